@@ -18,16 +18,17 @@ _ROUNDING = 64 * _EPS  # largest contradiction due to rounding of the rows, rela
 class LinearConstraints:
     """Constraints G y ≥ c, the same at every step or different from step to step.
 
-    Every row is divided by its norm, together with its c: violations are distances in the outputs' unit, and neither
-    results nor tolerances depend on the scale in which a constraint is given.
+    Every row is divided by its norm, together with its bound c. Violations are therefore distances in the outputs'
+    unit, and neither results nor tolerances depend on the scale in which a constraint is given.
 
     Args:
         G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
         c: Lower bounds, (F,) or (N, F), finite.
 
     Raises:
-        InputError: If shapes do not match, a number is not finite, a bound is not finite relative to its row, or no
-            output satisfies all constraints of a step. A contradiction beyond rounding counts, however small.
+        InputError: If shapes do not match or have no output or no step, a number is not finite, a bound divided by its
+            row's norm is not finite, or no output satisfies all constraints of a step. A contradiction beyond rounding
+            counts, however small.
 
     Attributes:
         G, c: Rows of unit norm (or zero) and their bounds [unit of the output], read-only; a row whose norm is one up
@@ -59,7 +60,8 @@ class LinearConstraints:
             upper: Upper bounds, (O,) or (N, O); inf at every step is no constraint.
 
         Raises:
-            InputError: If a lower bound exceeds its upper bound, or a bound is NaN or infinite at some steps only.
+            InputError: If shapes do not match, a lower bound exceeds its upper bound, or a bound is NaN, infinite at
+                some steps only, or infinite so that no output satisfies it.
         """
         lower, upper = as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound")
         try:
@@ -102,7 +104,7 @@ class LinearConstraints:
         return self.G.shape[0] if self.G.ndim == 3 else None
 
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return G (n, F, O) and c (n, F) at steps (n,); steps outside of the motion have those of its nearest step."""
+        """Return G (n, F, O) and c (n, F) at steps (n,); a step outside of the motion counts as the nearest one."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
             G, c = (np.broadcast_to(values, (len(steps), *values.shape)) for values in (self.G, self.c))
@@ -113,7 +115,7 @@ class LinearConstraints:
     def violation(self, output: np.ndarray, step: int = 0) -> float:
         """Compute the largest violation c − G y of a step's constraints, with rows of unit norm [unit of the output].
 
-        For the output y (O,), a negative violation is slack, and −inf is returned without constraints.
+        The output y is (O,). A negative violation is slack. The result is −inf if there are no constraints.
         """
         if self.num_constraints == 0:
             return -np.inf
@@ -125,8 +127,8 @@ class LinearConstraints:
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
         """Compute the output (O,) nearest to `output` (O,) within the constraints of a step.
 
-        If the solver does not find it, the result is the first allowed point on the straight line to a point inside
-        the constraints, so that there is a result for every finite output.
+        If the solver does not find it, the result is the first allowed point on the straight line from `output` to a
+        point inside the constraints, so that there is a result for every finite output.
 
         Raises:
             UnsolvableError: If `output` is not finite.
@@ -205,7 +207,7 @@ def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _max_margin_point(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the point (O,) that maximizes the smallest margin G y − c, up to a margin of max |c|."""
+    """Return the point (O,) that maximizes the smallest margin G y − c, up to max |c|, or 1 if c = 0."""
     from scipy.optimize import linprog  # imported here because it takes half a second
 
     outputs = G.shape[1]

@@ -20,11 +20,11 @@ class Demonstrations:
     Args:
         times: One clock (N,) for all demonstrations, or M clocks (N_m,), strictly increasing [s or phase].
         outputs: M arrays (N_m, O).
-        names: Names of the outputs with their units, such as "x [m]"; "y1", "y2", … by default.
+        names: Different names of the outputs with their units, such as "x [m]"; "y1", "y2", … by default.
 
     Raises:
         InputError: If there is no demonstration, one has fewer than two points, shapes or dimensions differ, a number
-            is not finite, or time does not increase strictly.
+            is not finite, time does not increase strictly, or `names` are not O different short printable texts.
 
     Attributes:
         times, outputs: M arrays (N_m,) and (N_m, O).
@@ -99,7 +99,7 @@ class Demonstrations:
         """Return the first `count` demonstrations, or all if it is None.
 
         Raises:
-            InputError: If there are fewer.
+            InputError: If `count` is not from 1 to the number of demonstrations.
         """
         if count is None:
             return self
@@ -114,7 +114,7 @@ class Demonstrations:
         different speeds of a demonstrator. Demonstrations that have such a clock already are returned unchanged.
 
         Args:
-            num_steps: Number of steps N, at least 2; that of the longest recording by default.
+            num_steps: Number of steps N, at least 2; the largest number of samples of a recording by default.
 
         Raises:
             InputError: If `num_steps` is less than 2 or not a whole number.
@@ -137,10 +137,12 @@ class Demonstrations:
         return Demonstrations(start + duration * phase, outputs, self.names)
 
     def save(self, path: str | Path) -> None:
-        """Write an `.npz` or a `.csv` file with one row per sample (demonstration, time, outputs), without rounding.
+        """Write an `.npz` or a `.csv` file without rounding.
+
+        A `.csv` file has one row per sample: demonstration, time, outputs.
 
         Raises:
-            InputError: If the file has another ending, or the file cannot be written.
+            InputError: If `path` has another ending, or the file cannot be written.
         """
         path = Path(path)
         writer = {".npz": io.write_npz, ".csv": io.write_csv}.get(path.suffix)
@@ -153,8 +155,8 @@ class Demonstrations:
         """Read a file that `save` or another program wrote.
 
         An `.npz` file may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` file with a first line of
-        `t` (or `time`, `time [s]`) and the outputs' names is one demonstration; a folder of such files is several. Time
-        is in seconds. Arrays of Python objects are refused, so that reading a file never executes code.
+        `t` (or `time`, `timestamp`, `time [s]`) and the outputs' names is one demonstration; a folder of such files is
+        several. Time is in seconds. Arrays of Python objects are refused, so that reading a file never executes code.
 
         Raises:
             InputError: If there is no such file, it is truncated, damaged or too large, or it does not hold
@@ -185,8 +187,8 @@ MAX_ALIGNED_SAMPLES = 10_000  # largest number of samples of an alignment; memor
 def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> Demonstrations:
     """Warp demonstrations in time onto the demonstration of median duration, by dynamic time warping.
 
-    The cost of a match is the distance of the outputs, each divided by its standard deviation over all demonstrations.
-    The warping path is monotonic. The result at each step is the mean of the samples that match this step.
+    The cost of a match is the distance of the samples, with each output divided by its standard deviation over all
+    demonstrations. The warping path is monotonic. The result at each step is the mean of the samples that match it.
 
     Args:
         demonstrations: Demonstrations of one motion.
@@ -266,7 +268,7 @@ class DemonstratedBounds:
     """Lower and upper bounds of each output in each phase of a motion."""
 
     names: tuple[str, ...]  # names of the outputs (O,)
-    phases: np.ndarray  # start of each phase (K,), from 0 to 1
+    phases: np.ndarray  # start of each phase (K,), as a fraction of the duration from 0 to below 1
     lower: np.ndarray  # lower bounds (K, O), infinite where an output is free
     upper: np.ndarray  # upper bounds (K, O), infinite where an output is free
     max_rates: np.ndarray  # largest demonstrated rate of each output (O,) [unit of the output/s]
@@ -286,7 +288,7 @@ def compute_bounds(
 ) -> DemonstratedBounds:
     """Compute bounds that every demonstration satisfies.
 
-    The range of a phase includes the samples at its borders, so that the bounds of adjacent phases overlap.
+    The samples at the border of two phases belong to the ranges of both, so that the bounds of the phases overlap.
 
     Args:
         demonstrations: At least one demonstration.
@@ -296,7 +298,7 @@ def compute_bounds(
         bounded: Indices of the bounded outputs, not a mask; all by default.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range, or `phases` or an index is not a whole number.
     """
     common = demonstrations.resampled()
     outputs = np.stack(common.outputs)

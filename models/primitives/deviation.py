@@ -18,13 +18,14 @@ _EVALUATED = 16  # number of steps at which the deviation is measured
 def measure_deviation(
     reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int
 ) -> tuple[float, float]:
-    """Compute the RMS distance of a motion from its reference mean, in two units.
+    """Compute the RMS distance of a motion from its reference mean, in two units, from a few of its steps.
 
     The motion is that of a primitive without actions, history and constraints, with the arguments of `LcNsKmp`. λ and β
     depend on the unit of the outputs: values for meters are wrong for millimeters.
 
     Returns:
-        The distance in standard deviations of the reference, and the largest distance of an output over its range.
+        The distance in standard deviations of the reference, and the largest distance of an output relative to the
+        range of its mean.
     """
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     errors = outputs_at(reference, kernel, lambda_ + beta, horizon, steps) - reference.means[steps]
@@ -40,7 +41,7 @@ def outputs_at(
 ) -> np.ndarray:
     """Compute the outputs (n, O) at `steps` (n,) without actions, history and constraints: k* (K + ħΣ)⁻¹ μ, ħ = λ + β.
 
-    The window of each step begins there. The other arguments are those of `LcNsKmp`.
+    The window of a step begins at that step. `hbar` is ħ; the other arguments are those of `LcNsKmp`.
     """
     outputs, at = reference.num_outputs, np.arange(horizon + 1)
     window = np.minimum(steps[:, None] + at, reference.num_steps - 1)
@@ -56,7 +57,7 @@ def outputs_at(
 
 
 def squared_distances(covariances: np.ndarray, errors: np.ndarray) -> np.ndarray:
-    """Compute squared Mahalanobis distances (…, n) of errors (…, n, O)."""
+    """Compute squared Mahalanobis distances (…, n) of errors (…, n, O) under covariances (n, O, O)."""
     whiten = np.linalg.inv(np.linalg.cholesky(covariances))
     return (np.einsum("nij,...nj->...ni", whiten, errors) ** 2).sum(axis=-1)
 
@@ -83,7 +84,7 @@ def check_deviation(
     The arguments are those of `measure_deviation`, and `max_deviation` is the largest accepted first number.
 
     Raises:
-        InputError: If the first number exceeds `max_deviation` and the second one exceeds `MAX_MISS`.
+        InputError: If the first number exceeds `max_deviation`, and the second one `MAX_MISS`.
     """
     deviation, miss = measure_deviation(reference, kernel, lambda_, beta, horizon)
     if not deviation <= 1.0:

@@ -35,7 +35,7 @@ def window_features(
     of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ of both would lose accuracy.
 
     Inputs of the history are (P,) or (P, I) and may be empty, those of the window (H+1,) or (H+1, I). `history_noise`
-    is ħρ, positive if there is a history.
+    is ħρ with ħ = λ + β and the variance ρ of the history; it is positive if there is a history.
 
     Raises:
         InputError: If `history_noise` is too small for the length of the history.
@@ -49,11 +49,11 @@ def window_interpolation(
 ) -> np.ndarray:
     """Compute the map (H+1, J) from actions at J different points of the window to all its points, given the history.
 
-    The map is K̂ K̲⁻¹ (thesis, equation 4.17). K̂ is conditioned on the history, and K̲, between the J points, is not. See
-    `window_features` for the arguments.
+    The map is K̂ K̲⁻¹ (thesis, equation 4.17). K̂ is conditioned on the history, and K̲, between the J points, is not.
+    `points` (J,) are indices of points of the window; the other arguments are those of `window_features`.
 
     Raises:
-        InputError: If points are so close that K̲ is singular.
+        InputError: As `window_features`, or if points are so close that K̲ is singular.
     """
     if len(points) == len(future_inputs) and not len(history_inputs):
         return np.eye(len(points))[:, points]  # actions at all points: nothing to interpolate

@@ -47,7 +47,8 @@ class Candidate:
 class Selection:
     """Selected mixture, kernel and regularization.
 
-    The regularization is the strongest one within a standard error of the best error, and the kernel the widest one.
+    The regularization is the strongest one within a standard error of the best error, and the kernel is the widest one
+    with this regularization.
     """
 
     reference: ReferenceTrajectory  # reference of all demonstrations
@@ -94,7 +95,8 @@ def fit(
     The number of components has the least Bayesian information criterion. Kernel and regularization are taken
     from a grid relative to the motion's duration and size. Candidates qualify if their error is within a standard error
     of the best one and their motion without actions stays within the demonstrations' spread. Of these, the strongest
-    regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow.
+    regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow. If no motion stays
+    within the spread, the candidate with the largest `share` is selected.
 
     Args:
         demonstrations: At least three demonstrations.
@@ -109,8 +111,8 @@ def fit(
         seed: As in `ReferenceTrajectory.from_demonstrations`.
 
     Raises:
-        InputError: If there are fewer than three demonstrations, they cannot be fitted, or the horizon is no number of
-            steps.
+        InputError: If there are fewer than three demonstrations, they cannot be fitted, the horizon is not a whole
+            number of at least 0, or another argument is out of range.
     """
     if not is_whole(horizon, 0):
         raise InputError(f"the horizon is a number of steps, not {brief(horizon)}")

@@ -1,11 +1,11 @@
 """Gains from a policy's action in [−1, 1] to null-space units, per output.
 
 The null-space projector is about the size of the posterior's variance: if demonstrations vary by millimeters, a raw
-action of size one barely moves the output. Without active constraints the loop history → next point is
+action of size one barely moves the output. Without active constraints the map from the history to the next point is
 linear, and two numbers that describe a gain follow from it exactly, for the action repeat that is used:
 
 - authority: displacement by a constant action of ±1, in demonstration standard deviations;
-- exploration RMS: root mean square of the displacement by white actions, in the same unit.
+- exploration RMS: root mean square of the displacement by uniform white actions in ±1, in the same unit.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
     """Compute the displacement (O,) of each output by a constant raw action of one in the same output.
 
     The displacement [unit of the output] is the RMS over the motion. `outputs` are indices or a mask of the explored
-    outputs, all by default; the others have authority zero.
+    outputs, all by default; the displacement of the others is returned as zero.
 
     Raises:
         InputError: If there is no explored output, or an index does not exist.
@@ -37,10 +37,10 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
     """Compute gains (O,) with which a constant action of ±1 moves outputs by √3 κ demonstration standard deviations.
 
-    The RMS of uniform actions in ±1 is 1/√3. With the factor √3 they cause an RMS of κ standard deviations in KGRL,
-    in which a command depends on one action only, if outputs are not coupled. Displacement and deviation are RMS over
-    the whole motion, so that regions dominate in which the demonstrations vary widely and leave room to explore. The
-    result does not depend on the action repeat, because a constant action is the same for every action repeat.
+    The RMS of uniform actions in ±1 is 1/√3. With the factor √3 they cause an RMS of κ standard deviations if outputs
+    are not coupled and a command depends on one action only, as in KGRL. Displacement and deviation are RMS over the
+    whole motion, so that regions dominate in which the demonstrations vary widely and leave room to explore. The result
+    does not depend on the action repeat, because a constant action is the same for every action repeat.
 
     Args:
         primitive: Primitive to calibrate.
@@ -48,7 +48,8 @@ def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.n
         outputs: Indices or mask of the explored outputs, all by default; the others get a gain of zero.
 
     Raises:
-        InputError: If κ is not positive, an index does not exist, or the primitive has no null space (β = 0).
+        InputError: If κ is not positive, there is no explored output, an index does not exist, or the primitive has no
+            null space (β = 0).
     """
     check_action_scale(action_scale)
     explored = _explored_mask(primitive, outputs)
@@ -110,13 +111,15 @@ def residual_gains(
 ) -> np.ndarray:
     """Compute the displacement (O,) of a residual command by an action of one, equal for all outputs of a group.
 
-    It is √3 κ times the RMS of the demonstrations' standard deviations over the motion and the group. A null-space
-    action of one displaces the command as much on average, but differently over time and direction.
+    The displacement [unit of the output] is √3 κ times the RMS of the demonstrations' standard deviations over the
+    motion and the group. A null-space action of one displaces the command as much on average, but differently over time
+    and direction.
 
     Args:
         reference: Reference trajectory of the demonstrations.
         action_scale: κ, positive.
-        groups: Indices of the outputs of each group; one group of all outputs by default.
+        groups: Indices of the outputs of each group; one group of all outputs by default. An output in no group gets a
+            displacement of zero.
     """
     variances = np.mean(reference.standard_deviations**2, axis=0)
     gains = np.zeros(len(variances))
