@@ -70,7 +70,8 @@ def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd
         seed: Seed of the first episode.
     """
     options = {"guidance": "base_policy", "difficulty": "hard", "base_policy": base_policy, "guard": guard}
-    env: Any = make_environment(TASK, {**options, "horizon": 15, "max_speed": MAX_SPEED, "max_jerk": MAX_JERK})
+    limits = {} if guard == "none" else {"max_speed": MAX_SPEED, "max_jerk": MAX_JERK}
+    env: Any = make_environment(TASK, {**options, "horizon": 15, **limits})
     try:
         bound = env.unwrapped.task.declaration.options.bound
         size, period = env.action_space.shape, env.unwrapped.task.control_period

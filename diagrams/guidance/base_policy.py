@@ -61,8 +61,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
 class ChunkExecutionGuidance(PrimitiveGuidance):
     """Guidance that commands chunks, with a guard by default; the action has no effect.
 
-    With a guard there is the output ``rate`` (1,) of `ChunkSafetyLimiter`. Without a guard (``guard=none``), bounds and
-    limits of the motion are not enforced.
+    With a guard there is the output ``rate`` (1,) of `ChunkSafetyLimiter`. Without a guard (``guard=none``), the linear
+    bounds are not enforced, and limits of the motion are refused.
     """
 
     def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False):
@@ -72,7 +72,7 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
 
         Raises:
             InputError: If the motion waits for the robot (``progress=state``), or the guard does not support the limits
-                and constraints.
+                and constraints, or there is none but limits are given.
         """
         super().__init__()
         config, options, builder = primitive_config_of(prior), prior.options, DiagramBuilder()
@@ -104,6 +104,11 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
             builder.ExportOutput(limiter.get_rate_output_port(), "rate")
             desired, fallback = limiter.get_desired_pose_output_port(), limiter.get_fallback_output_port()
         else:
+            if config.motion is not None or options["max_jerk"]:
+                raise InputError(
+                    "guard=none enforces no limits of the motion: choose another guard, or leave max_speed, "
+                    "max_acceleration, max_jerk, joint_margin and shapes out"
+                )
             never = builder.AddNamedSystem("fallback", ConstantVectorSource([0.0]))
             desired, fallback = chunk.get_output_port(), never.get_output_port()
         self._finish(builder, config, desired, fallback)

@@ -116,15 +116,15 @@ def test_spread_of_the_chunks_widens_what_an_action_reaches(registered):
 def test_guarded_chunks_are_within_bounds_speed_and_jerk(guard, registered):
     random, limits = np.random.default_rng(2), {"max_speed": (0.3,), "max_jerk": (40.0,), "horizon": 11}
     registered("jumps", lambda observation: np.tile(random.uniform(-1.0, 1.0, 2), (8, 1)))
-    options = {"guidance": "base_policy", "base_policy": "jumps", "action_repeat": 1, **limits}
-    env = make_env("NarrowPassage", guard=guard, **options)
+    options = {"guidance": "base_policy", "base_policy": "jumps", "action_repeat": 1}
+    env = make_env("NarrowPassage", guard=guard, **options, **limits)
     trace = run(env, np.ones((60, 2)))
     period = trace.period
     assert np.abs(np.diff(trace.commanded, axis=0)).max() <= 0.3 * period
     assert np.abs(np.diff(trace.commanded, n=3, axis=0)).max() <= 40.0 * period**3
     assert trace.signals["commanded_violation"].max() <= 1e-9
     assert np.ptp(trace.commanded, axis=0).max() > 0.01
-    free = run(make_env("NarrowPassage", guard="none", **options), np.ones((60, 2))).commanded
+    free = run(make_env("NarrowPassage", guard="none", horizon=11, **options), np.ones((60, 2))).commanded
     assert np.abs(np.diff(free, axis=0)).max() > 10 * 0.3 * period
 
 
@@ -152,6 +152,8 @@ def test_demonstrations_pass_the_default_guard_unchanged():
         ({"replan_steps": 42}, "steps"),
         ({"progress": "state"}, "clock"),
         ({"guard": "brake"}, "brake"),
+        ({"guard": "none", "max_speed": (0.3,)}, "guard=none enforces no limits"),
+        ({"guard": "none", "max_jerk": (40.0,)}, "guard=none enforces no limits"),
     ],
 )
 def test_guard_is_refused_when_an_option_does_not_fit(options, words):
