@@ -335,7 +335,7 @@ def build_task_diagram(
         "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
-    taken = {*exported, *INFO_KEYS, *RECORDED_SIGNALS}
+    taken = {*exported, *INFO_KEYS, *RECORDED_SIGNALS, "privileged", "rgb_image"}
     for name in reward.term_names:
         if name in taken:
             raise InputError(

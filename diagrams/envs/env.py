@@ -17,7 +17,7 @@ from pydrake.systems.framework import Context, Diagram, PortDataType
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.episode_monitor import TERMINATIONS
 
@@ -340,7 +340,7 @@ class DiagramEnv(DrakeGymEnv):
         """
         if self.task.push is None:
             raise InputError("this task has no robot that can be pushed")
-        displacement = np.asarray(displacement, dtype=float)
+        displacement = as_numbers(displacement, "a push")
         if displacement.shape != (self._pose_port.size(),) or not np.isfinite(displacement).all():
             raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
         self.task.push(self.simulator.get_mutable_context(), displacement)

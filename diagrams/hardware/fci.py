@@ -248,6 +248,8 @@ class FciDriver(PoseDriver):
         except (self._franky.NetworkException, RuntimeError):
             self._is_lost = True
             return False
+        except self._franky.Exception as error:
+            raise InputError(f"the robot at {self.url} cannot recover: {error}") from None
 
     def _reconnect(self) -> None:
         self._is_lost, self._robot = False, None

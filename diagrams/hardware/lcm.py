@@ -23,6 +23,7 @@ from guiderail.models.control.message_sequence import StatusSequence
 from guiderail.systems.heartbeat_monitor import FORGET_TIME
 
 PROVIDERS = ("udpm", "mpudpm", "tcpq", "memq")
+MAX_WAIT = 3600.0  # longest wait for messages [s]; LCM counts milliseconds in 32 bits
 MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
@@ -196,9 +197,9 @@ class LcmDriver(Driver):
     def receive(self, timeout: float = 0.0) -> None:
         """Receive the messages that have arrived; if there are none, wait at most `timeout` [s].
 
-        LCM waits for whole milliseconds: a positive timeout is rounded down, to at least 1 ms.
+        LCM waits for whole milliseconds: a positive timeout is rounded down, to at least 1 ms and at most `MAX_WAIT`.
         """
-        self.lcm.HandleSubscriptions(max(1, int(1000 * timeout)) if timeout > 0.0 else 0)
+        self.lcm.HandleSubscriptions(max(1, int(1000 * min(timeout, MAX_WAIT))) if timeout > 0.0 else 0)
 
     def check_usable(self) -> None:
         """Raise `InputError` if a message handler in Python would end the process."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -35,7 +37,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.pose_wrench import PoseWrench
 
@@ -95,11 +97,15 @@ class GantryStation(Station):
             control_period: Time between commands [s], a whole multiple of the time step.
 
         Raises:
-            InputError: If the time step is too long for a Cartesian controller with this impedance, or the control
-                period is no multiple of the time step.
+            InputError: If there is no such impedance control, the time step is too long for a Cartesian controller
+                with this impedance, or the control period is no multiple of the time step.
         """
         super().__init__()
         builder = DiagramBuilder()
+        if impedance_control not in get_args(ImpedanceControl):
+            raise InputError(
+                f"impedance_control must be {' or '.join(get_args(ImpedanceControl))}, not {brief(impedance_control)}"
+            )
         is_joint = impedance_control == "joint"
         if time_step is None:
             time_step = PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD

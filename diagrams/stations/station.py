@@ -20,7 +20,7 @@ output               size   meaning
 `wrench`             W      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
                             N and Nm, without the tool's weight and inertia, low-pass filtered
 `contact_force`      1      magnitude of the impedance's force [N], by which collisions are detected
-`saturation`         1      1 while the controller is at a limit of force or torque, otherwise 0
+`saturation`         1      nonzero while the controller is at a limit of force or torque; size 2 on the plane station
 `command_timed_out`  1      1 while commands are missing or not finite, and the last safe pose is held
 ===================  =====  ========================================================================================
 

@@ -193,7 +193,7 @@ def test_observation_is_centered_and_scaled_by_entry():
     np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "desired_pose"])
+@pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "privileged", "rgb_image"])
 def test_reward_term_with_a_reserved_name_is_refused(name):
     declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
     with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):

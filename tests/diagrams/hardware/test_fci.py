@@ -219,6 +219,15 @@ def test_recover_clears_the_error_or_raises(driver, robot):
     assert driver.read().is_readable
 
 
+def test_recovery_that_the_robot_rejects_is_refused(driver, robot, monkeypatch):
+    def reject():
+        raise FrankyError("command rejected")
+
+    monkeypatch.setattr(robot, "recover_from_errors", reject, raising=False)
+    with pytest.raises(InputError, match="cannot recover: command rejected"):
+        driver.recover()
+
+
 def test_motion_continues_after_a_reflex_is_cleared(driver, robot):
     driver.write_pose(RigidTransform(), 0.0)
     robot.motion_error = FrankyError("cartesian_reflex")

@@ -136,3 +136,13 @@ def test_older_heartbeat_of_another_channel_does_not_replace_a_newer_one():
         pair.other.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
         pair.read()
     assert pair.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
+
+
+def test_a_wait_beyond_the_range_of_lcm_ends_with_the_first_message():
+    pair = Pair()
+    message = lcmt_iiwa_status()
+    pair.other.lcm.Publish("IIWA_STATUS", message.encode())
+    pair.driver.lcm.Publish("IIWA_STATUS", message.encode())
+    pair.driver.receive(3e6)
+    pair.driver.lcm.Publish("IIWA_STATUS", message.encode())
+    pair.driver.receive(np.inf)

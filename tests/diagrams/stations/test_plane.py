@@ -7,6 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
+from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 WORLD, CONFIG = PassageGeometry(), PlaneConfig()
@@ -138,3 +139,10 @@ def test_sampled_pose_equals_that_of_the_environment():
         np.testing.assert_array_equal(
             run.sample.get_output_port().Eval(run.sample.GetMyContextFromRoot(run.context)), read
         )
+
+
+@pytest.mark.parametrize("obstacles", [np.zeros((2, 2)), [[0.0, np.nan]], "text"])
+def test_invalid_obstacles_are_refused(obstacles):
+    station = PlaneStation(PassageGeometry(obstacles_move=True), CONFIG)
+    with pytest.raises(InputError, match="obstacles"):
+        station.set_obstacles(station.CreateDefaultContext(), obstacles)
