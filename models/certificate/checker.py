@@ -1,6 +1,9 @@
-"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY]`; exit code 0 valid, 1 rejected, 2 unreadable.
+"""Check a certificate with NumPy alone: `python checker.py FOLDER [KEY_FILE]`.
 
-The checker bounds the commands y for all actions a. Given the history h, the window has the mean W h and the kernel C:
+Exit codes: 0 valid, 1 rejected, 2 unreadable.
+
+The checker bounds the commands y of a window of steps for all actions a. Given the history h, the prior has the mean
+W h and the kernel C; μ, Σ, λ and β are the primitive's means, covariances and parameters, G its rows of constraints:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
 Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
@@ -27,16 +30,16 @@ KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / 
 QUANTITIES = ("lower", "upper", "speed", "acceleration")
 BUDGETS = ("excess", "residue")
 AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
-BORDER = 1e-5  # slack, relative to the terms of a constraint, up to which it may be claimed to be active
+BORDER = 1e-5  # slack, relative to a constraint's terms, up to which a claim that the constraint is active is accepted
 COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec = 60
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
 MAX_BYTES = 2**30  # largest size of the arrays of one file
-MAX_WINDOW = 500  # upper limit of history and horizon together [steps]; environments accept 200 of each
+MAX_WINDOW = 500  # history and horizon together must be less [steps]; environments accept 200 of each
 # First halves of the SHA-256 of assumptions: the six that are always stated, that of a budget, that of another period
 ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
-# Arrays of each file: kind, and shape in terms of steps, outputs, rows of constraints and rounds of multipliers
+# Kind and shape of each array: N steps, O outputs, F rows, H steps of a window, T active steps, C corners, R rounds
 ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
     "primitive.npz": {
         **{"means": ("f", "NO"), "covariances": ("f", "NOO"), "gains": ("f", "O"), "start": ("f", "O")},
@@ -46,9 +49,7 @@ ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
     "constraints.npz": {"G": ("f", "NFO"), "c": ("f", "NF")},
     "witness.npz": {"active": ("b", "N"), "multipliers": ("f", "TCHF")},
 }
-LAGRANGE = {
-    **{"lagrange_steps": ("i", "32NOR"), "lagrange_outputs": ("i", "32NOR"), "lagrange_multipliers": ("f", "32NOR")}
-}
+LAGRANGE = {f"lagrange_{k}": (kind, "32NOR") for k, kind in (("steps", "i"), ("outputs", "i"), ("multipliers", "f"))}
 
 
 class Rejected(Exception):
@@ -56,18 +57,18 @@ class Rejected(Exception):
 
 
 def require(condition: Any, words: str) -> None:
-    """Reject the certificate unless a condition holds."""
+    """Raise `Rejected` with the reason `words` unless a condition holds."""
     if not condition:
         raise Rejected(words)
 
 
 def canonical(claims: dict[str, Any], *left_out: str) -> str:
-    """Return the canonical text of claims without the fields `left_out`; no other text is accepted."""
+    """Return the canonical text of claims without the fields `left_out`; `read` rejects any other text."""
     return json.dumps({k: v for k, v in claims.items() if k not in left_out}, sort_keys=True, allow_nan=False)
 
 
 def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any]]:
-    """Return primitive and constraints, witness and claims; reject files of any other format."""
+    """Return the arrays of primitive and constraints, those of the witness, and the claims; reject other formats."""
     text = (folder / "certificate.json").read_text(encoding="utf-8")
     claims = json.loads(text)
     require(type(claims) is dict and text == canonical(claims), "certificate.json is not in canonical form")
@@ -81,9 +82,7 @@ def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any
         signature = hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
         signed = isinstance(claims.get("signature"), str) and hmac.compare_digest(claims["signature"], signature)
         require(signed, "the signature is missing, or not of this key")
-    require(
-        type(claims["digests"]) is dict and sorted(claims["digests"]) == sorted(ARRAYS), "digests are not the files'"
-    )
+    require(type(claims["digests"]) is dict and sorted(claims["digests"]) == sorted(ARRAYS), "digests of other files")
     files, sizes = {}, {"3": 3, "2": 2}
     for name, expected in ARRAYS.items():
         expected = {**expected, **(LAGRANGE if has_budget and name == "witness.npz" else {})}
@@ -103,7 +102,7 @@ def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any
 
 
 def numbers(value: Any, shape: tuple[int, ...], what: str, may_be_null: bool = False) -> np.ndarray:
-    """Return lists of numbers as an array, null as NaN; reject anything else, such as whole numbers, text and bools."""
+    """Return lists of floats as an array, with `may_be_null` null as NaN; reject anything else, such as integers."""
     if shape:
         require(type(value) is list and len(value) == shape[0], f"{what} has another shape")
         return np.array([numbers(one, shape[1:], what, may_be_null) for one in value]).reshape(shape)
@@ -220,14 +219,14 @@ class Primitive:
             pulled, whitened = np.linalg.norm(weights @ values, axis=0), np.sqrt((values * weighed).sum(axis=0))
             whole = (np.abs(past) + np.abs(reached).sum(axis=1)).astype(float)
             noise = 4 * (r + self.past + 4) * EXTENDED * (spread_W @ whole + np.abs(mean).astype(float))
-            noise += EPS * self.past * (spread_W @ np.abs(reached).astype(float)).sum(axis=1) * share  # of `values`
+            noise += EPS * self.past * (spread_W @ np.abs(reached).astype(float)).sum(axis=1) * share  # by `values`
             return sizes * (share * pulled.sum() + inverse * whitened.sum() + np.linalg.norm(weights @ noise)) + noise
 
         rows = np.einsum("jfo,jk->jfko", self.G[at], np.eye(len(at))).reshape(-1, len(at) * outs)
         return history, action, offset, L.astype(float), rows, self.c[at].ravel(), error, share * self.beta * sizes
 
     def caps(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return lower and upper bounds (N, outs) by the constraints that involve a single output."""
+        """Return bounds (N, outs) by the constraints on a single output, widened by `COMMAND_TOLERANCE`."""
         alone = ((self.G != 0).sum(axis=2) == 1)[..., None]
         cap = self.c[..., None] / np.where(self.G == 0, 1, self.G)
         least = np.where(alone & (self.G > 0), cap, -np.inf).max(axis=1, initial=-np.inf)
@@ -235,7 +234,11 @@ class Primitive:
         return least - COMMAND_TOLERANCE, most + COMMAND_TOLERANCE
 
     def reach(self, p: Arrays, witness: Arrays) -> tuple[np.ndarray, ...]:
-        """Compute free motion, generators, their errors, bounds of corrected commands or NaN, and maps of histories."""
+        """Compute the commands that are reached without active constraints, and bounds where one can be active.
+
+        Returns: centers (P + N, outs) and generators (P + N, outs, B) of commands, bounds (P + N, outs) of their
+        rounding errors, bounds (2, N, outs) of corrected commands, or NaN, and maps (N, outs, P outs) of histories.
+        """
         P, N, outs = self.past, self.steps, self.outputs
         moved, claimed = np.flatnonzero(p["gains"]), witness["active"]
         A = len(moved)
@@ -308,7 +311,7 @@ class Primitive:
         return {"free": free, "always": always}
 
     def budgeted(self, p: Arrays, w: Arrays, budgets: list[np.ndarray], reached: Any, period: float) -> Arrays:
-        """Compute the quantities of the regime "budgeted"; any multipliers of constraints prove valid bounds."""
+        """Compute the quantities (N, outs) of the regime "budgeted"; any multipliers prove valid bounds."""
         (middle, spread, errors, _, maps), P, N, outs = reached, self.past, self.steps, self.outputs
         first, U = int(np.argmax(w["active"])), np.flatnonzero(p["gains"] == 0)
         A, steps_left, residues = outs - len(U), N - first, np.zeros((P + N, outs, (N - first) * len(U)), dtype=Real)
@@ -344,7 +347,7 @@ class Primitive:
 
 
 def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, limits: Any, alphas: np.ndarray) -> tuple[Any, Any]:
-    """Bound the commands of step n by cells: ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖², with v̄ interpolated from a cell's corners."""
+    """Bound the commands of step n by ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖²; v̄ interpolates the corrections v of a cell's corners."""
     (rows_L, rows, c, room), outs, A, alphas = limits, len(L), by.shape[1], alphas.reshape(len(alphas), -1)
     along = round(len(alphas) ** (1 / max(A, 1))) - 1
     is_complete = along >= 1 and (along + 1) ** A == len(alphas) and (alphas >= 0).all() and alphas.shape[1] == len(c)
@@ -386,7 +389,7 @@ def compare(claims: dict[str, Arrays], computed: dict[str, Arrays]) -> None:
 
 
 def check_forces(impedance: Any, computed: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
-    """Reject forces that do not follow from the impedance and the computed bounds; None: bounds not computed yet."""
+    """Reject forces that do not follow from `impedance` and `computed` bounds; None: no impedance, no bounds yet."""
     if impedance is None:
         return
     fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")
@@ -406,10 +409,7 @@ def check_forces(impedance: Any, computed: dict[str, Arrays] | None, regimes: tu
 
 
 def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
-    """Raise `Rejected` unless the certificate in a folder holds, and is signed with the key if there is one.
-
-    Returns the claims. `guiderail certify SKILL --verify FOLDER` compares them with a skill.
-    """
+    """Return the claims of a valid certificate, signed with the key if one is given; otherwise raise `Rejected`."""
     p, witness, claims = read(folder, key)
     require(claims["format"] == "guiderail certificate 4", "wrong format")
     require(type(claims["kernel"]) is str and claims["kernel"] in KERNELS, f"the kernel is none of {list(KERNELS)}")

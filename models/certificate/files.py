@@ -35,7 +35,7 @@ BUDGET = (
 OTHER_CLOCK = (
     "the period differs from the clock of the primitive: it is executed slower or faster than it was demonstrated"
 )
-CLOCK_TOLERANCE = 1e-6  # relative difference of period and clock
+CLOCK_TOLERANCE = 1e-6  # largest relative difference of period and clock without `OTHER_CLOCK`
 
 
 def certificate_files(
@@ -51,10 +51,11 @@ def certificate_files(
     Args:
         loop: Certified loop.
         certified: Bounds of the loop.
-        stiffness: Stiffness (6,) of the impedance that executes the commands; None if the robot has no impedance.
-        limits: Limits (6,) of the impedance's wrench; None if the robot has no impedance.
+        stiffness: Stiffness (6,) [N/m, Nm/rad] of the impedance that executes the commands; None if the robot has no
+            impedance.
+        limits: Limits (6,) of the impedance's wrench [N, Nm]; None if the robot has no impedance.
         about: Texts by name that identify the skill: its task, and others such as its run.
-        key: Key of the signature, at least 16 bytes; None for no signature.
+        key: Key of the signature; None for no signature. The checker rejects a key of fewer than 16 bytes.
 
     Raises:
         InputError: If the checker does not support the primitive's kernel, or the primitive's time steps are not equal.
@@ -102,7 +103,7 @@ def certificate_files(
 
 
 def seal(claims: Mapping[str, Any], key: bytes | None = None) -> bytes:
-    """Return the text of claims with their digest, which anyone can compute, and a signature if there is a key."""
+    """Return the text of claims with their digest, which anyone can compute, and with a signature if a key is given."""
     content = {name: value for name, value in claims.items() if name not in ("digest", "signature")}
     content["digest"] = hashlib.sha256(checker.canonical(content).encode()).hexdigest()
     if key is not None:
@@ -122,6 +123,9 @@ def compare_subject(
     Everything that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
     impedance, primitive, gains, start and constraints. `files` has the content of each file of a certificate that the
     checker accepts; the other arguments describe the skill as in `certificate_files`.
+
+    Raises:
+        InputError: If the skill cannot have a certificate, as in `certificate_files`.
     """
     claims = json.loads(files[CERTIFICATE])
     claimed = {name: claims[name] for name in ("about", "kernel", "period")}

@@ -15,8 +15,8 @@ import numpy as np
 
 from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_output_bounds
 
-ROUNDS = 4  # number of constraints at other steps that tighten one bound
-MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing
+ROUNDS = 4  # number of constraints at nearby steps that tighten one bound
+MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing [steps]
 NUM_CANDIDATES = 6  # number of constraints tried in each round: those most correlated with the direction
 FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
 
@@ -25,8 +25,8 @@ FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative t
 class Budget:
     """Budget of corrections: the rows are the largest value at one step and the largest sum over a sequence."""
 
-    excess: np.ndarray  # (2, A), excess over ±1 of the actions that are equivalent to corrected commands
-    residue: np.ndarray  # (2, O), displacement by corrections of the outputs that no action moves
+    excess: np.ndarray  # excess over ±1 of the actions that would lead to the corrected commands (2, A), A actions
+    residue: np.ndarray  # displacement, by corrections, of the outputs that no action moves (2, O) [unit of the output]
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class BudgetedBounds:
     bounds: Bounds  # bounds on commands, speeds and accelerations
     steps: np.ndarray  # step of the constraint that tightens a bound
     outputs: np.ndarray  # output of that constraint
-    multipliers: np.ndarray  # its multiplier, positive for an upper and negative for a lower bound
+    multipliers: np.ndarray  # multiplier of that constraint, positive if it is an upper bound, negative if a lower one
 
 
 def bound_within_budget(

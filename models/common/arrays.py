@@ -28,7 +28,7 @@ def is_finite(values: np.ndarray) -> bool:
 
 
 def is_whole(value: object, least: float) -> bool:
-    """Return True for a whole number of at least `least`; False for bools, NaN, infinity and what is no real number."""
+    """Return True for a whole number of at least `least`; False for bools, NaN, infinity and other types."""
     if isinstance(value, bool) or not isinstance(value, Real):
         return False
     if isinstance(value, Integral):
@@ -37,10 +37,10 @@ def is_whole(value: object, least: float) -> bool:
 
 
 def as_whole(value: object, what: str) -> int:
-    """Return a whole number of Python or NumPy as an int; `what` is its name for the message.
+    """Return a whole number of Python or NumPy, such as 3 or 3.0, as an int; `what` is its name for the message.
 
     Raises:
-        InputError: If it is not a whole number, such as 1.5, "3" and True.
+        InputError: If it is not a whole number: 1.5, "3" and True are refused.
     """
     if not is_whole(value, -math.inf):
         raise InputError(f"{what} must be a whole number, not {brief(value)}")
@@ -51,13 +51,13 @@ _EXACT = 2**53  # a double represents smaller whole numbers exactly
 
 
 def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
-    """Convert numbers, nested in any way that NumPy accepts, to a new array of doubles without rounding.
+    """Convert numbers, nested in any way that NumPy accepts, to a new array of doubles.
 
-    `what` is the name of the values for messages.
+    `what` is the name of the values for messages. Bools become 0 and 1; None becomes NaN.
 
     Raises:
-        InputError: If the values are ragged or are not real numbers (text, dates, complex numbers, other objects), or a
-            double cannot represent them.
+        InputError: If the values are ragged, or include text, dates, complex numbers, objects that `float` does not
+            convert, or integers of 2^53 and more, which a double rounds.
     """
     try:
         raw = np.asarray(values)
@@ -107,8 +107,8 @@ def round_period(seconds: float) -> float:
         seconds: Period [s], positive.
 
     Raises:
-        InputError: If `seconds` is not positive and finite.
+        InputError: If `seconds` is not finite, or not above 2^-40 s, about a picosecond.
     """
     if not (np.isfinite(seconds) and seconds > _GRID):
-        raise InputError(f"a period must be positive, not {seconds} s")
+        raise InputError(f"a period must be finite and above a picosecond, not {seconds} s")
     return round(seconds / _GRID) * _GRID

@@ -19,7 +19,7 @@ class RunsFailedError(RuntimeError):
 
     Attributes:
         sentences: One sentence for each failed run; the command prints them and exits with code 1.
-        rows: Results of the other runs, a data frame.
+        rows: Results of the other runs as a data frame, or None.
     """
 
     def __init__(self, sentences: list[str], rows: Any):
@@ -65,7 +65,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "wandb": {"wandb": "Weights & Biases"},
 }
 EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for module, name in modules.items()}
-"""Names of the software and of the extra that installs it, by the name of the module."""
+"""Name of the software, and of the extra that installs it, by the name of the module."""
 
 
 class MissingExtraError(InputError, ImportError):
@@ -86,6 +86,7 @@ def import_extra(module: str) -> Any:
 
     Raises:
         MissingExtraError: If it is not installed.
+        ModuleNotFoundError: If it is not installed, and no extra installs it.
     """
     try:
         return import_module(module)
@@ -98,6 +99,7 @@ def require_extra(module: str) -> None:
 
     Raises:
         MissingExtraError: If it is not installed.
+        ModuleNotFoundError: If it is not installed, and no extra installs it.
     """
     try:
         is_installed = find_spec(module) is not None

@@ -16,7 +16,7 @@ from guiderail.models.common.errors import InputError
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically: readers find the old content or the new, even if the process is killed.
 
-    Several processes and threads may write the same file; the last of them to finish wins.
+    Missing folders are created. Several processes and threads may write the same file; the last to finish wins.
 
     Raises:
         InputError: If the file cannot be written.

@@ -21,13 +21,14 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     """Return `function(*arguments)`, computed in a forked process; the result is pickled.
 
     Args:
-        function: Function; it needs no import in the child process, which is a copy of this one.
+        function: Function; it need not be importable, because the child process is a copy of this one.
         arguments: Arguments of the function, which are not pickled.
-        cpu_seconds: Limit of the function's CPU time [s].
+        cpu_seconds: Limit of the function's CPU time, a whole number [s].
         max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
 
     Raises:
-        IsolatedError: If the function raised, or its process aborted, was killed or exceeded a limit.
+        IsolatedError: If the function raised, its result cannot be pickled, or its process aborted, was killed or
+            exceeded a limit.
     """
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)

@@ -20,18 +20,22 @@ def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
 
     The constructor of Drake's `Parser` registers the remote package `drake_models`, and raises an error if
     DRAKE_ALLOW_NETWORK forbids it. The variable is therefore changed while parsing; nothing is downloaded.
+
+    Raises:
+        InputError: As `add_models`.
+        ValueError: If the file has several models or none.
     """
     (model,) = add_models(plant, path)
     return model
 
 
 def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
-    """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.yaml), to a plant.
+    """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.dmd.yaml), to a plant.
 
     Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
 
     Raises:
-        InputError: If the file, or a mesh that it names, cannot be read.
+        InputError: If the file, or a mesh that it names, cannot be read, or the file is of another type.
     """
     with _allow_package_map():
         parser = _make_parser(plant)

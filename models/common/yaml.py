@@ -25,7 +25,7 @@ from guiderail.models.common.files import read_bytes
 
 MAX_SIZE = 100_000  # largest size of a file [bytes]; a template has about 5,000
 MAX_ENTRIES = 10_000  # largest number of entries; an alias counts as many as its content
-MAX_DEPTH = 30  # largest depth of nested lists and mappings
+MAX_DEPTH = 30  # largest depth of nested lists and mappings; the innermost values count as a level
 
 _TAG = "tag:yaml.org,2002:"
 _PATTERNS = {
@@ -42,10 +42,10 @@ _PATTERNS = {
 
 
 def load_yaml(path: str | Path, what: str = "file") -> Any:
-    """Read a YAML file; `what` is its kind for messages, such as "template".
+    """Read a YAML file of at most `MAX_SIZE` bytes; `what` is its kind for messages, such as "template".
 
     Raises:
-        InputError: As `parse_yaml`, or if the file cannot be read.
+        InputError: As `parse_yaml`, or if the file cannot be read or is not in UTF-8.
     """
     path = Path(path)
     data = read_bytes(path, what, MAX_SIZE)
@@ -60,18 +60,19 @@ def parse_yaml(text: str, where: str = "text") -> Any:
     """Read one YAML document as Python's own types; `where` is its name for messages.
 
     Raises:
-        InputError: If it is not YAML, it has a tag, a date, a duplicate key or a key that is not text, or it is too
-            large or too deep.
+        InputError: If it is not YAML or not a single document, has a tag, a date, a duplicate key or a key that is not
+            text (an alias as a key is not checked), or is too large or too deep.
     """
     with _refusals(text, where):
         return _make_yaml().load(text)
 
 
 def check_yaml(text: str, where: str, tags: Collection[str]) -> None:
-    """Check that a document is within the limits of `parse_yaml`, and that it has only tags in `tags`.
+    """Check that documents are within the limits of `parse_yaml`, and that they have only tags in `tags`.
 
     Raises:
-        InputError: As `parse_yaml`, except for duplicate keys.
+        InputError: As `parse_yaml`, except for several documents, duplicate keys, unknown aliases, wrong merges (`<<`)
+            and integers of thousands of digits.
     """
     with _refusals(text, where):
         for _ in _make_yaml(tags).parse(text):
@@ -160,7 +161,7 @@ class _Parser(Parser):
             else:
                 entries, levels = self._sizes[event.anchor] = 1, 1
         if len(self._parents) + levels > MAX_DEPTH:
-            _refuse(f"more than {MAX_DEPTH} lists or mappings are inside each other: flatten them", event)
+            _refuse(f"more than {MAX_DEPTH} levels are inside each other: flatten lists and mappings", event)
         if self._num_entries > MAX_ENTRIES:
             _refuse(f"there are more than {MAX_ENTRIES} entries, aliases counted: leave out what is not needed", event)
         if entries and self._parents:

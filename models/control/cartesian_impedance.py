@@ -26,8 +26,8 @@ class JointTorques:
     """Result of the impedance law."""
 
     torque: np.ndarray  # joint torques to command (n,) [Nm]
-    wrench: np.ndarray  # wrench of the impedance (6,) [N, Nm]
-    is_saturated: bool  # True if a wrench or a torque is at its limit
+    wrench: np.ndarray  # limited wrench of the impedance (6,) [N, Nm]
+    is_saturated: bool  # True if the wrench or a torque is limited
 
 
 def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:
@@ -38,7 +38,7 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
     vector and the wrench is K e.
 
     Args:
-        K: Stiffness (6, 6), symmetric, positive definite.
+        K: Stiffness (6, 6) [N/m, Nm/rad], symmetric, positive definite.
         p_error: Desired minus actual position (3,) [m].
         eta: Scalar part of the quaternion of R_desired Rᵀ.
         epsilon: Vector part (3,) of that quaternion.
@@ -51,7 +51,11 @@ def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.nd
 def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: float) -> np.ndarray:
     """Compute D = 2 ζ L (L⁻¹ K L⁻ᵀ)^½ Lᵀ with Λ = L Lᵀ, which gives every mode of (K, Λ) the damping ratio ζ.
 
-    K is the stiffness (6, 6), symmetric and positive definite, and Λ⁻¹ = J M⁻¹ Jᵀ (6, 6) the inverse inertia.
+    K is the stiffness (6, 6), symmetric and positive definite, and Λ⁻¹ = J M⁻¹ Jᵀ (6, 6) the inverse inertia. D is
+    (6, 6).
+
+    Raises:
+        LinAlgError: If Λ⁻¹ is not positive definite.
     """
     L_modes, eigenvalues = _modes(K, _root_of_inverse(Lambda_inverse))
     return (L_modes * _dampings(eigenvalues, damping_ratio)) @ L_modes.T
@@ -80,11 +84,12 @@ def _dampings(eigenvalues: np.ndarray, damping_ratio: float) -> np.ndarray:
 
 
 def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """Compute Λ without the directions that a singular arm has lost.
+    """Compute Λ (6, 6) without the directions that a singular arm has lost.
 
-    Each eigenvalue, a mass m, is multiplied by a factor that falls smoothly with log m, from 1 at `LIGHT` to 0 at
-    `HEAVY`. For a regular arm the result equals Λ. In lost directions, the posture's torque then acts on the tool.
-    The argument is Λ⁻¹ = J M⁻¹ Jᵀ (6, 6), positive definite, [translational, rotational].
+    With rotations scaled by `LEVER`, each eigenvalue is a mass m [kg]. It is multiplied by a factor that falls smoothly
+    with log m, from 1 at `LIGHT` to 0 at `HEAVY`. For a regular arm the result equals Λ. In lost directions, the
+    posture's torque then acts on the tool. The argument is Λ⁻¹ = J M⁻¹ Jᵀ (6, 6), positive definite, [translational,
+    rotational].
     """
     eigenvalues, directions = np.linalg.eigh(_SCALE[:, None] * Lambda_inverse * _SCALE)
     masses = 1.0 / eigenvalues
@@ -117,11 +122,11 @@ def impedance_torques(
     N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the tool.
 
     Args:
-        K: Stiffness (6, 6) in the axes of the stiffness frame.
+        K: Stiffness (6, 6) [N/m, Nm/rad] in the axes of the stiffness frame.
         damping_ratio: Damping ratio ζ of every mode.
         wrench_limits: Limits (6,) along the axes of the stiffness frame [N, Nm].
         R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None: the same frame.
-        p_error: Position error (3,), as in `spring_wrench`.
+        p_error: Position error (3,) [m], as in `spring_wrench`.
         eta: Scalar part of the orientation error, as in `spring_wrench`.
         epsilon: Vector part (3,) of the orientation error, as in `spring_wrench`.
         J: Geometric Jacobian of the tool center (6, n).

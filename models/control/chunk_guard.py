@@ -25,8 +25,8 @@ class GuardedChunk:
     """Chunk within the limits."""
 
     outputs: np.ndarray  # outputs (K, O)
-    # Speed along the path of the requested chunk, relative to the requested speed; 1 for a projection and 0 for a
-    # fallback.
+    # Speed along the path of the requested chunk, relative to the requested speed; 1 in the mode "projection", and 0
+    # for a fallback.
     rate: float
     is_fallback: bool  # True if no chunk within the limits was found; `outputs` is then the rest of the previous result
 
@@ -47,7 +47,7 @@ class ChunkGuard:
     coupled outputs has a quadratic program of its own.
 
     Args:
-        constraints: Bounds of every output, G y ≥ c.
+        constraints: Bounds G y ≥ c of the outputs, the same at every step.
         velocity: Velocity limits v (O,) [unit/s], positive.
         jerk: Jerk limits j (O,) [unit/s³], positive.
         period: T, control period [s], positive.
@@ -57,7 +57,8 @@ class ChunkGuard:
         tolerance: Distance from the path (O,) that a slowdown accepts [unit], positive; a tenth of v T by default.
 
     Raises:
-        InputError: If an argument has the wrong shape or is out of range, or the start violates a constraint.
+        InputError: If an argument has the wrong shape or is out of range, the constraints change from step to step, or
+            the start violates a constraint.
     """
 
     def __init__(
@@ -95,7 +96,7 @@ class ChunkGuard:
         """Start again at rest at an output (O,) inside the constraints.
 
         Raises:
-            InputError: If it has the wrong shape or violates a constraint.
+            InputError: If the output has the wrong shape, is not finite or violates a constraint.
         """
         start, outputs = as_numbers(start, "the start"), self.constraints.num_outputs
         if start.shape != (outputs,) or not self.constraints.violation(start) <= TOLERANCE:
@@ -108,7 +109,8 @@ class ChunkGuard:
         The first command leads inside within the limits of velocity and jerk.
 
         Raises:
-            InputError: If it has the wrong shape or is not finite, or one step within the limits does not lead inside.
+            InputError: If the output has the wrong shape or is not finite, or one step within the limits does not lead
+            inside.
         """
         measured, outputs = as_numbers(measured, "the measured start"), self.constraints.num_outputs
         if measured.shape != (outputs,) or not np.isfinite(measured).all():
@@ -129,7 +131,7 @@ class ChunkGuard:
         """Return the chunk within the limits, and record its first `num_executed` steps as executed.
 
         Args:
-            chunk: Requested outputs (K, O), from the next control step on; values that are not finite are refused.
+            chunk: Requested outputs (K, O), finite, from the next control step on; K is at least `MIN_STEPS`.
             num_executed: Steps of the result that are executed before the next call, from 0 to K; all by default.
 
         Raises:
@@ -153,7 +155,7 @@ class ChunkGuard:
             plan: Rest of the previous result (n, O), n at least 1; returned if no chunk within the limits is found.
 
         Raises:
-            InputError: As `guard`.
+            InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite.
         """
         requested = as_numbers(chunk, "a chunk")
         outputs = self.constraints.num_outputs

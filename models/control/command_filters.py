@@ -28,7 +28,10 @@ class CommandLaw(Protocol):
         ...
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the state (S,) that follows the state `last`, and True if the law intervened in the command (O,)."""
+        """Return the state (S,) that follows the state `last`, and True if the law intervened.
+
+        `desired` is the desired command (O,).
+        """
         ...
 
 
@@ -70,7 +73,7 @@ class BarrierFilter(_LastCommand):
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if it differs from the desired one.
 
-        The last command is repeated if no allowed one is found, which can happen while the last one is not allowed.
+        The last command is repeated if no allowed command is found, as can happen while the last one is not allowed.
         """
         if not is_finite(desired):
             return last.copy(), True
@@ -95,15 +98,15 @@ class TangentSpaceFilter(_LastCommand):
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
     Far from a constraint this is the desired command; at a constraint the command only moves along the constraint.
-    Constraints that the step moves away from are left out, so that the command can leave them. The projection is only
-    accurate near the start of a step; a step that would cross a constraint is therefore shortened to end at it.
+    A satisfied constraint that the step moves away from is left out, so that the command can leave it. The projection
+    is only accurate near the start of a step; a step that would cross a constraint is therefore shortened to end at it.
 
     Args:
         keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.
         width: σ, slack at which motion towards a constraint is halved, positive [unit of a position].
 
     Raises:
-        InputError: If σ is not positive.
+        InputError: If σ is not positive and finite.
 
     Attributes:
         num_outputs: Number of outputs O.
@@ -137,7 +140,7 @@ class TangentSpaceFilter(_LastCommand):
 
 
 def _last_allowed(last: np.ndarray, goal: np.ndarray, G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the point (O,) nearest to `goal` with G y ≥ c on the line from `last`, which satisfies G y ≥ c."""
+    """Return the point (O,) nearest to `goal` with G y ≥ c on the line from `last`; `last` must satisfy G y ≥ c."""
     slack, change = G @ last - c, G @ (goal - last)
     share = np.min(np.divide(slack, -change, out=np.ones_like(slack), where=slack + change < 0.0), initial=1.0)
     return np.asarray(last + max(share, 0.0) * (goal - last))

@@ -33,7 +33,11 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
 
 
 def is_following(J: np.ndarray, v: np.ndarray, V: np.ndarray) -> bool:
-    """Return True if v (n,) moves the tool along V (6,): more than 1 % of V along it and at most 10 % across it."""
+    """Return True if joint velocities v (n,) move the tool along V (6,), or if V is slower than `STILL`.
+
+    The tool must move by more than 1 % of V along V, and by at most 10 % of V across it. J (6, n) and V are
+    [rotational, translational].
+    """
     actual, desired = TOOL_SCALE * (J @ v), TOOL_SCALE * V
     squared = float(desired @ desired)
     if squared < STILL**2:

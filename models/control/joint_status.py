@@ -95,7 +95,7 @@ class JointStatus:
 
 @dataclass(frozen=True)
 class Heartbeat:
-    """Heartbeat message of a robot-side safety monitor, sent with every status message."""
+    """Heartbeat message of a robot-side safety monitor, sent at each of its checks."""
 
     sequence: int  # sequence number, larger in each message
     is_stopping: bool  # True while the monitor stops the arm
@@ -107,12 +107,12 @@ class Heartbeat:
 
 
 MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
-"""Status that stands for a message that could not be decoded."""
+"""Status for a message that could not be decoded."""
 
 
 @dataclass(frozen=True)
 class StatusLimits:
-    """Plausibility limits of status messages; all are positive, settling time and drift of the clock may be zero.
+    """Plausibility limits of status messages, finite and positive; settling time and clock drift may be zero.
 
     Raises:
         InputError: If a limit is out of range, or there is no joint.
@@ -143,8 +143,11 @@ class StatusLimits:
     def at_rate(cls, velocity: Sequence[float], period: float, **others: float) -> "StatusLimits":
         """Return limits for a driver that sends a status every `period` [s].
 
-        The timeout is `MAX_MISSED_MESSAGES` periods. `velocity` are the velocity limits of the joints, (n,) [rad/s].
-        `others` are further limits by name.
+        `max_age`, `max_lead` and `max_check_interval` are `MAX_MISSED_MESSAGES` periods. `velocity` are the velocity
+        limits of the joints, (n,) [rad/s]. `others` are further limits by name.
+
+        Raises:
+            InputError: If a limit is out of range, or there is no joint.
         """
         timeout = MAX_MISSED_MESSAGES * period
         return cls(tuple(velocity), max_age=timeout, max_lead=timeout, max_check_interval=timeout, **others)

@@ -12,20 +12,21 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 class KeepOut:
     """Axis-aligned boxes that must not be entered and linear constraints, both with a margin.
 
-    A commanded position is projected to the nearest allowed one. The motion towards it stops before it would enter a
-    box, so that a large step cannot jump through a wall.
+    A desired position is projected onto the constraints, and out of a box through the nearest face. The motion towards
+    the result stops before it would enter a box, so that a large step cannot jump through a wall.
 
     Args:
         lower: Lower corners of the boxes (B, O).
         upper: Upper corners of the boxes (B, O); a box may extend to infinity.
         constraints: G y ≥ c on positions (O,), the same at every step.
-        margin: Distance from boxes and constraints, finite and not negative.
+        margin: Distance from boxes and constraints [unit of a position], finite and not negative.
 
     Raises:
-        InputError: If shapes do not match, a box is empty, or the margin is out of range.
+        InputError: If shapes do not match, a box is empty, the constraints change from step to step or contradict each
+            other with the margin, or the margin is out of range.
 
     Attributes:
-        margin: Distance from boxes and constraints [unit of a position].
+        margin: Distance from boxes and constraints.
     """
 
     _GAP = 1e-6  # distance from a box at which a motion stops, so that rounding cannot put it inside

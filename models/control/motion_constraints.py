@@ -124,7 +124,7 @@ class MotionConstraintFilter:
         period: Time between two commands h [s], positive.
 
     Raises:
-        InputError: If the period is not positive.
+        InputError: If the period is not positive and finite.
 
     Attributes:
         num_outputs: Number of outputs O.
@@ -311,4 +311,4 @@ class MotionLimits:
 
 
 FRANKA_LIMITS = MotionLimits((1.7, 13.0, 6500.0), (2.5, 25.0, 12500.0))
-"""Limits of a Cartesian motion that libfranka enforces for a Franka Emika Panda and an FR3."""
+"""Published limits of the Cartesian motion of a Franka Emika Panda; an FR3 has lower accelerations and jerks."""

@@ -40,7 +40,7 @@ class ConvexShape(ABC):
 
     @abstractmethod
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the signed distance of p (D,) from the set, negative inside, and its unit normal there (D,)."""
+        """Return the signed distance of p (D,) from the set, negative inside, and the outward unit normal (D,)."""
 
     def half_space(self, p: np.ndarray) -> tuple[np.ndarray, float]:
         """Return n (D,) and c of the half-space nᵀ y ≥ c outside of the shape, linearized at p (D,)."""
@@ -52,10 +52,10 @@ class ConvexShape(ABC):
         return self.surface(p)[0]
 
     def separate(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return n and c of a half-space outside of the shape that contains the line from p to q, if one exists.
+        """Return n (D,) and c of a half-space nᵀ y ≥ c outside of the shape that contains the line from p to q.
 
-        It is linearized at p or q if the result contains both, otherwise at the point of the line nearest to the shape;
-        if the line crosses the shape, the result does not contain all of it.
+        The shape is linearized at p or q (D,) if the half-space then contains both, otherwise at the point of the line
+        nearest to the shape. If the line crosses the shape, the half-space does not contain all of the line.
         """
         for at, other in ((p, q), (q, p)):
             n, c = self.half_space(at)
@@ -151,7 +151,7 @@ class Cylinder(ConvexShape):
         margin: Distance to keep, not negative.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range, or both centers are the same point.
     """
 
     num_dims = 3

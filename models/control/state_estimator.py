@@ -1,6 +1,6 @@
 """Estimator of a robot's joint state that compares status messages with each other, with the clock and with a model.
 
-Used by the hardware station (`StatusWatchdog`) and by the safety monitor. docs/robot.md derives the thresholds.
+The hardware station (`StatusWatchdog`) and the safety monitor use it. docs/robot.md derives the thresholds.
 """
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.models.control.message_sequence import RESOLUTION
 
-ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # faults in spite of a valid status
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # a status with them is accepted
 # Faults after which the message is dropped, and the next one is compared with the last readable status. After a fault
 # in neither of the two lists, statuses are in doubt until all have been valid for the settling time. A status in doubt
 # is only accepted if it agrees with the prediction.
@@ -46,7 +46,7 @@ class EstimatorState:
 
     check_time: float  # local time of the next check [s]
     receipt_time: float  # local time of the last readable status [s]
-    fault: float  # last fault, a code of `Fault`
+    fault: float  # last fault, a code of `Fault`; `NONE` after the settling time
     fault_time: float  # local time of that fault [s]
     doubt_time: float  # local time of the last fault that put statuses in doubt [s]; NaN if none
     early: float  # sum of the recent corrections of the clock offset for early statuses [s]
@@ -110,7 +110,7 @@ class Estimate:
     """Result of a check."""
 
     fault: Fault  # present or recent fault, or `Fault.NONE`
-    age: float  # age of the accepted status relative to the earliest arrival [s]; infinite before the first
+    age: float  # age of the accepted status by the synchronized clocks [s]; infinite before the first
     is_new: bool  # True if a status is accepted at this check
     state: EstimatorState  # state for the next check; has the accepted values and the velocity estimate
 
@@ -124,12 +124,13 @@ class StateEstimator:
     - *Equal values*: a joint whose velocity or positions show motion does not repeat its position or its velocity to
       the bit in consecutive statuses. No joint repeats position, velocity and external torque together while another
       joint moves.
-    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋|; deviations, added up with a decay, stay within
-      the position tolerance.
-    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay,
+    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses, h apart, with the velocities v₋
+      and v; deviations, added up with a decay, stay within the position tolerance.
+    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v), h being the time between two checks, and
+      m = Σ M Δv, both with a decay,
       |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
       The last term, with a faster decay, accepts collisions, which change the velocity before the external torque. It
-      is zero for a joint that does not react.
+      is zero for a joint that does not react. Δv_noise and Δv_max are `velocity_noise` and `velocity_jump`.
 
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
@@ -144,7 +145,8 @@ class StateEstimator:
 
     Args:
         limits: Plausibility limits of a status.
-        torque_tolerance: Largest error of each joint's torque [Nm], positive: friction, gravity compensation, sensor.
+        torque_tolerance: Largest error of each joint's torque, (n,) [Nm], positive: friction, gravity compensation,
+            sensor.
         period: Period of the check [s], positive.
 
     Raises:
@@ -239,7 +241,10 @@ class StateEstimator:
         return self._finish(state, before, fault, now, age)
 
     def advance(self, estimate: Estimate, torque: np.ndarray) -> EstimatorState:
-        """Return the state for the next check, until which the torques (n,) [Nm] are in effect."""
+        """Return the state for the next check, until which the torques (n,) [Nm] are in effect.
+
+        A torque that is NaN or infinite counts as zero.
+        """
         state = estimate.state
         torque = np.where(np.isfinite(torque), torque, 0.0)
         return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))

@@ -70,10 +70,10 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
 
 
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
-    """Move a bound straight towards another one, so that no number changes by more than `max_change`.
+    """Move a bound straight towards the bound `target`, so that no number changes by more than `max_change`.
 
-    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line. All bounds
-    are signals (8,), and `max_change` (8,) is positive.
+    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line. Both bounds
+    are finite signals (8,), and `max_change` (8,) is positive.
     """
     change = target - bound
     excess = float(np.max(np.abs(change) / max_change))
@@ -97,8 +97,8 @@ def slow_down(
 
     d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: on the way to its rest position, the spring returns
-    at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], and
-    `force` is F [N].
+    at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s],
+    `impedance` is √(k m) [N s/m], and `force` is F [N].
     """
     speed = norm(velocity)
     if speed == 0.0 or spring.dot(velocity) <= 0.0:
@@ -116,17 +116,17 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
 def bounded_wrench(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, mass: float, bound: WrenchBound
 ) -> np.ndarray:
-    """Compute s − β D v, with the clipped spring s and the largest share β ≤ 1 of the damper that the bound allows.
+    """Compute s − β d (6,) with the clipped spring s and the largest share β ≤ 1 of the damper d in the bound.
 
     The clipped spring has a potential, and the damper only dissipates at every share: for a constant bound and rest
     position the law is passive.
 
     Args:
-        spring: Wrench of the spring (6,).
-        damping: Wrench of the damper D V (6,).
+        spring: Wrench of the spring (6,) [N, Nm].
+        damping: Wrench d of the damper (6,) [N, Nm].
         velocity: Translational velocity (3,) [m/s].
         mass: Moving mass in the direction of the velocity [kg].
-        bound: Bound.
+        bound: Bound, along the axes of the wrenches.
     """
     s = clip_wrench(spring, bound.axes, bound.force, bound.torque)
     impedance = approach_impedance(bound.contact_stiffness, mass)
@@ -169,10 +169,10 @@ def governed_error(
     reduced by (K h + D) |v₀|.
 
     Args:
-        stiffness: Stiffness (6,) K of each coordinate.
-        damping: Damping (6,) D of each coordinate.
-        error: Pose error (6,) e.
-        velocity: Velocity (6,) v₀ before the step.
+        stiffness: Stiffness (6,) K of each coordinate [N/m, Nm/rad], positive.
+        damping: Damping (6,) D of each coordinate [N s/m, Nm s/rad].
+        error: Pose error (6,) e [m, rad].
+        velocity: Velocity (6,) v₀ before the step [m/s, rad/s].
         mass: Moving mass [kg].
         step: Time step h [s].
         bound: Bound, with axes in the order of the coordinates.
@@ -194,7 +194,7 @@ def governed_error(
 def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
     """Compute the center of pressure (−τ_y, τ_x) / f_z (2,) [m] of a wrench about the tool center (6,), force first.
 
-    Below the normal force `min_force` [N] the result is zero, because the quotient is not reliable.
+    Below the normal force `min_force` [N], positive, the result is zero, because the quotient is not reliable.
     """
     if wrench[2] < min_force:
         return np.zeros(2)
@@ -268,9 +268,9 @@ def admissible_change(
     caller applies a lower limit at once, which removes energy.
 
     Args:
-        stiffness: Stiffness (n,).
-        limits: Limits (n,) before and after the change.
-        errors: Reference minus measured pose (n,) before and after the change.
+        stiffness: Stiffness (n,) [N/m, Nm/rad], positive.
+        limits: Limits (n,) before and after the change [N, Nm].
+        errors: Reference minus measured pose (n,) before and after the change [m, rad].
         energy: Largest energy of the springs [J].
     """
 

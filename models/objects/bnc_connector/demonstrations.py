@@ -4,9 +4,9 @@ The scripted demonstrator replaces the human hand of the thesis (section 4.4.2).
 station with impedance control. The files hold the commanded and the measured poses. A primitive learns the commanded
 ones, because the push is the difference between commanded and measured poses.
 
-- Insertion, for a jack at a known position: the motions differ randomly. The demonstrator approaches the jack roughly,
-  wanders over the rim with a light push until the plug drops in, is precise where the connector guides the motion, and
-  varies its speed.
+- Insertion, for a jack at a known position: the motions differ randomly. The demonstrator approaches the jack
+  imprecisely, wanders over the rim with a light push until the plug drops in, is precise where the connector guides the
+  motion, and varies its speed.
 - Search, for a jack at an uncertain position: the demonstrator circles around the expected position with a light push,
   and then inserts the plug. The five circles begin a fifth of a turn apart. During the search the five positions are
   always evenly spaced on a circle. Until the plug drops in, their mean is the center of the circle, and their
@@ -35,7 +35,7 @@ NUM_DEMONSTRATIONS = 5
 NUM_STEPS = 400
 
 QUARTER_TURN = np.pi / 2
-# Heights of the plug in the locked frame.
+# Heights of the plug in the locked frame [m].
 CLEAR = 15.5 * MM  # above the jack
 RIM = 10.5 * MM  # on the barrel's rim
 # A command lies below the surface that stops the plug: under impedance control the difference is the push.
@@ -81,13 +81,13 @@ def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:
 
 
 def insert_and_lock() -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and desired poses (N, 6) of the whole motion for a jack at a known position."""
+    """Return times (N,) [s] and desired poses (N, 6) of the N waypoints of an insertion at a known position."""
     times, z, yaw = WAYPOINTS.T
     return times, poses(z, yaw)
 
 
 def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
-    """Return the desired poses (M, N, 6) of M insertions at `times` (N,) [s], in the locked frame."""
+    """Return the desired poses (M, N, 6) of the M demonstrated insertions at `times` (N,) [s], in the locked frame."""
     rng = np.random.default_rng(seed)
     script_times, script = insert_and_lock()
     scripted, curves = [], []
@@ -149,7 +149,7 @@ _SEARCH_CORRELATION = 0.3  # correlation time [s]
 
 
 def search_motions(seed: int, times: np.ndarray, push: float = LIGHT_PUSH) -> np.ndarray:
-    """Return the desired poses (M, N, 6) of M searches at `times` (N,) [s], in the locked frame.
+    """Return the desired poses (M, N, 6) of the M demonstrated searches at `times` (N,) [s], in the locked frame.
 
     `push` is the distance of the command below the rim at the beginning of the search [m].
     """

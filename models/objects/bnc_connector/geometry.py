@@ -1,9 +1,9 @@
 """Geometry of a BNC bayonet connector at true scale: a jack with two lugs and a plug whose ring has two slots.
 
-Frames. The jack frame J lies at the bottom of the barrel's center line, z along the barrel to its open end, x through
-the lugs. The plug frame P lies in the plane of the ring's mouth, z from the mouth to the cable, x through the entries
-of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by minus `detent_angle`, and is locked at
-X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
+Frames. The origin of the jack frame J is the bottom of the barrel's center line; z points along the barrel to its open
+end, and x through the lugs. The origin of the plug frame P is the center of the ring's mouth; z points from the mouth
+to the cable, and x through the entries of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by
+minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
 Contact. The ring has two open rigid surfaces: a bore that collides only with the barrel, and a pair of slots that
 collide only with the lugs. These surfaces have a third of the triangles of a closed ring, and their contact is computed
@@ -69,7 +69,7 @@ class BncDimensions:
         return round(self.bore_radius - self.barrel_radius, 9)
 
     def with_bore_clearance(self, clearance: float) -> "BncDimensions":
-        """Return the dimensions with a bore of another clearance."""
+        """Return the dimensions with a bore of another clearance on each side [m]."""
         return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 
     @property
