@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationKind:
-    """Kind of station."""
+    """Entry of the registry: how a station is built, and what it needs."""
 
     name: str  # name for `station=`
-    build: Callable[..., Station]  # function that builds the station from a workcell and options by name
+    build: Callable[..., Station]  # builder; its arguments are a workcell, and the options by name
     workcell_kind: str  # kind of workcell that the station needs, such as "insertion" for a workpiece and a fixture
     options: type[Options] | None  # class of the station's environment options; None if it has none
     description: str  # summary in one line
@@ -41,8 +41,11 @@ def register_station(
     Args:
         name: Name for `station=`.
         workcell_kind: Kind of workcell that the station needs.
-        options: Class of the station's environment options.
-        is_simulated: True for a simulation.
+        options: Class of the station's environment options; None if it has none.
+        is_simulated: True for a simulation: a reset can set its state.
+
+    Raises:
+        InputError: When the decorator is applied, if another station has that name.
     """
 
     def add(build: Any) -> Any:

@@ -21,7 +21,7 @@ class Workcell(Protocol):
     """Objects of a task.
 
     A station calls `add_fixture`, `add_workpiece` and, in Drake, `filter_contacts` in this order for its simulated
-    plant. The plant of a controller has the workpiece only, so `add_workpiece` may be called for that plant first.
+    plant. A controller's plant contains only the workpiece, so `add_workpiece` may be called for that plant first.
 
     The tool center P is at the target frame T when the task is done; all poses of a station are X_TP. Objects are added
     at their nominal poses; offsets of an episode are set in the context.

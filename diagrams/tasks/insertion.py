@@ -80,7 +80,8 @@ class InsertionTask(Task):
         simulated_rewards: Rewards that use components of the workpiece's pose that a robot cannot measure.
         snaps_in: True if the bounded force cannot pull out an inserted workpiece, so that on hardware the operator
             releases it after a success.
-        offsets: Sampler of the offsets; it stores the hidden values of a run.
+        offsets: Sampler of the offsets; it stores the hidden values of a run. A subclass sets it.
+        collision: Signal and limit of the contact force [N]. A subclass sets it.
     """
 
     Reset: ClassVar[type[ResetOptions]] = InsertionReset
@@ -93,10 +94,11 @@ class InsertionTask(Task):
     offsets: HiddenOffsets
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
-        """Return the workpiece's actual pose in the fixture, (6,): position and rotation vector, offsets included.
+        """Return the workpiece's actual pose in the fixture, (6,): position [m] and rotation vector [rad].
 
-        On hardware the pose is estimated from the robot's own pose, if the task defines `observable_success`. If the
-        force limit is sampled, it is the signal `force_limit`, and the signal `max_wrench` limits the station's force.
+        In simulation, the signal `hidden_offset` (3,) is the fixture's offset: x, y [m] and turn [rad]. On hardware the
+        workpiece's pose is estimated from the robot's own pose, if the task defines `observable_success`. If the force
+        limit is sampled, it is the signal `force_limit` [N], and the signal `max_wrench` limits the station's force.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -212,8 +214,9 @@ def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransfo
     """Convert offsets to the poses of the actual target frame in the nominal one and of the workpiece in the tool.
 
     Args:
-        fixture: (x, y) of the fixture [m], and its turn about z [rad] if it has one.
-        workpiece: (x, y) of the workpiece in the tool [m], and its tilt about x and y [rad] if it has one.
+        fixture: Offset of the fixture, (2,) or (3,): x, y [m], and optionally its turn about z [rad].
+        workpiece: Offset of the workpiece in the tool, (2,) or (4,): x, y [m], and optionally its tilt about x and y
+            [rad].
     """
     turn = RotationMatrix.MakeZRotation(fixture[2]) if len(fixture) > 2 else RotationMatrix()
     tilt = RotationMatrix(RollPitchYaw(*workpiece[2:], 0.0)) if len(workpiece) > 2 else RotationMatrix()
@@ -226,7 +229,7 @@ REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
 # Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
 # terminal reward alone, a success by random motion would therefore earn as much as a success by use of the contact,
-# although random motion succeeds less reliably. The path from start to lock is 15.6 mm long, with the last 5.5 mm in
+# although random motion succeeds less reliably. The path from start to lock is 15.6 mm long, with the last 10.5 mm in
 # the jack.
 DEPTH_REWARD = 5.0
 # Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
@@ -248,10 +251,11 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
 
 
 def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return the seven symmetries of a plug on the rim: quarter turns about the axis, and reflections.
+    """Return the seven symmetries of a plug on the rim: three turns about the axis, and four reflections.
 
-    Vectors across the axis are rotated or reflected; a reflection also changes the sign of torques and tilts, which are
-    axial vectors. Components of pose and wrench along and about the axis are unchanged.
+    Vectors across the axis are rotated or reflected. Torques and tilts are axial vectors, so that a reflection also
+    changes their sign. Components of pose and wrench along and about the axis are unchanged; a reflection changes the
+    sign of the fixture's turn in a privileged observation.
 
     Returns:
         Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if

@@ -63,10 +63,10 @@ _REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 class HiddenOffsets(ABC):
     """Sampler of the actual offsets of fixture and workpiece at every reset.
 
-    An offset is (x, y) [m] in the target frame, after which a subclass may have angles [rad]; see `part_poses`. A
-    run begins at the first reset, and at every reset with the option `new_run`. The option `held_out` samples the
-    episode from a random stream that training never uses; the run's hidden offset stays the same. The option
-    `offset` (x, y) [m] replaces the sample.
+    An offset is (x, y) [m], of the fixture in the target frame or of the workpiece in the tool. A subclass may append
+    angles [rad]; see `part_poses`. A run begins at the first reset, and at every reset with the option `new_run`. The
+    option `held_out` samples the episode from a random stream that training never uses; the run's hidden offset stays
+    the same. The option `offset` (x, y) [m] replaces the sample.
     """
 
     def __init__(self, kind: str = "per_run"):

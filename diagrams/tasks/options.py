@@ -21,7 +21,7 @@ CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 # Variance ρ of the history [m², rad²]; the thesis's 1e-8, (0.1 mm)², is too large for demonstrations that vary by 1 mm.
 HISTORY_VARIANCE = 1e-11
 
-# Standard deviation of a hand's repeatability [x y z Rz Ry Rx], added to the demonstrations' covariance.
+# Standard deviation of a hand's repeatability, x y z [m] and Rz Ry Rx [rad]. Its square is added to fitted variances.
 REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE)
 
 # Observations and rewards of `DemonstratedInsertion`.
@@ -56,7 +56,7 @@ class FixtureOffsetOptions(Options):
     """Options of a task with a fixture that is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run", description="offset of the fixture: sampled per run, per episode, or none"
+        "per_run", description="offset of the fixture: sampled per run or per episode; none: within 0.3 mm per episode"
     )
     offset_range: OffsetRange | None = Field(
         None, description="smallest and largest offset of the fixture [m]; default: that of fixture_offset"
@@ -73,7 +73,7 @@ class ReferenceOptions(Options):
     )
 
     def fit_arguments(self) -> dict[str, Any]:
-        """Return the arguments of `ReferenceTrajectory.from_demonstrations` that differ from their defaults."""
+        """Return arguments of `ReferenceTrajectory.from_demonstrations`, without options that have their default."""
         arguments = {"reference_model": "model", "gap_scale": "gap_scale", "prior_std": "prior_std"}
         fields = type(self).model_fields
         given = {name: getattr(self, name) for name in arguments if name in fields}
@@ -110,11 +110,11 @@ class ForceOptions(Options):
     )
     force_limit_range: ForceRange | None = Field(
         None,
-        description="sample the force limit of every episode between these two, and let the policy observe it [N]; "
-        "default: force_limit",
+        description="sample the force limit of every episode between these two [N]; the policy observes it, except "
+        "with observation=image; default: force_limit",
     )
     bounded_force: bool = Field(
-        True, description="limit the impedance, so that its force cannot pass force_limit; without it: 40 N per axis"
+        True, description="limit the impedance so that its force stays below force_limit; if false: 40 N per axis"
     )
 
     @property

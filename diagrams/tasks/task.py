@@ -145,6 +145,9 @@ class Task(ABC):
 
         Args:
             config: Configuration of the environment.
+
+        Raises:
+            InputError: If the control period is not a whole multiple of `time_unit`.
         """
         self.config = config
         self.options = config.parts["task"]
@@ -307,7 +310,7 @@ class Task(ABC):
 
     @classmethod
     def provides(cls) -> tuple[str, ...]:
-        """Return the kinds of prior knowledge that the task provides, names in `REQUIREMENTS`."""
+        """Return the kinds of prior knowledge that the task provides: keys of `guidance.registry.REQUIREMENTS`."""
         methods = {
             "demonstrations": "reference",
             "keep_out": "keep_out",

@@ -2,7 +2,7 @@
 
 A third of the sequences are the signs of impulse responses, which reach a bound exactly if no constraint is active. A
 third are actions of ±1 that change sign periodically or at random. A third are variations of one of the worst sequences
-so far; a variation that is worse replaces it.
+so far, which a variation with a larger value replaces.
 """
 
 from dataclasses import dataclass, field
@@ -17,7 +17,10 @@ DWELLS = (1, 1, 2, 3, 5, 10, 20, 50, 100)  # steps between two changes of sign
 
 @dataclass
 class AttackResult:
-    """Worst values that an adversary reached; excess and residue at one step, and in total over a sequence."""
+    """Worst values that an adversary reached.
+
+    The rows of `excess` and `residue` are the largest value at one step, and the largest sum over a sequence.
+    """
 
     # Largest value of each quantity at every step (N, O): distance from the motion without actions, speed and
     # acceleration in the outputs' units per s and s².
@@ -30,8 +33,8 @@ class AttackResult:
     residue: np.ndarray
     steps: int = 0  # number of executed steps
     corrected: int = 0  # number of steps with a correction
-    # Worst value with its actions (N, A) and start (O,), by quantity, output and kind of step: True for the steps at
-    # which a constraint can be active, False for the others.
+    # Worst value with its actions (N, A) and start (O,), by quantity, output (for "excess": action) and kind of step:
+    # True for the steps at which a constraint can be active, False for the others.
     worst: dict[tuple[str, int, bool], tuple[float, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
@@ -139,7 +142,7 @@ class Adversary:
         return loop.start + offset * loop.start_within
 
     def _switching_actions(self) -> tuple[np.ndarray, np.ndarray]:
-        """Sample actions of ±1 that change sign: periodically for all outputs together, or at random for each."""
+        """Sample actions of ±1 that change sign: periodically in all entries at once, or at random in each entry."""
         steps, size = self._loop.primitive.num_steps, len(self._moved)
         dwell = self._rng.choice(DWELLS)
         if self._rng.uniform() < 0.5:

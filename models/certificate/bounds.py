@@ -5,8 +5,9 @@ are the impulse responses. Its half-width along a direction is the sum of the ab
 that direction. Three regimes are certified:
 
 - *free*: all sequences, until a constraint becomes active. These bounds are exact.
-- *always*: all sequences. Where no constraint of the window can be active (with a history: up to the first step where
-  one can), the bounds are those of *free*. Elsewhere, a constrained output is bounded by the constraints themselves.
+- *always*: all sequences. The window of a step is this step and its H future points with constraints. Where no
+  constraint of the window can be active (with a history: before the first step where one can), the bounds are those of
+  *free*. Elsewhere, a constrained output is bounded by the constraints themselves.
   Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
   a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
   corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖²,
@@ -45,17 +46,20 @@ class CertifiedBounds:
     free: Bounds  # bounds until a constraint becomes active
     always: Bounds  # bounds for all sequences
     can_be_active: np.ndarray  # mask (N,) of the steps at which some actions make a constraint of the window active
-    # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F), at the T steps of `can_be_active` and every corner
-    # of the action cells; empty with a history.
+    # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F): for the T steps of `can_be_active`, the corners of
+    # the K cells along each of A actions, the points of the window, and its F constraints each. Empty with a history.
     multipliers: np.ndarray
     budgeted: BudgetedBounds | None = None  # bounds for corrections within a budget, or None
 
 
 def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBounds:
-    """Compute the bounds of a loop; without a budget or a history, the regime *budgeted* is skipped.
+    """Compute the bounds of a loop.
+
+    The regime *budgeted* is skipped without a budget, without a history, or if no constraint can be active.
 
     Raises:
-        InputError: If a primitive without a history has more than `MAX_ACTIONS` actions.
+        InputError: If a primitive without a history has more than `MAX_ACTIONS` actions, or its constraints leave less
+            room than twice `CORNER_MARGIN`.
     """
     primitive = loop.primitive
     middle, generators = reach(loop)
@@ -76,10 +80,10 @@ def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBound
 
 
 def action_cells(gains: np.ndarray) -> tuple[np.ndarray, list[list[int]]]:
-    """Divide the actions into cells, given the null-space units per action (O,).
+    """Divide the actions into cells, given the null-space action per unit of the action, `gains` (O,).
 
     Returns:
-        The corners (C, O) of all cells as raw actions, and the indices of the corners of each cell.
+        The corners (C, O) of all cells as null-space actions, and the indices of the corners of each cell.
 
     Raises:
         InputError: If there are more than `MAX_ACTIONS` actions.
@@ -211,8 +215,8 @@ def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarra
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)
     upper = np.where(is_corrected, np.minimum(corrected_bounds[1], high), free.upper)
-    # Values at each step and at the two steps before it. Before the first step, the robot rests at a pose within the
-    # start.
+    # Values at each step and at the two steps before it. Before the first step, the robot rests at a pose in the box of
+    # starts.
     least = np.vstack([[loop.start - loop.start_within] * 2, lower])
     greatest = np.vstack([[loop.start + loop.start_within] * 2, upper])
     recent = np.vstack([np.zeros((2, lower.shape[1]), bool), is_corrected])

@@ -159,9 +159,12 @@ LOCKED_STEPS = 3  # consecutive steps with a locked plug that count as success, 
 
 
 def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
-    """Return the reference of demonstrations, shipped or in a file, fitted once per process.
+    """Return the reference trajectory of demonstrations, fitted once per process.
 
-    The first `count` demonstrations are used. Further arguments are those of `ReferenceTrajectory.from_demonstrations`.
+    Args:
+        demonstrations: Name in `DEMONSTRATIONS`, or path of a file .npz or .csv.
+        count: Number of demonstrations that are used, from the first on; None: all.
+        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
     """
     return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
 
@@ -184,7 +187,7 @@ SCALED_RIM = (RIM - 1.2 * MM - POSE_CENTER[2]) / POSE_SCALE[2]  # scaled height 
 CONTACT_FORCE = 0.2  # scaled force along z above which the plug is in contact
 
 # Parameters of `scripted_center_of_pressure`, for the demonstrations "search".
-STEP = 0.5 * MM  # change of the command from one action to the next [m]
+STEP = 0.5 * MM  # largest change of the command from one action to the next [m]
 REACH = 3.1 * MM  # displacement of the command at an action of 1 [m]
 ON_RIM = RIM - 0.5 * MM  # height above which the plug is not inserted [m]
 MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the rim [s]
@@ -203,7 +206,7 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) that moves the command one step towards the center of pressure, and so towards the jack.
+    """Return an action (2,) that moves the command at most `STEP` towards the center of pressure, and so to the jack.
 
     Once the plug has dropped into the jack, the command is constant until the search ends. Outside the time of the
     search the action is zero. The last command is read from the observation, so that the policy has no state.

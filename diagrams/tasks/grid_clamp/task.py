@@ -105,9 +105,8 @@ class GridClampWorkcell(MovableWorkcell):
 
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # reward per distance descended [1/m], cost per squared force [1/N²]
-# Reward per distance gained towards the holes' axis [1/m], large because steps are fractions of a millimeter.
-# Terminal reward of a collision. It makes an early collision cost more than a long episode of gentle pressing.
-ALIGNMENT, COLLISION_REWARD = 3000.0, -25.0
+ALIGNMENT = 3000.0  # reward per distance gained towards the holes' axis [1/m]; steps are fractions of a millimeter
+COLLISION_REWARD = -25.0  # terminal reward; an early collision costs more than a long episode of gentle pressing
 
 
 def _force_cost(wrench: np.ndarray) -> float:
@@ -162,7 +161,7 @@ class GridClampUncertainty(HiddenOffsets):
         return np.zeros(2), offset
 
 
-SEATED_STEPS = 3  # consecutive control steps that count as seated
+SEATED_STEPS = 3  # consecutive steps with a seated clamp that count as success, at the default control period
 
 # Largest distance between robot and command [m]. At this distance the impedance pushes with 12 N, twice the force that
 # snapping in needs.
@@ -193,11 +192,11 @@ STIFFNESS = Impedance().stiffness[0]
 
 
 def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
-    """Return the inputs (3,) in [−1, 1] of a memoryless search, for a scaled position and force, (6,).
+    """Return the inputs (3,) in [−1, 1] of a memoryless search.
 
-    Above the table the clamp moves to the start of the first lane. On the table it presses lightly and follows the
-    lanes in alternating directions. In a hole it yields to lateral forces, and pushes down until it snaps in, with at
-    most `snap_force` [N].
+    The observation begins with the scaled position (3,) and force (3,). Above the table the clamp moves to the start of
+    the first lane. On the table it presses lightly and follows the lanes in alternating directions. In a hole it yields
+    to lateral forces, and pushes down until it snaps in, with at most `snap_force` [N].
     """
     position, force = observation[:3] * SCALE[:3] + CENTER[:3], observation[3:6] * SCALE[3:]
     command = position - force / STIFFNESS  # the impedance's spring separates command and position
@@ -270,7 +269,7 @@ class GridClamp(InsertionTask):
         return self._workcell
 
     def template(self) -> PlacedTemplate:
-        """Return the template with one state: an upright clamp in a cuboid above the hole."""
+        """Return the template with one state: an upright clamp in a cuboid around the axis of the middle hole."""
         active = self.config.options["active_constraints"]
         return PlacedTemplate(TEMPLATE, {"hole": RigidTransform()}, active, MAX_TRACKING_ERROR)
 
@@ -340,7 +339,7 @@ class GridClamp(InsertionTask):
         return front_camera(np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01], distance=0.17, height=0.075)
 
     def scene(self) -> Scene:
-        """Return the drawing of the cuboid that bounds commands, up to the start height."""
+        """Return the drawing of the cuboid that bounds commands, up to 25 mm above the target."""
         to_world, parameters = in_frame(self._workcell.X_WT), TEMPLATE.parameters
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))

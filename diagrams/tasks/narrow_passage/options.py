@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.options import ReferenceOptions
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
-SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, half way through the wide part behind the gap, on the mean demonstration
+SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, on the mean demonstration half way from the gap to the goal
 HARD: Mapping[str, Any] = {
     "gap_width": 0.03,
     "obstacle_radius": 0.08,
@@ -21,7 +21,7 @@ HARD: Mapping[str, Any] = {
     "obstacles_end": True,
     "start_deviation": 0.03,
 }
-"""Options of difficulty="hard": half the gap, and two obstacles on sampled sides that end the episode when touched."""
+"""Options of difficulty="hard": half the gap width, and two obstacles on sampled sides that must not be touched."""
 
 
 class NarrowPassageOptions(ReferenceOptions):
@@ -36,19 +36,24 @@ class NarrowPassageOptions(ReferenceOptions):
     obstacle_radius: Number = Field(
         DEFAULT_GEOMETRY.obstacle_radius, ge=0.01, le=0.1, description="radius of the obstacles [m]"
     )
-    second_obstacle: bool = Field(False, description="add an obstacle behind the gap")
+    second_obstacle: bool = Field(False, description="add an obstacle between the gap and the goal")
     obstacle_beside: Number = Field(
         0.0,
         ge=0,
         le=0.1,
-        description="sampled lateral offset of the obstacles, alternately left and right [m]",
+        description="offset of the obstacles along x [m], alternately to the left and right; the first side is sampled",
     )
     obstacles_constrain: bool = Field(
-        False, description="keep every command of a primitive outside of the obstacle, which must not be sampled"
+        False,
+        description="keep every command of a primitive outside of the one fixed obstacle; not with second_obstacle, "
+        "obstacle_beside or obstacles_end",
     )
     obstacles_end: bool = Field(False, description="end the episode as a collision when an obstacle is touched")
     start_deviation: Number = Field(
-        0.0, ge=0, le=0.05, description="standard deviation of the start along x and y [m]; 0: held-out starts only"
+        0.0,
+        ge=0,
+        le=0.05,
+        description="standard deviation of the start along x and y [m]; 0: only held-out starts vary",
     )
 
     @property

@@ -95,7 +95,8 @@ class NarrowPassage(Task):
     """Pass the gap to the goal.
 
     Rewards: "sparse" is the thesis's (4.22 to 4.25), "shaped" adds the distance gained towards the goal in centimeters.
-    Observations: "state" is the time in [−1, 1] (the thesis's policy state), "image" is 110 × 144 × 3.
+    Observations: "state" is the time in [−1, 1] (the thesis's policy state), followed by the obstacles' positions if
+    `obstacle_beside` is positive; "image" is 110 × 144 × 3.
     """
 
     workcell_kind = "plane"
@@ -121,7 +122,10 @@ class NarrowPassage(Task):
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         if self.options.obstacles_constrain and self.options.has_sampled_obstacles:
-            raise InputError("obstacles_constrain needs an obstacle that is not sampled: leave its options out")
+            raise InputError(
+                "obstacles_constrain needs the one fixed obstacle: leave out second_obstacle, obstacle_beside and "
+                "obstacles_end"
+            )
         self._geometry = self.options.workcell()
         self.num_steps = round(demonstrations.NUM_STEPS * self.default_control_period / self.control_period)
 
@@ -158,7 +162,7 @@ class NarrowPassage(Task):
         return self._geometry.keep_out()
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return the phase and sampled obstacles, or the camera above the plane, with +y to the right."""
+        """Return the phase and sampled obstacles, or the camera above the plane, whose image has +y to the right."""
         if self.config.observation == "state":
             offset = self.options.obstacle_beside
             obstacles = ObservationTerm("obstacles", self._geometry.obstacles.ravel(), offset or 1.0)
@@ -216,7 +220,11 @@ class NarrowPassage(Task):
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles at sampled sides."""
+        """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles at sampled sides.
+
+        Raises:
+            InputError: If a coordinate of the start is larger than `MAX_START`.
+        """
         start, obstacles = reference_trajectory().means[0].copy(), self._geometry.obstacles
         deviation = self._start_deviation(options.held_out)
         if self.options.has_sampled_obstacles or self.options.start_deviation > 0:
@@ -239,7 +247,7 @@ class NarrowPassage(Task):
         return {"start": start, "obstacles": obstacles}
 
     def start_within(self) -> float:
-        """Return the largest start offset of a reset, training or held-out [m]."""
+        """Return the largest start offset along x and y of a reset, training or held-out [m]."""
         return MAX_DEVIATIONS * max(self._start_deviation(held_out) for held_out in (False, True))
 
     def _start_deviation(self, held_out: bool) -> float:

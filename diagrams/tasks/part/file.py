@@ -57,8 +57,8 @@ class Piece(Options):
     """Collision mesh."""
 
     file: str = Field(
-        description="file next to this one, in the target frame [m]: OBJ (convex if compliant), or VTK with tetrahedra "
-        "(compliant)"
+        description="file in the task folder, in the target frame [m]: OBJ (convex if compliant), or VTK with "
+        "tetrahedra (compliant)"
     )
     modulus: Number | None = Field(
         None, gt=0, description="hydroelastic modulus of a compliant mesh [Pa]; default: rigid"
@@ -122,7 +122,7 @@ class Tolerance(Options):
     height: Number = Field(0.5 * MM, gt=0, description="along z [m]")
     lateral: Number = Field(1.0 * MM, gt=0, description="across z [m]")
     turn: Number = Field(4.0, gt=0, description="about z [degrees]")
-    steps: int = Field(3, ge=1, description="consecutive control steps that count as success")
+    steps: int = Field(3, ge=1, description="consecutive steps that count as success, at the default control period")
 
     def accepts(self, plug: np.ndarray) -> bool:
         """Return True if a plug is at the target.
@@ -137,7 +137,7 @@ class Tolerance(Options):
 
 
 class Bounds(Options):
-    """Bounds of every command, [x y z Rz Ry Rx]: one list for all steps, or one list for each phase."""
+    """Bounds of every command, [x y z Rz Ry Rx] in m and rad: one list for all steps, or one list for each phase."""
 
     lower: tuple[Any, ...]
     upper: tuple[Any, ...]
@@ -322,7 +322,8 @@ def read_task_file(folder: Path) -> PartTaskFile:
     """Read the task of a folder.
 
     Raises:
-        InputError: If the folder is missing or not a task, a value is invalid, or a named file is missing.
+        InputError: If the folder is missing or not a task, a value is invalid, or a named file is missing or not in the
+            folder.
     """
     path = folder / FILE_NAME
     if not folder.is_dir():
@@ -358,7 +359,11 @@ def task_folder_digest(folder: Path) -> str:
 
 
 def write_task_file(folder: Path, file: PartTaskFile) -> Path:
-    """Write `task.yaml` with numbers of nine significant digits, and return its path."""
+    """Write `task.yaml` with numbers of nine significant digits, and return its path.
+
+    Raises:
+        InputError: If the file cannot be written.
+    """
     path = folder / FILE_NAME
     values = _plain(file.model_dump())
     text = yaml.safe_dump(values, sort_keys=False, width=110, default_flow_style=None)

@@ -59,7 +59,7 @@ PLUG, SOCKET = "plug", "socket"
 
 @dataclass(frozen=True)
 class PartWorkcell(MovableWorkcell):
-    """Socket in the world and plug in the tool; the vertices of the assembled parts are given in the target frame."""
+    """Socket in the world and plug in the tool; both meshes have the coordinates of the assembled parts, in T."""
 
     fixture: ClassVar[str] = SOCKET
     workpiece: ClassVar[str] = PLUG
@@ -130,7 +130,7 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
-MIN_PUSH = 1.5 * MM  # smallest distance beyond the play by which a push displaces the command of a seated plug [m]
+MIN_PUSH = 1.5 * MM  # smallest displacement of the command of a seated plug by a push, in addition to the play [m]
 FOLLOWING = 3.0  # rate of change of the action per distance of 2 mm between the command and a plug in the socket [1/s]
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
@@ -150,7 +150,7 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
         None,
         ge=0.5 * MM,
         le=6.0 * MM,
-        description="bound of a command's |x| and |y| [m], instead of the constant ones of task.yaml",
+        description="bound of a command's |x| and |y| [m]; it replaces those of task.yaml, which must be constant",
     )
 
     start_offset_max: Number = Field(
@@ -185,10 +185,15 @@ class ScriptedSearch:
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
-        """Construct the policy; `duration` returns the duration of the reference trajectory [s] at each observation."""
+        """Construct the policy.
+
+        Args:
+            file: Content of `task.yaml`.
+            duration: Function that returns the duration of the reference trajectory [s]; called at each observation.
+        """
         self._file, self._duration = file, duration
         self._times, poses = file.motion.plan_search()
-        # A thread stops the plug above a command that pushes it.
+        # The thread of a task with an `advance` holds the plug above the command, by `push`.
         self._heights = poses[:, 2] + (file.motion.push if file.motion.advance else 0.0)
         self._time, self._size, self._direction = np.inf, 3 if file.motion.search_turn else 2, 1.0
         self._action = np.zeros(self._size)
@@ -262,7 +267,11 @@ class PartInsertion(DemonstratedInsertion):
         return self.on_clock(self.file.demonstrations.reference(self.folder))
 
     def constraints(self) -> LinearConstraints:
-        """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y."""
+        """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y.
+
+        Raises:
+            InputError: If `bound` is given, and the bounds of `task.yaml` change between phases.
+        """
         bounds, limit = self.file.bounds, self.options.bound
         if limit is not None:
             if bounds.phases is not None:
@@ -280,8 +289,8 @@ class PartInsertion(DemonstratedInsertion):
     def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
         """Return pushes along ±x and ±y, as far as the bounds allow, which the walls of the socket stop.
 
-        A plug that was turned is locked and is pulled upwards instead. A direction is omitted if the bounds allow less
-        than the play, twice the clearance, and `MIN_PUSH`.
+        A direction is omitted if the bounds allow less than the sum of `MIN_PUSH` and the play, which is twice the
+        clearance. A plug that was turned is locked and is pulled upwards instead.
         """
         if self.file.turn:
             return super().hold_tests(pose)
@@ -321,11 +330,11 @@ class PartInsertion(DemonstratedInsertion):
         return [seated, self.force_limit()]
 
     def symmetry(self) -> Symmetry | None:
-        """Return the symmetries of both parts."""
+        """Return the symmetries of both parts; None if none applies."""
         return self._select_symmetries(self.file.sides)
 
     def near_symmetry(self) -> Symmetry | None:
-        """Return the symmetries of both parts, and those that nearly hold for a plug on the rim."""
+        """Return the symmetries of both parts and those that nearly hold on the rim; None if none applies."""
         return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
@@ -342,7 +351,7 @@ class PartInsertion(DemonstratedInsertion):
         return front_camera(target, distance=6 * size, height=3 * size)
 
     def scene(self) -> Scene:
-        """Return the demonstrations and the box of the bounds of each phase."""
+        """Return the demonstrations and the box of the bounds of each phase in `task.yaml`."""
         to_world, size = in_frame(self.workcell().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
         lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())

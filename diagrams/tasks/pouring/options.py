@@ -24,7 +24,7 @@ SPARSE_INPUT_SPEED = 1.7  # default input_speed of "sct" with the sparse reward:
 def make_template(config: PouringConfig, input_speed: float = 1.0, **aiming: float) -> SharedControlTemplate:
     """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`.
 
-    With `aim_speed` and `pour_speed`, fractions of full speeds, the template has aiming in the state Pour.
+    If `aim_speed` and `pour_speed`, fractions of the full speeds, are given, inputs can aim the tip in the state Pour.
     """
     return load_template(
         "pouring_aimed" if aiming else "pouring",
@@ -54,7 +54,7 @@ HARD: Mapping[str, Any] = {
     "mug_inner_diameter": 0.07,
     "time_limit": 6.0,
 }
-"""Options of difficulty="hard": the template assumes a mug position with an error, which is sampled and observed."""
+"""Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed."""
 
 
 MOST_BALLS = 8  # largest number of balls
@@ -92,9 +92,11 @@ class PouringOptions(Options):
         description="largest sampled distance between actual and estimated mug position [m]",
     )
     time_limit: Number = Field(15.0, ge=3.0, le=30.0, description="duration of an episode [s]")
-    aim: bool = Field(False, description="allow to aim in Pour, and observe the error and the template's state")
+    aim: bool = Field(
+        False, description="let inputs aim the tip in the state Pour; observe the mug error and the template's state"
+    )
     aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
-    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilt speed in an aimed Pour")
+    pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilting speed in Pour, with aim")
 
     @property
     def needed(self) -> int:

@@ -110,7 +110,8 @@ OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip: distance from the mug's ax
 POURING_DISTANCE = 0.078  # [m] distance from the mug's opening below which the inputs are only horizontal
 SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to this distance
 
-AIM_OVER_THE_RIM = (0.03, 0.045)  # [m] goal of the tip at the estimated mug, at which the state Pour begins
+# [m] goal of the tip until the state Pour begins: distance from the axis of the estimated mug, height above its rim
+AIM_OVER_THE_RIM = (0.03, 0.045)
 AIM_SOFTNESS = 0.02  # [m] distance from the aim below which the inputs are proportional to this distance
 AIM_TOLERANCE = 0.008  # [m] distance from the aim below which the policy tilts the thermos
 POURING_TILT = 95.0  # [degrees] tilt above which the policy always tilts further, because the balls already roll
@@ -290,7 +291,12 @@ class Pouring(Task):
     ) -> dict[str, Any]:
         """Place the mug, the upright thermos and the balls at sampled poses; an unreachable start is sampled again.
 
-        Values that a reset option replaces are sampled nevertheless.
+        Values that a reset option replaces are sampled nevertheless. The start is projected onto the constraints of the
+        template's first state. The returned `mug_position` is that of the actual mug, unlike the reset option of this
+        name.
+
+        Raises:
+            InputError: If a reset option is too large, or the arm reaches no sampled start.
         """
         assert isinstance(station, PouringStation)
         episode = episode_stream(rng, options.held_out)
