@@ -20,13 +20,13 @@ class ActiveConstraintProjector(LeafSystem):
 
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
-    See `SharedControlTemplate.command`. The last command is discrete state. Its initial value is the measured pose,
-    moved towards the constraints as far as one period allows. Between control instants the output is a pure function of
-    the last command and the request.
+    H^im is the requested pose, q the template's state and H^ac the command; see `SharedControlTemplate.command`. The
+    last command is discrete state. Its initial value is the measured pose, moved towards the constraints as far as one
+    period allows. Between control instants the output depends only on the discrete state, the request and q.
 
-    The last safe command is repeated, and ``fallback`` is 1, if a request or the measured pose is not finite. The same
-    happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot is
-    blocked. If a transition or a moved object puts the repeated command outside the constraints, the command moves
+    The last safe command is repeated, and ``fallback`` is 1, if the request or the measured pose is not finite. The
+    same happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot
+    is blocked. If a transition or a moved object puts the repeated command outside the constraints, the command moves
     inside.
 
     .. pydrake_system::
@@ -44,15 +44,15 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. Each violation output is the largest violation of an active constraint, in meters or radians;
-    0 inside.
+    template's state. Each violation output is the largest violation of an active constraint, in meters or radians, and
+    0 inside the constraints.
 
     Args:
         template: Shared control template.
         frames: Poses of the template's objects by name, in the frame of the poses at the ports.
         period: Control period [s], positive.
-        max_tracking_error: Distance between the robot and its command beyond which the last command is repeated [m],
-            positive.
+        max_tracking_error: Bound of the tracking error, the distance between the last command and the position
+            measured at that time [m], positive; infinite by default.
 
     Raises:
         InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the

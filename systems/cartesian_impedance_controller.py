@@ -31,6 +31,9 @@ class ImpedanceGains:
         posture_damping: Decay rate of null-space motion [1/s], not negative, finite. Its torque is this rate times M v,
             which dissipates energy in every posture.
         bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
+
+    Raises:
+        InputError: If an argument is out of range, or a matrix or vector of six has the wrong shape.
     """
 
     stiffness: np.ndarray
@@ -65,9 +68,10 @@ class CartesianImpedanceController(LeafSystem):
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
-    See `impedance_torques`. K may be given in the axes of any frame. The orientation error is computed from
-    quaternions, so no orientation is singular. D follows from K and the arm's inertia in its present posture. If
-    commands stop, the last valid one remains in force (`LastValidPose`).
+    J is the Jacobian of P, e the pose error, V the velocity of P and N the projector into the null space; see
+    `impedance_torques`. The stiffness K may be given in the axes of any frame. The orientation error is computed from
+    quaternions, so no orientation is singular. The damping D follows from K and the arm's inertia in its present
+    posture. If commands stop, the last valid one remains in force (`LastValidPose`).
 
     .. pydrake_system::
 
@@ -86,10 +90,11 @@ class CartesianImpedanceController(LeafSystem):
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
-    is not connected, commands never time out. ``max_wrench`` is (8,), [fx fy fz tx ty tz] along the axes of the gains,
-    norm of the force and norm of the torque [N, Nm]; it lowers the bound and cannot raise it. ``generalized_force`` is
-    (n,), joint torques [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T. ``saturation`` (1,) is 1
-    while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid command is available.
+    is not connected, commands never time out. ``max_wrench`` is (8,), limits of [fx fy fz tx ty tz] along the axes of
+    the gains, of the norm of the force and of the norm of the torque [N, Nm]; it lowers the bound and cannot raise it.
+    ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T.
+    ``saturation`` (1,) is 1 while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid
+    command is available.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
@@ -103,7 +108,7 @@ class CartesianImpedanceController(LeafSystem):
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range, or the posture does not have n joints.
     """
 
     def __init__(

@@ -28,6 +28,9 @@ class SpeedLimits:
     Attributes:
         translational: Translational speed limit [m/s], positive.
         rotational: Rotational speed limit [rad/s], positive.
+
+    Raises:
+        InputError: If a limit is not positive.
     """
 
     translational: float = 0.25
@@ -68,22 +71,23 @@ class CartesianPositionController(LeafSystem):
     ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``positions`` is (n,), measured joint
     positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
-    (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 if the desired
-    direction could not be followed for the last valid command. ``command_timed_out`` (1,) is 1 while no valid command
-    is available. All outputs depend on state alone; there is no direct feedthrough.
+    (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 if the tool
+    could not move in the desired direction at the last valid command. ``command_timed_out`` (1,) is 1 while no valid
+    command is available. All outputs depend on state alone; there is no direct feedthrough.
 
     Args:
-        plant: Model of the arm alone, finalized; its joint limits are satisfied.
+        plant: Model of the arm alone, of at least six joints, finalized; its joint limits are satisfied.
         target: Frame T, fixed in the world.
         tool_center: Frame P.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         period: Period of the joint commands [s], positive.
         speed_limits: Speed limits of the tool center.
-        posture_gain: Gain of the return to the posture [1/s], not negative.
+        posture_gain: Gain of the return to the posture [1/s], not negative, finite.
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range. At initialization, if a measured position is not finite.
+        InputError: If an argument is out of range or has the wrong shape. At initialization, if a measured position is
+            not finite.
     """
 
     def __init__(
@@ -102,7 +106,9 @@ class CartesianPositionController(LeafSystem):
         check_period(period)
         num_joints = plant.num_positions()
         if not 0.0 <= posture_gain < np.inf:
-            raise InputError(f"a position controller's posture gain must not be negative, not {posture_gain}")
+            raise InputError(
+                f"a position controller's posture gain must be finite and not negative, not {posture_gain}"
+            )
         if np.shape(posture) != (num_joints,):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
         if not np.isfinite(posture).all():

@@ -17,8 +17,8 @@ class ChunkReference(LeafSystem):
         mean = mean of the chunks;  covariance = diag(variance of the chunks) + covariance_floor · Σ_n
 
     Every ``replan_steps`` control steps the policy predicts chunks from the observation just before that instant; in
-    between, the window advances along them. Σ_n are the covariances of a reference trajectory. Until the first
-    prediction, the output is the window of this trajectory.
+    between, the window advances along them. Σ_n are the covariances of a reference trajectory of O outputs. Until the
+    first prediction, the output is the window of this trajectory.
 
     .. pydrake_system::
 
@@ -38,11 +38,12 @@ class ChunkReference(LeafSystem):
         reference: Reference trajectory with one point per control step, for Σ_n and the first window.
         horizon: Number of future points H after the current one, not negative.
         replan_steps: Control steps between two predictions, at least 1.
-        covariance_floor: Factor of Σ_n in the covariance, positive.
+        covariance_floor: Factor of Σ_n in the covariance, positive, finite.
         period: Control period [s], positive.
 
     Raises:
         InputError: If an argument is out of range.
+        PolicyError: At an update, if the policy does not return finite chunks of O outputs.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class ChunkReference(LeafSystem):
                 f"{replan_steps} and {horizon}"
             )
         if not (np.isfinite(covariance_floor) and covariance_floor > 0):
-            raise InputError(f"covariance_floor must be positive, not {covariance_floor}")
+            raise InputError(f"covariance_floor must be positive and finite, not {covariance_floor}")
         self._policy, self._reference, self._horizon = policy, reference, horizon
         self._replan_steps, self._floor = replan_steps, covariance_floor
         self._num_points, outputs = horizon + replan_steps, reference.num_outputs

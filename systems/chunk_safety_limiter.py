@@ -46,7 +46,7 @@ class ChunkSafetyLimiter(LeafSystem):
         guard: Limits and mode, for O outputs; its state is not used.
         num_steps: Number K of steps of a chunk, at least 4 and at least `replan_steps`.
         replan_steps: Number of control steps that are executed of each chunk, at least 1.
-        period: Control period [s], equal to the period of the guard.
+        period: Control period [s], positive. It must equal the period of the guard, which is not checked.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if the measured pose is not finite.

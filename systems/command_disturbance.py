@@ -11,10 +11,10 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class CommandDisturbance(LeafSystem):
     """Delay commands and lose some of them at random; a lost command is replaced by the last delivered one.
 
-        y_n = y_{n−1} with probability p, otherwise u_{n−k},  n = 0, 1, …
+        y_t = y_{t−1} with probability p, otherwise u_{t−k},  t = 0, 1, …
 
-    where y_{−1} and u_{−1}, …, u_{−k} are the measured pose at initialization. Every command, also the first one, is
-    therefore delayed by k periods.
+    where u_t is the command of period t and y_t the delivered one. y_{−1} and u_{−1}, …, u_{−k} are the measured pose
+    at initialization. Every command, also the first one, is therefore delayed by k periods.
 
     .. pydrake_system::
 
@@ -64,7 +64,7 @@ class CommandDisturbance(LeafSystem):
     get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Set the seed of the losses; `context` is this system's."""
+        """Set the seed of the losses, not negative; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -15,8 +15,9 @@ class CommandFilter(LeafSystem):
         safe_pose = law(last safe_pose, desired_pose)
 
     See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`. The last of these laws uses the last two
-    commands. At initialization, the last command is the measured pose. If the law returns a command that is not finite,
-    for example because the desired pose is not finite, the last command is repeated.
+    commands. At initialization, the last command is the measured pose. If the desired pose is not finite, the first two
+    laws repeat the last command, and the third one brakes. If a law returns numbers that are not finite, the last
+    command is repeated.
 
     .. pydrake_system::
 

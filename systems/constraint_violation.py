@@ -22,9 +22,9 @@ class ConstraintViolation(LeafSystem):
         output_ports:
         - violation
 
-    ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c; `UNCONSTRAINED` if there is no
-    constraint. The violation depends on the pose and the control step alone, so every guidance is evaluated in the same
-    way.
+    ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c, or as in
+    `MotionConstraints.violation`; it is `UNCONSTRAINED` if there is no constraint. The violation depends on the pose
+    and the control step alone, so every guidance is evaluated in the same way.
 
     Args:
         constraints: Linear constraints (constant, or one set per control step) or motion constraints, on O outputs.

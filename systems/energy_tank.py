@@ -33,11 +33,12 @@ class EnergyTank(LeafSystem):
 
         T' = T + Σ D Δx² / h − (U(x_r', F') − U(x_r, F)) ≥ 0
 
-    U is the energy of the clipped spring at the measured pose x. The energy that a change of the reference x_r or of
-    the limits F adds to the spring is taken from the tank. The energy that the damper dissipates, at least Σ D Δx² / h
-    in a period h, refills the tank up to its capacity. If the tank holds too little energy, only a share of the change
-    is passed on. A decrease of a limit applies at once. The energy of spring, tank and motion therefore increases only
-    by work of the environment, which cannot extract more than the initial content (Ferraguti, Secchi, Fantuzzi 2013).
+    T is the energy in the tank, and U that of the clipped spring at the measured pose x; a prime marks the values after
+    a change. The energy that a change of the reference x_r or of the limits F adds to the spring is taken from the
+    tank. The energy that the damper dissipates, at least Σ D Δx² / h for a displacement Δx in a period h, refills the
+    tank up to its capacity. If the tank holds too little energy, only a share of the change is passed on. A decrease of
+    a limit applies at once. The energy of spring, tank and motion therefore increases only by work of the environment,
+    which cannot extract more than the initial content (Ferraguti, Secchi, Fantuzzi 2013).
 
     .. pydrake_system::
 
@@ -52,15 +53,16 @@ class EnergyTank(LeafSystem):
         - energy
 
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
-    desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite,
-    reference and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,),
-    [fx fy fz tx ty tz], norm of the force and norm of the torque [N, Nm]. ``energy`` is (1,), the content [J].
+    desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite, reference
+    and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,), limits of
+    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm].
+    ``energy`` is (1,), the content [J].
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
         damping: Smallest damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
         bound: Bound of the wrench, with finite limits per axis.
-        capacity: Initial and largest content [J], positive.
+        capacity: Initial and largest content [J], positive, finite.
         period: Sampling period [s], positive.
 
     Raises:
@@ -73,7 +75,7 @@ class EnergyTank(LeafSystem):
         super().__init__()
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < capacity < np.inf:
-            raise InputError(f"an energy tank's capacity must be positive, not {capacity} J")
+            raise InputError(f"an energy tank's capacity must be positive and finite, not {capacity} J")
         if not is_finite(bound.axes):
             raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
         self._bound, self._capacity, self._period = bound, capacity, period

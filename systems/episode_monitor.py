@@ -15,7 +15,7 @@ TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "ti
 
 - ``""``: the episode continues.
 - ``"success"``: the goal of the task was reached.
-- ``"collision"``: the contact force passed the limit of the task, or an obstacle was touched.
+- ``"collision"``: the contact force exceeded the limit of the task, or an obstacle was touched.
 - ``"spill"``: a ball was spilled.
 - ``"blocked"``: no progress for a number of steps.
 - ``"violation"``: a constraint was violated.
@@ -55,7 +55,7 @@ class TerminationTerm:
         if self.termination not in TERMINATIONS[1:]:
             raise InputError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
         if not 1 <= self.steps < np.inf:
-            raise InputError(f"a condition must hold for at least one control step, not {self.steps}")
+            raise InputError(f"the steps of a condition must be finite and at least 1, not {self.steps}")
         if not 0.0 <= self.min_progress < np.inf:
             raise InputError(f"the smallest progress must be finite and not negative, not {self.min_progress}")
 
@@ -82,8 +82,8 @@ class EpisodeMonitor(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If there is no term, the period is not positive, two terms disagree about the size of a signal, or
-            the parameters of a function are not named like its signals.
+        InputError: If there is no term, the period is not positive, a signal has two sizes or a size below 1, or the
+            parameters of a function are not named like its signals.
     """
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):

@@ -38,12 +38,12 @@ class JointTorqueErrors:
 class ExternalTorqueSensor(LeafSystem):
     """Measure external joint torques with errors of sensors, friction and model.
 
-        τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ n,  n ~ N(0, 1) once per period
+        τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ w,  w ~ N(0, 1) once per period
 
     An arm computes its external torques as the measured torques minus the torques of its model. τ_c are the torques of
-    contact forces, ε relative errors of the sensors, g(q) the gravity of the model and g'(q) that of the actual bodies,
-    c friction with v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are compensated exactly. The
-    errors are parameters, which a reset samples and restores.
+    contact forces, ε relative errors of the sensors, g(q) the gravity torques of the model and g'(q) those of the
+    actual bodies, c friction torques with v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are
+    compensated exactly. The errors are parameters, which `set_errors` sets at a reset.
 
     .. pydrake_system::
 
@@ -54,18 +54,18 @@ class ExternalTorqueSensor(LeafSystem):
         output_ports:
         - external_torque
 
-    ``state`` is (2n,), positions and velocities of the joints. ``contact_torque`` and ``external_torque`` are (n,), in
-    Nm.
+    ``state`` is (2n,), positions and velocities of the joints [rad, rad/s]. ``contact_torque`` and ``external_torque``
+    are (n,) [Nm].
 
     Args:
         plant: Model of the arm alone, finalized.
-        payload_body: Body to whose center of mass a payload is rigidly attached.
-        noise: Standard deviations σ, (n,) [Nm].
-        drift: Standard deviations of d after `DRIFT_TIME`, (n,) [Nm].
+        payload_body: Body of the plant, not the world, to whose center of mass a payload is rigidly attached.
+        noise: Standard deviations σ, (n,) [Nm], not negative, finite.
+        drift: Standard deviations of d after `DRIFT_TIME`, (n,) [Nm], not negative, finite.
         period: Period of noise and drift [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If the period, the noise or the drift is out of range or has the wrong shape.
     """
 
     def __init__(
@@ -77,7 +77,9 @@ class ExternalTorqueSensor(LeafSystem):
         self._noise, self._drift = np.array(noise, dtype=float), np.array(drift, dtype=float)
         for values in (self._noise, self._drift):
             if values.shape != (n,) or not (np.isfinite(values) & (values >= 0.0)).all():
-                raise InputError(f"noise and drift of torque sensors are {n} standard deviations, not {values}")
+                raise InputError(
+                    f"noise and drift of torque sensors must each be {n} finite numbers, none negative, not {values}"
+                )
         self._plant, self._step = plant, np.sqrt(period / DRIFT_TIME)
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
         self._nominal = [body.default_mass() for body in self._bodies]
@@ -112,11 +114,11 @@ class ExternalTorqueSensor(LeafSystem):
 
     @property
     def bodies(self) -> tuple[RigidBody, ...]:
-        """The B bodies of `JointTorqueErrors`."""
+        """The B bodies of `JointTorqueErrors` in its order, all but the world."""
         return tuple(self._bodies)
 
     def set_errors(self, context: Context, errors: JointTorqueErrors, seed: int) -> None:
-        """Set the errors of an episode and the seed of noise and drift; `context` is this system's."""
+        """Set the errors of an episode and the seed of noise and drift, not negative; `context` is this system's."""
         for index, values in (
             (self._gain, errors.gain),
             (self._offset, errors.offset),

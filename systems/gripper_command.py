@@ -31,7 +31,7 @@ class GripperCommand(LeafSystem):
         period: Period at which the desired position is stored [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If the sizes differ, or an argument is out of range.
     """
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float):

@@ -15,9 +15,9 @@ FORGET_TIME = 1.0  # age of a heartbeat above which its sender is ignored while 
 class HeartbeatMonitor(LeafSystem):
     """Raise a fault when a robot-side safety monitor reports a stop or its heartbeat times out.
 
-    Each sender has a timeout of its own, so that the exit of one monitor is detected while another one is alive. To
-    allow the replacement of a monitor, a heartbeat older than `FORGET_TIME` is ignored while another monitor is alive.
-    No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
+    The age of each sender's heartbeat is checked, so that the exit of one monitor is detected while another one is
+    alive. To allow the replacement of a monitor, a heartbeat older than `FORGET_TIME` is ignored while another monitor
+    is alive. No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
 
     .. pydrake_system::
 

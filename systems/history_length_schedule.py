@@ -26,12 +26,12 @@ class HistoryLengthSchedule(LeafSystem):
         output_ports:
         - history_length
 
-    ``wrench`` is (W,), measured; its first three entries are a force [N] (its first two for W = 2).
+    ``wrench`` is (W,), measured; its first three entries, or all entries if W is less than 3, are a force [N].
     ``history_length`` is (1,), the number P of stored outputs; it is discrete state, initially the longest length.
 
     Args:
-        lengths: History lengths in any order, each at least 1, because without a history a command would not start
-            where the previous one ended.
+        lengths: History lengths in any order, at least one, whole numbers from 1. Without a history a command would not
+            start where the previous one ended.
         period: Control period [s], positive.
         contact_threshold: Force above which contact begins [N], finite.
         release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.

@@ -14,8 +14,9 @@ class ImpedanceMonitor(LeafSystem):
 
         contact_force = ‖f‖,  at rest f = K (x_d − x)
 
-    In a collision this estimate is a better measure than the simulated contact force: the instantaneous force of an
-    impact depends on the time step of the simulation, and the force of the impedance does not.
+    where K is the stiffness, x_d the desired and x the measured pose. In a collision this estimate is a better measure
+    than the simulated contact force: the instantaneous force of an impact depends on the time step of the simulation,
+    and the force of the impedance does not.
 
     .. pydrake_system::
 

@@ -16,9 +16,9 @@ class JointTorqueWrench(LeafSystem):
 
         F = (Jᵀ)⁺ τ_external,  t_f y' = F − y
 
-    τ_external are the measured joint torques minus the torques of the arm's weight and inertia; the controller of an
-    arm with torque sensors provides them. The pseudoinverse is damped, so that near a singular posture the estimate
-    tends to zero instead of diverging.
+    J is the Jacobian of the tool center, and y the output. τ_external are the measured joint torques minus the torques
+    of the arm's weight and inertia; the controller of an arm with torque sensors provides them. The pseudoinverse is
+    damped, so that near a singular posture the estimate tends to zero instead of diverging.
 
     .. pydrake_system::
 
@@ -31,19 +31,20 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without direct feedthrough: one sample old, and zero in a
-    default context. The first sample initializes the filter: a filter that starts at zero would not reach the full bias
-    before a tare. Samples that are not finite are skipped.
+    default context. The first sample initializes the filter, because a filter that starts at zero would not have
+    reached the sensors' bias when it is tared. Samples that are not finite are skipped.
 
     Args:
         plant: Model of the arm alone, finalized.
         target: Frame T.
         tool_center: Frame P.
         period: Sampling period [s], positive.
-        time_constant: Time constant t_f of the filter [s]; 0 disables it.
-        damping: Damping of the pseudoinverse, not negative, finite.
+        time_constant: Time constant t_f of the filter [s], not negative, finite; 0 disables it.
+        damping: Damping of the pseudoinverse, not negative, finite; positive if a posture may be singular.
 
     Raises:
         InputError: If an argument is out of range.
+        LinAlgError: At an update, if the damping is 0 and the posture is singular.
     """
 
     def __init__(

@@ -43,20 +43,20 @@ class LcNsKmpSystem(LeafSystem):
     ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
     (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
-    starts at the end of the previous one. If ``reference_window`` ((H+1)(O + O²),) is connected, its means and
-    covariances, the current step first, replace those of the reference (`ChunkReference`). ``command`` is (O,).
+    starts at the end of the previous one. ``reference_window`` is ((H+1)(O + O²),) for the horizon H of `primitive`. If
+    it is connected, its means and covariances, the current step first, replace those of the reference
+    (`ChunkReference`); all primitives must then have this horizon. ``command`` is (O,).
     ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack,
     `ConstraintViolation.UNCONSTRAINED` if there is none. ``fallback`` (1,) is 1 if no window within the constraints
     was found; the command is then the point nearest to the last command within the constraints of the current step.
 
     The step is discrete state that counts control periods since time zero. If ``motion_time`` (1,) [s] is connected
     (`ProgressClock`), it determines the step instead. The command is a pure function of step, action and history,
-    evaluated once per control step (see docs/concepts/rates.md). The evaluation raises an `InputError` if no primitive
-    has the selected history length.
+    evaluated once per control step (see docs/concepts/rates.md).
 
     Args:
         primitive: Primitive with O outputs and a history of P outputs.
-        gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); ones by default.
+        gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); None: ones.
         period: Control period [s], positive. It must equal the period of the reference trajectory, otherwise the
             motion is faster or slower than the demonstrations.
         shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
@@ -64,7 +64,8 @@ class LcNsKmpSystem(LeafSystem):
 
     Raises:
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or the primitives in
-            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`.
+            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`. At an
+            evaluation, if the action or the history is not finite, or no primitive has the selected history length.
     """
 
     def __init__(

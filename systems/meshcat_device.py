@@ -23,8 +23,8 @@ class MeshcatDevice(LeafSystem):
         output_ports:
         - action
 
-    ``action`` is (n,), in [−1, 1], sampled once per period. An entry is the value of its gamepad axis outside the dead
-    zone, otherwise the value of its slider, which two keys move.
+    ``action`` is (n,), in [−1, 1], sampled once per period. An entry is the value of its gamepad axis times its sign
+    outside the dead zone, otherwise the value of its slider, which two keys move.
 
     Args:
         meshcat: Meshcat instance that shows the sliders and reads the gamepad.
@@ -41,7 +41,9 @@ class MeshcatDevice(LeafSystem):
     ):
         super().__init__()
         if len(axes) != len(keys) or not axes:
-            raise InputError(f"a device needs as many axes as pairs of keys, not {len(axes)} and {len(keys)}")
+            raise InputError(
+                f"a device needs one or more axes and as many pairs of keys, not {len(axes)} and {len(keys)}"
+            )
         self._meshcat, self._axes = meshcat, tuple(axes)
         self._sliders = [f"input {i + 1}" for i in range(len(axes))]
         for name, (lower, higher) in zip(self._sliders, keys, strict=True):

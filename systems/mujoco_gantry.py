@@ -24,7 +24,7 @@ MAX_JOINT_SPEED = 1e3  # joint speed above which a simulation counts as diverged
 
 
 class DivergedError(RuntimeError):
-    """Raised if the state of the physics engine has diverged."""
+    """Raised if the state of the physics engine has diverged, or its contact or constraint buffer is full."""
 
 
 class MovedBodies(NamedTuple):
@@ -50,9 +50,10 @@ class MujocoGantry(LeafSystem):
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
-    with the contact forces f of the engine, the wrench w of f on the tool at its center in the axes of T, and the
-    filtered wrench y. A static plant defines the pose of the fixture and the pose of the workpiece in the tool, offsets
-    included. Before every update, the bodies of the model are placed at these poses.
+    with the pose q of the tool, its inertia M and bias forces c, and the desired pose x_d. K, D and the limits belong
+    to the six motors. The engine computes the contact forces f. w is the wrench of f on the tool at its center in the
+    axes of T, and y the filtered wrench. A static plant defines the pose of the fixture and the pose of the workpiece
+    in the tool, offsets included. Before every update, the bodies of the model are placed at these poses.
 
     .. pydrake_system::
 
@@ -70,25 +71,25 @@ class MujocoGantry(LeafSystem):
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
     output of the static plant; ``body_poses`` contains the same poses, but tool and workpiece are at their simulated
-    poses.
-    ``state`` is (12,), the pose and its velocity. ``geometry_poses`` contains the poses of all frames with geometry.
-    ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,), the forces and
-    torques of the six motors in the order of the pose. Positions, velocities and warm start of the engine and the state
-    of the filter are declared state.
+    poses. ``state`` is (12,), the pose and its time derivative. ``geometry_poses`` contains the poses of all frames
+    with geometry. ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,),
+    the forces and torques of the six motors in the order of the pose. Positions, velocities and warm start of the
+    engine and the state of the filter are declared state.
 
-    If the engine diverges, the update raises a `DivergedError`. The engine's automatic reset is disabled, because it
-    would move the tool to the target.
+    The engine's automatic reset after a divergence is disabled, because it would move the tool to the target.
 
     Args:
-        model: MuJoCo model with bodies of the names in `MovedBodies`; this system writes to it.
+        model: MuJoCo model with bodies `fixture` and `workpiece`, whose first six joints and motors move the tool; this
+            system writes to it.
         plant: Finalized plant without joints, registered as a source of geometry.
         moved: Bodies of the plant that the model contains.
         X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
         period: Update period [s], positive, an integer multiple of the model's step.
-        time_constant: τ of the wrench filter [s]; 0 disables it.
+        time_constant: τ of the wrench filter [s], not negative, finite; 0 disables it.
 
     Raises:
         InputError: If a number is out of range, or the model's step does not divide the period.
+        DivergedError: At an update, if the engine diverges, or its contact or constraint buffer is full.
     """
 
     def __init__(
@@ -103,7 +104,7 @@ class MujocoGantry(LeafSystem):
         super().__init__()
         check_period(period)
         if not 0.0 <= time_constant < np.inf:
-            raise InputError(f"a wrench sensor's time constant must not be negative, not {time_constant} s")
+            raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
         step = float(model.opt.timestep)
         self._num_steps = round(period / step)
         if abs(self._num_steps * step - period) > 1e-9:
@@ -169,7 +170,7 @@ class MujocoGantry(LeafSystem):
     get_geometry_poses_output_port = output_getter("geometry_poses", "poses of all frames with geometry")
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the tool at rest at `pose`, (6,); `context` is this system's."""
+        """Put the tool at rest at `pose`, (6,) [m, rad]; `context` is this system's."""
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:

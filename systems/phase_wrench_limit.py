@@ -16,7 +16,7 @@ class PhaseWrenchLimit(LeafSystem):
 
     B_q is the limit of state q, r the largest rate and h the period. The rate is bounded in both directions: a limit
     that falls at once would make the force jump. An episode begins with the limit of its first state. If ``state`` is
-    not the number of a state, B_q is the minimum of the limits of all states.
+    not the number of a state, B_q is the element-wise minimum of the limits of all states.
 
     .. pydrake_system::
 
@@ -33,7 +33,7 @@ class PhaseWrenchLimit(LeafSystem):
 
     Args:
         limits: Limits of each state (n, 8) [N, Nm], finite and not negative.
-        max_rate: Largest rates (8,) [N/s, Nm/s], positive.
+        max_rate: Largest rates (8,) [N/s, Nm/s], positive, finite.
         period: Sampling period [s], positive.
 
     Raises:

@@ -48,6 +48,7 @@ class PolicySystem(LeafSystem):
 
     Raises:
         InputError: If an argument is out of range.
+        PolicyError: At an update, if the policy does not return A finite numbers.
     """
 
     def __init__(

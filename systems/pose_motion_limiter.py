@@ -49,7 +49,8 @@ class PoseMotionLimiter(LeafSystem):
         period: Sampling period [s], positive.
 
     Raises:
-        InputError: If the period is out of range.
+        InputError: If the period is out of range. At an evaluation, if no trajectory within the limits is found, not
+            even one to rest.
     """
 
     def __init__(self, limits: MotionLimits, *, period: float):

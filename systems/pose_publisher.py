@@ -51,7 +51,7 @@ class PosePublisher(LeafSystem):
         self.DeclarePeriodicPublishEvent(period, 0.0, self._publish)
 
     get_pose_input_port = input_getter("pose", "desired pose of the tool center, (6,)")
-    get_arm_state_input_port = input_getter("arm_state", "state of the arm, (1,), a number of `ArmState`")
+    get_arm_state_input_port = input_getter("arm_state", "state of the arm, (1,), a value of `ArmState`")
 
     def _publish(self, context: Context) -> None:
         state = self._arm_state_port.Eval(context)[0]

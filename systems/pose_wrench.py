@@ -26,8 +26,9 @@ class PoseWrench(LeafSystem):
         output_ports:
         - wrench
 
-    ``pose`` is X_TP as (6,) [x y z a b c] in meters and radians. ``generalized_force`` is (6,), along and about these
-    coordinates [N, Nm]. ``wrench`` is (6,), [fx fy fz tx ty tz] at P in the axes of T.
+    ``pose`` is X_TP, the pose of the tool center P in a frame T, as (6,) [x y z a b c] in meters and radians.
+    ``generalized_force`` is (6,), along and about these coordinates [N, Nm]. ``wrench`` is (6,), [fx fy fz tx ty tz] at
+    P in the axes of T [N, Nm].
     """
 
     def __init__(self) -> None:

@@ -23,7 +23,7 @@ class ProgressClock(LeafSystem):
     of the period; it is a discrete state, and zero at initialization.
 
     Args:
-        rule: Rule of the progress.
+        rule: Rule that decides in each control step whether the motion progresses.
         num_outputs: Number O of outputs.
         period: Control period [s], positive.
 

@@ -173,7 +173,7 @@ def test_content_is_kept_when_the_measured_pose_is_not_finite():
     [
         ({"stiffness": np.zeros(6)}, "six positive stiffnesses"),
         ({"capacity": 0.0}, "capacity must be positive"),
-        ({"capacity": np.inf}, "capacity must be positive"),
+        ({"capacity": np.inf}, "capacity must be positive and finite"),
         ({"bound": WrenchBound(np.r_[np.inf, np.ones(5)], 20.0, 5.2)}, "finite limits"),
         ({"period": 0.0}, "period must be positive"),
     ],
