@@ -88,7 +88,7 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     Partial folders that killed processes left for the same path are removed first.
 
     Raises:
-        InputError: If the folder cannot be written. An OSError of another file is not changed.
+        InputError: If the folder cannot be written. An OSError about another file is raised unchanged.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
     for left in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
@@ -137,11 +137,11 @@ ENDINGS = (".npz", ".csv")  # endings of demonstration files
 def load_demonstrations(path: Path) -> Demonstrations:
     """Return the demonstrations of a file, or of all .npz and .csv files of a folder.
 
-    Each file is read by `Demonstrations.load`, as in training. As a folder, `Demonstrations.load` itself accepts only
+    Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts a folder only of
     .csv files.
 
     Raises:
-        InputError: If there are none, or a file is invalid.
+        InputError: If there are no demonstrations, a file is invalid, or files have different outputs.
     """
     if path_exists(path) and path.is_dir():
         files = in_order(file for file in path.iterdir() if file.suffix in ENDINGS)
@@ -160,7 +160,7 @@ def load_demonstrations(path: Path) -> Demonstrations:
 
 
 def refuse_existing_run(path: Path) -> None:
-    """Raise an InputError if the folder of a new run holds anything but hidden files.
+    """Raise an InputError if the path of a new run is a file, or a folder that holds anything but hidden files.
 
     Hidden files may be left over from a run that was killed before its configuration was written.
     """

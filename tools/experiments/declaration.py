@@ -33,7 +33,7 @@ LEARNED = "learned"
 
 
 def _placeholder_check(**examples: Any) -> Callable[[str], str]:
-    """Return a validator of file names with placeholders in braces; `examples` has a value of each."""
+    """Return a validator of file names with placeholders in braces; `examples` has a value for each placeholder."""
 
     def check(name: str) -> str:
         known = ", ".join(f"{{{word}}}" for word in examples)
@@ -97,7 +97,7 @@ class Method(_Strict):
     """Environment and policy that a study compares with others."""
 
     env: dict[str, Any] = {}  # options of the environment, in addition to the study's
-    learner: LearnerChoice = LearnerChoice()  # choices that override the study's; null stands for the task's own
+    learner: LearnerChoice = LearnerChoice()  # overrides the study's; null algorithm or preset: the task's own
     policy: str = LEARNED  # "learned", "best_constant", or the name of a baseline or scripted policy
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each action component that best_constant tries
     seeds: Seeds | None = None  # default: the study's; one seed is enough for a policy without learning
@@ -109,7 +109,7 @@ class EvalSet(_Strict):
     name: str = "held out"  # name in the table
     env: dict[str, Any] = {}  # options of the environment that differ from training
     sampled: dict[str, tuple[float, float]] = {}  # options that are resampled uniformly from a range
-    every: Integer = Field(default=4, ge=1)  # number of episodes between two samples
+    every: Integer = Field(default=4, ge=1)  # number of consecutive episodes with the same sample
     options: dict[str, Any] = {}  # options of each reset
     episodes: Integer = Field(default=100, ge=1)  # number of episodes
     first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; episode i has first_seed + i
@@ -165,7 +165,7 @@ class Study(_Strict):
     statistics: tuple[str, ...] = ()  # statistics of training in addition to the usual ones
     ratios: tuple[Ratio, ...] = ()  # ratios reported next to the table
     folder: RunName = "{method}-{seed}"  # folder of a run
-    imports: tuple[str, ...] = ()  # modules or files (.py) that register the task, the learner, …
+    imports: tuple[str, ...] = ()  # modules, files (.py) or task folders that register the task, the learner, …
 
     @field_validator("statistics")
     @classmethod
@@ -210,7 +210,13 @@ class Study(_Strict):
         return "-".join([self.name, *methods, *seeds]) if methods or seeds else None
 
     def subset(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
-        """Return the study with some of its methods, or with other seeds; raise an InputError for an unknown method."""
+        """Return the study with some of its methods, or with other seeds.
+
+        A method that declares seeds of its own keeps them.
+
+        Raises:
+            InputError: If a method is unknown.
+        """
         for name in methods or ():
             if name not in self.methods:
                 raise InputError(f"the study {self.name} has no method {name!r}: {did_you_mean(name, self.methods)}")

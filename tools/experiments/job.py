@@ -1,6 +1,7 @@
-"""Job of a study: one method with one seed, trained and evaluated in a folder of its own by a worker that keeps a log.
+"""Job of a study: trains and evaluates one method with one seed, in a folder of its own.
 
-The state of a job is in its folder: an interrupted job resumes from it, and a finished job only reads its tables.
+The state of a job is in its folder: an interrupted job resumes from it, and a finished job only reads its tables. Each
+attempt of a worker is logged.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ BEST_CONSTANT = "best_constant"
 BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
 SELECTION_EPISODES = 10  # training episodes of each constant action, to select the best action
 
+# Statistics of the training episodes in the table; their columns begin with `training_`.
 TRAINING = (
     "episodes", "success_rate", "success_rate_last_10", "episodes_to_convergence", "mean_return_last_10", "mean_force",
     "mean_squared_force", "mean_squared_force_since_converged", "peak_force", "max_commanded_violation",
@@ -51,6 +53,7 @@ TRAINING = (
     "ended_in_success", "ended_in_collision", "ended_in_spill", "fallback_steps", "jerk_commanded_linear_first_10",
     "jerk_commanded_angular_first_10", "jerk_measured_linear_first_10", "total_steps", "wall_time",
 )  # fmt: skip
+# Statistics of the evaluated episodes in the table.
 EVALUATED = (
     "episodes", "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "mean_force",
     "mean_squared_force", "peak_force", "max_commanded_violation", "violating_episodes", "collisions",
@@ -171,7 +174,7 @@ def run_job(job: Job) -> list[dict[str, Any]]:
 
 
 def _needs_training(job: Job, episodes: int) -> bool:
-    """Return True if the run has not reached a number of episodes."""
+    """Return True if training must run to reach a number of episodes, or to write the policy after that number."""
     folder = job.folder
     if not job.learns or (job.policy_folder(episodes) / "policy.json").exists():
         return False
@@ -210,9 +213,11 @@ def _refuse_lost_policy(job: Job, episodes: int) -> None:
 
 
 def digest(job: Job, eval_set: EvalSet | None = None, episodes: int = 0) -> str:
-    """Return the digest of everything that decides evaluated episodes, for the name of their file.
+    """Return the digest of what decides evaluated episodes, for the name of their file.
 
-    It contains the resolved environment, because the options that a difficulty stands for may change.
+    It contains the resolved environment, because the options that a difficulty sets may change. It does not contain the
+    learner, because a run's folder holds a run of one learner only. Seed and number of training episodes are contained
+    only if the names of folder and file do not contain them.
     """
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     evaluation = "" if eval_set is None else eval_set.model_dump_json(exclude={"name", "file"})

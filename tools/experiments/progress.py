@@ -27,9 +27,12 @@ class StudyProgress:
     """
 
     def __init__(self, jobs: Mapping[int, Any], total: int, console: Console | None = None):
-        """Construct the display of jobs to run, by key, of a study with `total` jobs, including those that are done.
+        """Construct the display.
 
-        The console is standard error by default, so that results can be piped.
+        Args:
+            jobs: Jobs to run, by key.
+            total: Number of jobs of the study, including those that are done.
+            console: Console; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
         self._open = {

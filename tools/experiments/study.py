@@ -49,7 +49,8 @@ def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataF
         A row for each method, seed, number of training episodes and evaluation set, in this order.
 
     Raises:
-        InputError: Before anything is written, if the declaration is invalid or a folder holds another run.
+        InputError: Before anything is written, if the declaration is invalid, a folder holds another run or cannot be
+            written, or the engine cannot reach its workers.
         RunsFailedError: At the end, if some jobs failed.
     """
     if out.exists() and not out.is_dir():
@@ -79,17 +80,18 @@ def study_command(
     table: str | None = None,
     describe_differences: DescribeDifferences | None = None,
 ) -> dict[str, Any]:
-    """Run a study by `run_study`, write its table as `.csv` and `.md`, and return a summary with results of each seed.
+    """Run a study by `run_study`, write its table as `.csv` and `.md`, draw its sweeps, and return a summary.
 
     Args:
         study: As in `run_study`.
-        out: As in `run_study`; the table is written into it.
+        out: As in `run_study`; the table and the picture are written into it.
         engine: As in `run_study`.
-        table: Name of the table; by default that of the study.
+        table: Name of the table and the picture; by default that of the study.
         describe_differences: Function whose sentences the summary has as `differences`, by method.
 
     Returns:
-        Summary. `failed` has one sentence for each failed job, which has no rows in the table.
+        Summary: paths of the files, and results of each seed by label. `failed` has one sentence for each failed job,
+        which has no rows in the table; it is the only entry if no job has rows.
 
     Raises:
         InputError: As `run_study`, or if a file cannot be written.
@@ -140,7 +142,11 @@ def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
 
 
 def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
-    """Return the ratio of a column between two methods, per seed and for the sums; empty if a row is missing."""
+    """Return the ratio of a column between two methods, of each row and of the sums, as text by label.
+
+    With several evaluation sets or numbers of training episodes, a seed has several rows. The result is empty if the
+    rows of the two methods do not have the same seeds in the same order.
+    """
     of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
@@ -200,13 +206,12 @@ def _refuse_shared_folders(jobs: list[Job]) -> None:
 
 
 def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
-    """Draw a panel for each sweep: the success rate of all seeds against the quantity.
+    """Draw a panel for each sweep, the success rate of all seeds against the quantity; return the picture's path.
 
-    The band spans all seeds' 95 % intervals. Harder values are to the right. A cross marks where a method that
-    began above `BREAKING_SUCCESS` falls below it.
+    The band spans all seeds' 95 % intervals. Harder values are to the right. A cross marks where the success rate of a
+    method falls below `BREAKING_SUCCESS`; there is none if the rate is below it at the first value.
 
-    For a method evaluated after several numbers of training episodes, the largest number is drawn. Return the path of
-    the picture.
+    For a method evaluated after several numbers of training episodes, the largest number is drawn.
     """
     width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
     figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
@@ -244,13 +249,19 @@ def breaking_points(study: Study, rows: pd.DataFrame) -> dict[str, str]:
 
 
 def format_breaking_point(values: Sequence[float], points: Sequence[tuple[float, float, float]]) -> str:
-    """Return the breaking point of a curve as a number, or as `NEVER` or `AT_ONCE`."""
+    """Return the breaking point of a curve as text: a number, `NEVER` or `AT_ONCE`.
+
+    `points` are success rate, lower and upper bound at each of `values`, as `curve` returns them.
+    """
     at = breaking_point(values, [rate for rate, _, _ in points])
     return at if isinstance(at, str) else f"{at:.3g}"
 
 
 def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], list[tuple[float, float, float]]]:
-    """Return the values at which a method was evaluated, the easiest first, and its success rate with its interval."""
+    """Return the values of a sweep at which the method `name` was evaluated, the easiest first, and a point for each.
+
+    A point is the success rate of all seeds, and the lowest and highest end of the seeds' 95 % intervals.
+    """
     points = {value: _success(rows, name, sweep.eval_set(value).name) for value in sweep.at}
     evaluated = {value: point for value, point in points.items() if point is not None}
     return list(evaluated), list(evaluated.values())
@@ -270,7 +281,7 @@ def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | s
 
 
 def _success(rows: pd.DataFrame, method: str, eval_set: str) -> tuple[float, float, float] | None:
-    """Return the success rate of all seeds, and the lowest and highest end of their intervals."""
+    """Return the success rate of all seeds, and the lowest and highest end of their intervals; None without rows."""
     selected = rows[(rows["method"] == method) & (rows["eval_set"] == eval_set)]
     selected = selected[selected["after_episodes"] == selected["after_episodes"].max()]
     if not len(selected):

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 
-MAX_ATTEMPTS = 3  # lost workers after which a job is given up, because the job itself may kill them
+MAX_ATTEMPTS = 3  # number of lost workers after which a job is given up: the job itself may kill its worker
 GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
 
 
@@ -19,7 +19,7 @@ GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
 class Outcome:
     """Result of a job."""
 
-    rows: tuple[dict[str, Any], ...] = ()  # rows of its table
+    rows: tuple[dict[str, Any], ...] = ()  # rows of the study's table
     failure: str = ""  # one sentence on why the job failed; empty if it succeeded
 
 
@@ -27,10 +27,11 @@ Work: TypeAlias = Callable[[Any], Outcome]
 
 
 class Engine(AbstractContextManager[Any]):
-    """Engine that runs jobs on workers, one at a time per worker and with one thread.
+    """Engine that runs jobs on workers; a worker runs one job at a time, with one thread.
 
-    An engine is a context manager: entering it finds or prepares the workers, and leaving it ends all processes that it
-    started, also after an error. A job resumes from its folder, so the job of a lost worker is given to another worker.
+    An engine is a context manager. Entering it finds or prepares the workers, and raises an InputError if it cannot.
+    Leaving it ends all processes that it started, also after an error. A job resumes from its folder, so the job of a
+    lost worker is given to another worker.
 
     Attributes:
         processes: Number of jobs that run at once; None if the engine does not set it.

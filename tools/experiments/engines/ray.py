@@ -18,7 +18,7 @@ CONNECT_TIMEOUT = 5.0  # time within which a cluster must answer [s]; Ray itself
 
 @register_engine("ray")
 class RayEngine(Engine):
-    """Engine on a Ray cluster, which runs as many jobs at once as it has cores.
+    """Engine on a Ray cluster, which runs as many jobs at once as it has cores, or on a local Ray.
 
     The study's folder must be on a path that all machines share, so that the job of a lost machine can resume.
     """
