@@ -38,32 +38,40 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     The action is (A,) in [−1, 1], one entry for each of `action_dims` or each input of the template. It is applied for
     `action_repeat` steps of the environment, whose rewards are added up. An episode is truncated when the motion has
-    ended. `info` has, in addition to the environment's: `constraint_violation` (the largest of all commands of the
-    action; negative inside, at most 1e-9 for guidance that enforces the constraints), `fallback` (number of the
-    action's steps without a solution), `phase` (0 to 1), `command` (O,) and `segment` (its name).
+    ended. `info` has these entries in addition to the environment's:
+
+    - `constraint_violation`: largest violation by the commands of the action. It is negative inside the constraints,
+      0 inside those of a template, and −inf without constraints. It is at most 1e-9 for guidance that enforces the
+      constraints, except while a motion that began outside `MotionConstraints` or outside a template moves inside.
+    - `fallback`: number of the action's steps without a solution, or in which only braking was left.
+    - `phase`: phase of the motion, 0 to 1.
+    - `command`: last command (O,) in the world.
+    - `segment`: name of the segment or of the template's state.
 
     Args:
         env: Environment to wrap; its own action is what `to_action` returns.
-        demonstrations: One motion in the world, its file, or segments with frames of their own; at least three
-            demonstrations each, from whose spread the kernel is selected.
+        demonstrations: One motion in the world or in `frame`, its file, or segments with frames of their own; at least
+            three demonstrations each, from whose spread the kernel is selected.
         pose: (env, observation) → measured outputs (O,) in the world, such as a position, or a position and an
             orientation (see `orientation`).
         to_action: (env, observation, command, extra) → action of `env` that reaches the command (O,); `extra` is the
             segment's discrete output, such as a gripper command.
         guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (the action is added to the motion,
-            without constraints), "clipped_residual" (as "residual", moved to the nearest point within the constraints),
-            "template", or a `Guide`.
+            without constraints), "clipped_residual" (as "residual", moved to the nearest point within the linear
+            constraints), "template", or a `Guide`, with which arguments about the motion are ignored.
         constraints: Constraints of a single motion without segments; `Segment` has its own.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
-        template_frames: (env, observation) → poses of the template's objects by name, called at reset.
-        period: Duration of a step of `env` [s], positive.
+        template_frames: (env, observation) → poses X_WF (`RigidTransform`) of the template's objects by name, called
+            at reset.
+        period: Duration of a step of `env` [s], positive; required for a template, for `MotionConstraints`, and unless
+            every segment has `num_steps`.
         action_repeat: Steps of `env` for which an action is applied, at least 1.
         action_scale: κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
         action_dims: Indices of the outputs that an action moves; all by default.
-        history: P, past outputs that the motion of sKGRL passes through, at least 1.
+        history: P, number of past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
-        horizon: H, future points at which the constraints are satisfied.
+        horizon: H, number of future points at which the constraints are satisfied, at least 0.
         orientation: Meaning of the last three of six outputs: "euler_zyx" for angles [Rz Ry Rx], or "rotation_vector".
             By default, that of the demonstrations' names ("Rz [rad]", "Ry [rad]", "Rx [rad]" are Euler angles), and
             "rotation_vector" for other names.
@@ -72,8 +80,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             template's first frame, in units of 0.2 m and π.
 
     Raises:
-        InputError: If an argument is out of range. In `reset`, if the measured pose is not finite. In `step`, if the
-            action is not (A,) finite numbers; the environment has not moved then.
+        InputError: If an argument is out of range.
 
     Attributes:
         guide: Guide, which computes the commands.
@@ -144,7 +151,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.observation_space = self._extended_space(env.observation_space)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and begin the motion at the measured pose."""
+        """Reset the environment and begin the motion at the measured pose.
+
+        Raises:
+            InputError: If the measured pose is not (O,) finite numbers, or a frame or constraints are invalid.
+        """
         self._observation, info = self.env.reset(seed=seed, options=options)
         self._terminated = self._truncated = False
         measured = self._measured()
@@ -152,14 +163,20 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._extended(), {**info, "phase": self.guide.phase, "segment": self.guide.segment_name}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Apply an action (A,) for `action_repeat` steps of the environment."""
+        """Apply an action (A,) for `action_repeat` steps of the environment, or until the episode ends.
+
+        Raises:
+            InputError: If the action is not (A,) finite numbers (the environment has not moved then), or the measured
+                pose is not (O,) finite numbers.
+            ResetNeeded: If no episode has begun, or the episode has ended.
+        """
         self.begin_action(action)
         while not self.is_action_complete:
             self.advance(predict(self.request()))
         return self.end_action()
 
     def begin_action(self, action: Any) -> None:
-        """Begin an action; step several environments together with `request`, `advance` and `end_action`.
+        """Begin an action, which `request`, `advance` and `end_action` then apply in step with other environments.
 
         Raises:
             InputError: If the action is not (A,) finite numbers; one outside [−1, 1] is clipped.
@@ -182,11 +199,15 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._count >= self.action_repeat or self._terminated or self._truncated
 
     def request(self) -> Any:
-        """Return the request for the next step's prediction, or None if the guide needs no prediction."""
+        """Return the request for the next step's prediction, or None if the guide needs no prediction.
+
+        Raises:
+            InputError: If the measured pose is not (O,) finite numbers.
+        """
         return self.guide.request(self.env, self._observation, self._action, self._measured())
 
     def advance(self, output: np.ndarray | None) -> None:
-        """Step the environment with the output (O,) of the requested prediction, or None if there is no solution."""
+        """Step the environment with the predicted output (O,); None without a request or a solution."""
         self._command = command = self.guide.finish(output)
         action = self._to_action(self.env, self._observation, command.output, command.extra)
         self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
@@ -266,7 +287,7 @@ class GuidedVectorEnv(SyncVectorEnv):
         **keywords: Keywords of `GuidedEnv`.
 
     Raises:
-        InputError: As `GuidedEnv`.
+        InputError: As `GuidedEnv`, or if `env_fns` is empty or holds something else than functions.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
@@ -285,7 +306,9 @@ class GuidedVectorEnv(SyncVectorEnv):
         """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos.
 
         Raises:
-            InputError: If the actions are not (B, A) finite numbers; no environment has moved then.
+            InputError: If the actions are not (B, A) finite numbers (no environment has moved then), or a measured pose
+                is not (O,) finite numbers.
+            ResetNeeded: If no episode has begun.
         """
         actions = as_numbers(actions, "actions")
         if actions.shape != self.action_space.shape:

@@ -38,8 +38,10 @@ class GuideCommand:
     """Command of one control step."""
 
     output: np.ndarray  # command (O,) in the world
-    violation: float  # violation of the segment's constraints; negative inside, −inf without constraints
-    # True if no command within the constraints was found; the command is then the last one or near it.
+    # Violation of the segment's constraints, negative inside and −inf without constraints; of a template's, 0 inside.
+    violation: float
+    # True if no command within the constraints was found, so that the command is the last one or near it, or if only
+    # braking was left.
     is_fallback: bool
     extra: Any  # discrete output of the segment, for `to_action`
 
@@ -49,7 +51,7 @@ class Guide(ABC):
 
     Attributes:
         num_outputs: Number O of outputs of a command.
-        num_actions: Number of entries of an action.
+        num_actions: Number A of entries of an action.
     """
 
     num_outputs: int
@@ -70,13 +72,13 @@ class Guide(ABC):
         Args:
             env: Environment, for the callables of segments and templates.
             observation: Last observation of `env`.
-            action: Policy's action (A,), in [−1, 1].
+            action: Policy's action (A,), finite; the guide clips it to [−1, 1].
             pose: Measured pose (O,).
         """
 
     @abstractmethod
     def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step with the output (O,) of the requested prediction, or None if it has no solution."""
+        """Complete the control step with the predicted output (O,); None without a request or a solution."""
 
     @property
     @abstractmethod
@@ -165,9 +167,9 @@ class GuideSettings:
     # κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
     action_dims: Sequence[int] | None = None  # outputs that an action moves, one entry each; all by default
-    history: int = 4  # P, past outputs that the motion of sKGRL passes through
+    history: int = 4  # P, number of past outputs that the motion of sKGRL passes through
     history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
-    horizon: int = 20  # H, future points at which the constraints are satisfied
+    horizon: int = 20  # H, number of future points at which the constraints are satisfied
     # Meaning of the last three of six outputs; None for that of the demonstrations' names, or else "rotation_vector".
     orientation: Orientation | None = None
 
@@ -177,10 +179,10 @@ class PrimitiveGuide(Guide):
 
     Args:
         segments: Segments in their order.
-        guidance: "kgrl", "skgrl", "kmp" (no actions), "residual" (no constraints) or "clipped_residual" (moved to the
-            nearest point within the constraints).
+        guidance: "kgrl", "skgrl", "kmp" (actions have no effect), "residual" (no constraints) or "clipped_residual"
+            (moved to the nearest point within the linear constraints).
         settings: Settings.
-        period: Control period [s]; required unless every segment has `num_steps`.
+        period: Control period [s]; required for `MotionConstraints`, and unless every segment has `num_steps`.
 
     Raises:
         InputError: If an argument is out of range, a segment has fewer than three demonstrations, or segments have
@@ -215,7 +217,11 @@ class PrimitiveGuide(Guide):
         self.num_steps = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments)
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin the first segment."""
+        """Begin the first segment.
+
+        Raises:
+            InputError: If a frame or constraints are invalid, or `MotionConstraints` have no period.
+        """
         self._recent = [np.array(pose, dtype=float)]
         self._is_ended = False
         self._begin(0, env, observation)
@@ -308,7 +314,7 @@ class PrimitiveGuide(Guide):
         return self.segments[self._index].segment.name or str(self._index)
 
     def scaled_command(self) -> np.ndarray:
-        """Return the last command (O,) in the frame, relative to the range of the segment's demonstrations."""
+        """Return the last command (O,) in the segment's frame, scaled to ±1 over the range of its demonstrations."""
         fitted = self.segments[self._index]
         return (self._last - fitted.center) / fitted.half_range
 
@@ -347,12 +353,12 @@ class TemplateGuide(Guide):
 
     Args:
         template: Template.
-        frames: (env, observation) → poses X_WF of the template's objects by name, called at reset.
-        period: Control period [s].
+        frames: (env, observation) → poses X_WF (`RigidTransform`) of the template's objects by name, called at reset.
+        period: Control period [s], positive.
         extra: Value for `to_action`, or (name of the state) → value.
 
     Raises:
-        InputError: If the period is not positive.
+        InputError: If the period is missing or not positive.
     """
 
     num_outputs = POSE_SIZE
@@ -370,7 +376,11 @@ class TemplateGuide(Guide):
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin in the template's state at the measured pose."""
+        """Begin in the template's state at the measured pose.
+
+        Raises:
+            InputError: If the pose of an object is missing, or a pose is not finite.
+        """
         self._frames = self._frames_of(env, observation)
         missing = [name for name in self.template.frames if name not in self._frames]
         if missing:
@@ -416,7 +426,7 @@ class TemplateGuide(Guide):
         return self.template.states[self._state].name
 
     def scaled_command(self) -> np.ndarray:
-        """Return the last command (6,) in the template's first frame, in units of `_COMMAND_SCALE`."""
+        """Return the last command (6,) in the template's first frame, in units of 0.2 m and π."""
         X_WF = self._frames[self.template.frames[0]] if self.template.frames else None
         X_FE = self._X if X_WF is None else X_WF.inverse() @ self._X
         return transform_to_pose(X_FE) / _COMMAND_SCALE

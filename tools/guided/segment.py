@@ -26,14 +26,14 @@ class Frame:
     """Frame F of a segment in the world W.
 
     Args:
-        p: Origin p_WF, (3,) or (O,) for outputs that are not positions in space [unit of the outputs].
+        p: Origin p_WF [unit of the outputs]: (3,) with a rotation, otherwise (n,) with n ≤ O, for the first n outputs.
         R: Rotation matrix R_WF (3, 3); the identity by default.
 
     Raises:
-        InputError: If a number is not finite or a shape is wrong.
+        InputError: If `p` is not a vector of finite numbers, or `R` is not a rotation matrix.
 
     Attributes:
-        p: Origin (3,) or (O,).
+        p: Origin (n,).
         R: Rotation matrix (3, 3), or None.
     """
 
@@ -51,7 +51,7 @@ class Frame:
         """Transform an output (O,) from F to W; if F has a rotation, the last three of six entries are an orientation.
 
         Raises:
-            InputError: If the frame does not fit the number of entries.
+            InputError: If the frame does not fit O outputs.
         """
         return self._transformed(output, orientation, is_inverse=False)
 
@@ -61,10 +61,11 @@ class Frame:
         Args:
             output: Output (O,) in W.
             orientation: Meaning of the last three of six entries.
-            near: Output (O,) in F; full turns are added to the orientation so that it is nearest to this one.
+            near: Output (O,) in F. If O is 6, full turns are added to the orientation so that it is nearest to that of
+                `near`.
 
         Raises:
-            InputError: If the frame does not fit the number of entries.
+            InputError: If the frame does not fit O outputs.
         """
         return self._transformed(output, orientation, is_inverse=True, near=near)
 
@@ -112,16 +113,17 @@ class Segment:
 
     Attributes:
         demonstrations: Demonstrations in the segment's frame, at least three, or their file.
-        frame: (env, observation) → `Frame` or origin (O,), called when the segment begins; the world by default.
+        frame: (env, observation) → `Frame` or its origin, called when the segment begins; the world by default.
         constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
         extra: Value for `to_action` that no action changes, such as a gripper command, or (phase, is_held) → value:
             the phase of the segment from 0 to 1, and true while its last point is held. By default, the value of
             `discrete`.
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
-        until: (env, observation) → true to end the segment early; by default it ends with its steps.
-        num_steps: Control steps, at least 12; by default, the mean duration of the demonstrations divided by the
-            period. A shorter segment of at least four periods is slowed down to 12 steps.
+        until: (env, observation) → true to end the segment early, called before each step but its first; by default
+            it ends with its steps.
+        num_steps: Control steps, at least 12; by default one more than the mean duration of the demonstrations has
+            periods. A shorter segment of at least four periods is slowed down to 12 steps.
         dwell: Control steps for which the last point is held after `num_steps`.
         floor: Standard deviation (O,) or scalar whose square is added to every variance [unit of the output].
         name: Name of the segment, in `info`.
@@ -163,8 +165,8 @@ class Segment:
         """Return the number of control steps.
 
         Raises:
-            InputError: If neither `num_steps` nor a positive period [s] is known, or the demonstrations are shorter
-                than four periods.
+            InputError: If there is neither `num_steps` nor a positive, finite period [s], or the demonstrations are
+                shorter than four periods.
         """
         if self.num_steps is not None:
             return int(self.num_steps)
@@ -182,7 +184,7 @@ class Segment:
         """Return the most frequent discrete output of the demonstrations for each control step, or None.
 
         Raises:
-            InputError: If there is not a value for each sample.
+            InputError: If there is not one discrete output for each sample of each demonstration.
         """
         if self.discrete is None:
             return None
@@ -199,14 +201,14 @@ class Segment:
 
 
 def as_bool(value: Any, what: str) -> bool:
-    """Return what the function named `what` has returned as True or False; raise an InputError for an array."""
+    """Return `value`, a result of the function named `what`, as a bool; raise an InputError if it is an array."""
     if np.ndim(value):
         raise InputError(f"{what} must return True or False, not {brief(value)}")
     return bool(value)
 
 
 def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[int]]) -> list[Demonstrations]:
-    """Cut demonstrations at events into segments; a sample at a cut belongs to both sides.
+    """Cut demonstrations at events into segments; the sample at a cut belongs to the segments on both sides.
 
     Args:
         demonstrations: M demonstrations.
@@ -216,7 +218,8 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
         K + 1 demonstrations of M parts each; the clock of each part begins at 0.
 
     Raises:
-        InputError: If there is not one list for each demonstration, or a part has fewer than two samples.
+        InputError: If there is not one list for each demonstration, the lists differ in length, or a part has fewer
+            than two samples.
     """
     try:
         lists = [list(each) for each in cuts]
@@ -238,7 +241,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
 
 def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
-    """Return the sample indices of events in each recording.
+    """Return the sample indices of events, a list for each of M recordings.
 
     An event is the first sample after the previous event at which its condition holds.
 

@@ -69,7 +69,8 @@ class RobotConnection:
     """Connection to the robot driver.
 
     Raises:
-        InputError: If the options contradict each other, or the driver has no simulated robot.
+        InputError: If the options contradict each other, the driver is unknown or has no simulated robot, or the rate
+            is out of range.
     """
 
     robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has a bus of its own
@@ -85,10 +86,14 @@ class RobotConnection:
 
     @classmethod
     def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:
-        """Return the connection that options and a scenario file describe; the file may be None.
+        """Return the connection with the robot and address of a scenario file, if there is one, and with options.
+
+        Args:
+            file: Scenario file, or None.
+            **options: Fields of the connection. A file for a simulated driver sets `sim`.
 
         Raises:
-            InputError: If the file is invalid, or its robot or address contradicts the options.
+            InputError: As `RobotConnection`, or if the file is invalid or contradicts the options.
         """
         if file is None:
             return cls(**options)
@@ -138,7 +143,7 @@ class RobotConnection:
         return LockstepClock(station.driver, LOCKSTEP_TIMEOUT, station.period), wall_clock
 
     def timing(self, station: HardwareStation, clock: WallClock) -> Mapping[str, Any]:
-        """Return statistics of the intervals between statuses; empty in lockstep."""
+        """Return statistics of the intervals between statuses [ms]; empty in lockstep."""
         if self.synchronous:
             return {}
         return {
@@ -153,7 +158,10 @@ class RobotConnection:
     def simulated_driver(
         self, task: str, url: str, imports: Sequence[str] = ()
     ) -> Iterator[subprocess.Popen[Any] | None]:
-        """Run the simulated driver of an arm in front of a task's fixture; do nothing for a real robot."""
+        """Run the simulated driver of an arm in front of a task's fixture; for a real robot, do nothing and yield None.
+
+        The driver listens at `url` and imports the modules `imports`.
+        """
         if not self.sim:
             yield None
             return

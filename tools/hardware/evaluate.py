@@ -46,7 +46,7 @@ def evaluate_on_robot(
     out: Path | None = None,
     log: Log = print,
 ) -> Mapping[str, Any]:
-    """Run episodes of a policy, and write a row for each.
+    """Run episodes of a policy on a robot or a simulated driver, and write a row for each.
 
     With a simulated driver the episodes have the conditions of `guiderail evaluate` in simulation: held-out conditions,
     and the run's own hidden offset.
@@ -67,8 +67,8 @@ def evaluate_on_robot(
         `stopped`, the number of stopped episodes.
 
     Raises:
-        InputError: If the policy cannot be executed, no robot answers, a check fails or is not confirmed, or the rows
-            exist already.
+        InputError: If `episodes` is less than 1, the policy cannot be executed, no robot answers, a check fails or is
+            not confirmed, the arm does not reach the start or does not resume, or the rows exist already.
     """
     if episodes < 1:
         raise InputError(f"a number of episodes is at least one, not {episodes}")

@@ -108,9 +108,12 @@ class SkillExecutor:
         self._joints: dict[str, list[np.ndarray]] = {name: [] for name in JOINT_SIGNALS}
 
     def run(self, log: Log) -> Outcome:
-        """Take control where the arm is, approach the skill's start slowly, execute it, and damp the arm to rest.
+        """Take control of the arm, approach the skill's start slowly, execute the skill, and damp the arm to rest.
 
-        The arm is brought to rest after any exception too, for example of a policy that returns no action.
+        The arm is brought to rest after any exception too, for example if a policy returns no action.
+
+        Raises:
+            InputError: If no robot answers.
         """
         self._warm_up()
         self._simulator = start_simulator(self._station, self._clock)
@@ -145,7 +148,10 @@ class SkillExecutor:
         self._clock.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
 
     def _return_control(self) -> None:
-        """Control the arm by the approach's station in a new simulator: one that raised cannot be advanced."""
+        """Control the arm by the approach's station in a new simulator.
+
+        Drake cannot continue a simulator that raised within a step.
+        """
         station, root_context = self._active_station()
         context = station.GetMyContextFromRoot(root_context)
         self._simulator = start_simulator(self._station, self._clock)
@@ -251,7 +257,7 @@ class SkillExecutor:
     def write(self, folder: Path, metadata: Mapping[str, Any]) -> Path:
         """Write the control steps with joint signals as Parquet, the metadata as JSON; return the Parquet path."""
         folder.mkdir(parents=True, exist_ok=True)
-        # The number is above all existing ones, even if only one of a pair of files is left.
+        # The number is above those of all existing files, because either file of a recording may have been removed.
         matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
         number = max((int(match.group(1)) for match in matches if match), default=-1) + 1
         steps = table(self.trace, number)
@@ -278,16 +284,22 @@ def deploy(
 ) -> int:
     """Execute the policy of a run on a robot.
 
-    The run is a folder or `pretrained:NAME`. The recording is written to `out`, by default `recordings_folder`. With
-    `assume_yes` the pre-flight checks need no confirmation. The `force_limit` [N] is at most that of the training; a
-    lower one limits the forces of a first motion.
+    Args:
+        run: Run folder, or `pretrained:NAME`.
+        connection: Connection to the robot driver.
+        station: Name of a hardware station.
+        force_limit: Contact force above which the arm is stopped [N], at most that of the training (the default);
+            a lower one limits the forces of a first motion.
+        assume_yes: Do not ask for confirmation of the pre-flight checks.
+        out: Folder of the recording; `recordings_folder` by default.
+        log: Function that shows a message.
 
     Returns:
-        The exit code: 0 if the skill was executed to its end, 1 if it was stopped.
+        The exit code: 0 if the skill was executed to its end, 1 if it was stopped or did not reach the start.
 
     Raises:
-        InputError: If the policy cannot be executed or recorded, no robot answers, or a check fails or is not
-            confirmed.
+        InputError: If the task is no insertion, the policy cannot be executed or recorded, the force limit is above
+            that of the training, no robot answers, or a check fails or is not confirmed.
     """
     folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
     config, policy = folder.config(), Policy.load(folder.path)
@@ -349,7 +361,7 @@ def hardware_environment(task: str, environment: Mapping[str, Any], station: str
     A reward that needs simulation state is replaced by the task's first reward that does not; no policy uses rewards.
 
     Raises:
-        InputError: If `station` is simulated.
+        InputError: If `station` is unknown or simulated.
     """
     if STATIONS.get(station).is_simulated:
         raise InputError(f"station {station!r} is a simulation: watch the policy there with guiderail visualize")

@@ -43,9 +43,9 @@ def describe_distance(pose: np.ndarray, start: np.ndarray) -> str:
 
 
 def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
-    """Return commands (n, 6) from `pose` to `target`, (6,), along a straight line at `SPEED`, then at `target`.
+    """Return commands (n, 6) along a straight line from `pose` to `target`, (6,), which is held for `SETTLING_TIME`.
 
-    The time between commands is `period` [s].
+    The speeds are at most `SPEED` and `ANGULAR_SPEED`. The time between commands is `period` [s].
     """
     distance, angle = pose_distance(target, pose)
     moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
@@ -57,7 +57,8 @@ def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
     """Return commands backwards along poses (n, 6) at the recorded speed, but not below the minimum speeds.
 
     The time between poses is `period` [s]. A pose is skipped if both its distance and its angle from the last
-    pose that was not skipped are less than the minimum speeds cover in a period.
+    pose that was not skipped are less than the minimum speeds cover in a period. The first pose of `path` is never
+    skipped.
     """
     poses: list[np.ndarray] = []
     for pose in path[::-1]:
@@ -160,7 +161,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     payload = sum(body.default_mass() for body in arm.tool)
     torque_shares, axis_limits = station.max_torque_shares(positions), station.impedance.limits[:3]
     if isinstance(driver, PoseDriver):
-        # Nothing clips the torques of the robot's own impedance controller; its limits of external torque stop the arm.
+        # Nothing clips the torques of the robot's own impedance controller; limits of external torque stop the arm.
         torque_share = (torque_shares * np.divide(limits.torque, limits.external_torque)).max()
         torques = f"stopped at external torques of {_numbers(limits.external_torque, 1)} Nm"
         hint = "; above 100% a firm push stops the arm: choose a smaller force_limit"
@@ -219,10 +220,13 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 
 
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
-    """Show the checks and have the operator confirm them; then repeat them, because the robot may have changed.
+    """Show the checks with `log` and have the operator confirm them; then repeat them: the robot may have changed.
 
     If the robot reports an error, such as a reflex, and the operator agrees, the error is cleared first. With
-    `assume_yes` nothing is asked. Returns the checks that were shown.
+    `assume_yes` nothing is asked, and the checks are not repeated.
+
+    Returns:
+        The checks that were shown.
 
     Raises:
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an

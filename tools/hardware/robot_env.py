@@ -103,7 +103,7 @@ class RobotEnv(DiagramEnv):
             hold_tests: Function that returns the pushes that confirm a success, for its measured pose (6,).
             snaps_in: True if the arm cannot pull out a workpiece after a success.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
-                moves the parts as a reset in simulation does, and returns what was sampled.
+                moves the parts as a reset in simulation does, and returns what was sampled. None for a real robot.
 
         Raises:
             InputError: If no robot answers.
@@ -125,7 +125,7 @@ class RobotEnv(DiagramEnv):
 
     @property
     def pose(self) -> np.ndarray:
-        """Pose of the tool, (6,)."""
+        """Measured pose of the tool, (6,) [m, rad]."""
         return self._station.get_pose_output_port().Eval(self._context).copy()
 
     @property
@@ -180,7 +180,8 @@ class RobotEnv(DiagramEnv):
         """Move the arm to the start, and begin an episode.
 
         Raises:
-            InputError: If the start is not reached, or options are given for a real robot.
+            InputError: If the start is not reached, the arm does not resume after a stop, or options are given for a
+                real robot.
         """
         if options and self._randomize_parts is None:
             raise InputError("a reset of a robot takes no options: software cannot move its parts")
@@ -216,7 +217,7 @@ class RobotEnv(DiagramEnv):
         return observation, reward, terminated, truncated, info
 
     def _extend_return_path(self) -> None:
-        """Append the way back along the measured poses of the episode."""
+        """Add the way back along the measured poses of the episode to the return path."""
         self._return_path.extend(retrace(self.trace.measured, self.task.control_period)[::-1])
 
     def _statistics(self, first: int) -> tuple[float, float, float, bool]:
@@ -338,7 +339,7 @@ class RobotEnv(DiagramEnv):
         self._retry_until_ok(self._approach_start)
 
     def _rejoin_return_path(self) -> None:
-        """If the arm was moved by hand, prepend a slow motion to the nearest pose of the return path."""
+        """If the arm was moved by hand, begin the return path with a slow motion to its nearest pose."""
         pose = self.pose
         if not self._return_path or is_near(pose, self._return_path[-1]):
             return

@@ -17,8 +17,8 @@ from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 
 HARDWARE, SIMULATION = "hardware", "simulation"
 _TAGS = ("!IiwaDriver", "!PandaDriver", "!Rpy")  # accepted tags, which name classes
-# Supported fields of Drake's classes. Others are refused, not ignored: without its channel suffix, for example, a
-# command would move another robot.
+# Supported fields of Drake's classes. Another field that differs from its default is refused, not ignored: without its
+# channel suffix, for example, a command would move another robot.
 SUPPORTED = ("control_mode", "lcm_bus", "lcm_url")
 
 
@@ -32,7 +32,10 @@ class PandaDriver:
 
 @dataclass
 class Scenario:
-    """Robot, its bus and its surroundings, with the fields of Drake's `hardware_sim`."""
+    """Robot, its bus and its surroundings.
+
+    All fields but `station` are those of a scenario of Drake's `hardware_sim`, whose further fields are refused.
+    """
 
     station: str = SIMULATION  # "simulation" for a simulated driver, or "hardware"
     # Model directives of the surroundings, for a simulated driver.
