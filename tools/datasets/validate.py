@@ -24,7 +24,7 @@ from guiderail.tools.files import (
     write_atomically,
 )
 
-UNIT_RATIO = 20.0  # larger size ratios indicate another unit: mm instead of m gives 1000, cm gives 100
+UNIT_RATIO = 20.0  # larger ratios of two motions' sizes indicate another unit: mm instead of m gives 1000, cm gives 100
 
 
 def fit_bounds(
@@ -38,20 +38,20 @@ def fit_bounds(
     out: Path | None = None,
     task: Path | None = None,
 ) -> dict[str, Any]:
-    """Fit bounds to demonstrations, draw and write them; return them as text.
+    """Fit bounds to demonstrations, and draw or write them; return a summary with the bounds as text.
 
     Args:
-        file: Demonstrations.
+        file: File of demonstrations, or a folder of files.
         phases: Number of phases, each with its own bounds.
-        margin: Margin beyond the demonstrations, as a fraction of their range.
-        min_margin: Smallest margin, in the outputs' unit.
+        margin: Margin on each side, as a fraction of the demonstrations' range in the phase.
+        min_margin: Smallest margin on each side, in the outputs' unit.
         outputs: Indices of the bounded outputs; all by default.
         draw: Picture to write.
         out: YAML file to write; it must not exist.
         task: Task folder; the bounds in its `task.yaml` are replaced.
 
     Raises:
-        InputError: If an argument is invalid.
+        InputError: If the demonstrations or another argument are invalid, or a file cannot be written.
     """
     if draw is not None:
         check_picture(draw)
@@ -87,7 +87,7 @@ def fit_bounds(
 
 
 def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
-    """Return bounds as values for a task file; None for an unbounded output."""
+    """Return bounds as values for a task file: a list for each phase, or one list; None for an unbounded output."""
 
     def plain(rows: np.ndarray) -> list[Any]:
         lists = [[float(f"{value:.9g}") if np.isfinite(value) else None for value in row] for row in rows]
@@ -118,7 +118,9 @@ _MAX_COMPONENTS = 8  # largest number of mixture components in the comparison wi
 
 
 def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
-    """Return a warning if the motion without actions leaves the spread of the demonstrations, else None.
+    """Return a warning if too few steps without actions stay within a standard deviation of the demonstrations.
+
+    The result is None if at least `MIN_SHARE` of the steps do, or if the task has no demonstrations.
 
     Raises:
         InputError: For an unknown task or option.
@@ -142,12 +144,14 @@ def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
 
 
 def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
-    """Read demonstrations and return their number, durations, ranges, spread, and the deviation of a default primitive.
+    """Read demonstrations and return their number, durations, ranges and spread, with the fit of a primitive.
+
+    The latter is the deviation of a primitive with default parameters, or with `fit` the result of `fit_primitive`.
 
     Args:
         file: File of demonstrations, or a folder of files.
         draw: Picture to write, with the mean, two standard deviations and the range.
-        fit: True to fit a primitive to them, which takes seconds.
+        fit: True to fit the parameters of a primitive, which takes seconds.
 
     Raises:
         InputError: If the demonstrations are invalid, or cannot be drawn or fitted.
@@ -185,9 +189,9 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
 
 
 def _other_units(outputs: np.ndarray) -> list[str]:
-    """Return a sentence for each demonstration over `UNIT_RATIO` times larger or smaller than the median.
+    """Return a sentence for each demonstration more than `UNIT_RATIO` times larger or smaller than the median one.
 
-    `outputs` are those of all demonstrations, (M, N, O).
+    `outputs` are those of all M demonstrations, (M, N, O).
     """
     lengths = np.linalg.norm(np.ptp(outputs, axis=1), axis=1)
     median = float(np.median(lengths))
@@ -220,10 +224,10 @@ def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceT
 
 
 def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
-    """Return the parameters of a primitive that reproduces the demonstrations, and the result of the defaults.
+    """Return the parameters of a primitive that reproduces the demonstrations, and how well the defaults do.
 
     Raises:
-        InputError: If there are too few demonstrations.
+        InputError: If there are fewer than three demonstrations, or too few steps.
     """
     from guiderail.models.primitives.fit import fit
 
@@ -241,7 +245,11 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
 
 
 def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
-    """Draw resampled demonstrations, the mean and two standard deviations of the reference, and the range."""
+    """Draw resampled demonstrations, the mean and two standard deviations of the reference, and the range.
+
+    Raises:
+        InputError: If the picture cannot be written.
+    """
     from guiderail.tools.visualization.style import new_figure, save_figure
 
     outputs, reference = np.stack(common.outputs), _fit_reference(common, None)
@@ -259,21 +267,21 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
 
 
 def _variance_floor(demonstrations: Demonstrations) -> np.ndarray:
-    """Return a floor (O,) of the standard deviation: demonstrations that agree exactly have a singular covariance."""
+    """Return a floor (O,) of the standard deviation, because demonstrations that agree have a singular covariance."""
     return 1e-3 * np.maximum(np.ptp(np.concatenate(demonstrations.outputs), axis=0), 1e-9)
 
 
 TEMPLATE_ENDINGS = (".yaml", ".yml")
-SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a transition distance, by the unit in the file
+SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a transition distance that was read, by the unit in the file
 
 
 def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
     """Read a template file or a shipped template and return its inputs, frames, states and transitions, with remarks.
 
-    With `draw`, its state machine is drawn to a file .png, .svg, .pdf or .dot.
+    With `draw`, its state machine is drawn to a .png, .svg, .pdf, .dot or .gv file.
 
     Raises:
-        InputError: If the template cannot be used.
+        InputError: If there is no such template, it has an error, or the drawing cannot be written.
     """
     from guiderail.models.templates import load_template
     from guiderail.models.templates.drawing import draw as draw_template

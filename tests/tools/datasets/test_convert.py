@@ -295,7 +295,7 @@ def test_export_states_a_shifted_start_when_resampled(tmp_path):
     t = 0.1 * np.arange(5)
     Demonstrations([t - 0.2], [t[:, None]]).save(tmp_path / "early.npz")
     result = export_demonstrations(tmp_path / "early.npz", tmp_path / "set", "lerobot", rate=20)
-    assert result["note"].count("where it was -0.2") == 1
+    assert result["note"].count("first samples were at -0.2 s") == 1
 
 
 @pytest.mark.parametrize("rate", [1e15, 1e308])

@@ -1,4 +1,4 @@
-"""LeRobot datasets of version 3, read and written without LeRobot, which requires other versions of dependencies."""
+"""Reader and writer of LeRobot datasets of version 3, without LeRobot itself, which needs other dependency versions."""
 
 from __future__ import annotations
 
@@ -29,14 +29,15 @@ _CLOCKS = {
 
 
 def read_lerobot(folder: Path, signal: str | None) -> Recorded:
-    """Return one demonstration per episode of a dataset.
+    """Return one motion per episode of a dataset, with times from its frame indices [s].
 
     Args:
         folder: Folder of the dataset.
-        signal: Name of a vector-valued feature; None for the only one (`choose_signal`).
+        signal: Name of a feature with a vector of floats; None to choose one by the rules of `choose_signal`.
 
     Raises:
-        InputError: If the folder is not such a dataset, a file is damaged, or no single feature can be chosen.
+        InputError: If the folder is not such a dataset, a file is damaged, there are more than `MAX_LINES` frames, or
+            no single feature can be chosen.
     """
     import pyarrow as arrow
     import pyarrow.parquet as parquet
@@ -97,8 +98,11 @@ def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
 def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     """Write a dataset in which the demonstrated motion is both the action and the state; return remarks.
 
+    The folder must be new or empty.
+
     Raises:
-        InputError: If the demonstrations have no common rate, a value exceeds 32 bits, or the folder cannot be written.
+        InputError: If the demonstrations have no common rate, the rate rounds to zero, a value exceeds the range of
+            32-bit floats, or the folder cannot be written.
     """
     import pandas as pd
     import pyarrow as arrow

@@ -32,7 +32,7 @@ def rotations_of(quaternions: np.ndarray, where: str) -> Rotation:
     """Return the rotations of quaternions (N, 4), [x y z w]; `where` names their file for the message.
 
     Raises:
-        InputError: If a quaternion is not of length one, or contains NaN.
+        InputError: If the length of a quaternion differs from 1 by more than 0.01, or is NaN.
     """
     lengths = np.linalg.norm(quaternions, axis=1)
     wrong = np.flatnonzero(~(np.abs(lengths - 1.0) <= 0.01))  # the tolerance of tf2
@@ -50,15 +50,18 @@ def poses_in_target(
     target: Sequence[float] | None,
     like: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return poses (N, 6), [x y z Rz Ry Rx], in the target frame.
+    """Return poses (N, 6), [x y z Rz Ry Rx], in the target frame [m, rad].
 
     Args:
         positions: Positions (N, 3) in the recording's frame [m].
         rotations: Rotations (N,) in the recording's frame.
-        target: Pose of the target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees;
-            None keeps the recording's frame.
-        like: Poses of an earlier demonstration, (N', 6). Angles are shifted by full turns to be nearest to the angles
-            of these poses, because a full turn between two demonstrations would be learned as variance.
+        target: Pose of the target in the recording's frame, (6,): [x y z] in meters, and the angles [rx ry rz] in
+            degrees of rotations about the fixed axes x, y and z, in this order. None keeps the recording's frame.
+        like: Poses of an earlier demonstration, (L, 6). Angles are shifted by full turns, so that their mean is nearest
+            to the mean of these poses: a full turn between two demonstrations would be learned as variance.
+
+    Raises:
+        InputError: If Ry comes within 1° of ±90°, where Rz and Rx are not unique.
     """
     if target is not None:
         turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
@@ -69,7 +72,7 @@ def poses_in_target(
             "the angles [Rz Ry Rx] of this recording are singular, because Ry comes near ±90°: give a target frame "
             "(--target) that is turned by 90°"
         )
-    # Rz(a) Ry(b) Rx(c), continuous beyond ±π.
+    # Angles [a b c] of Rz(a) Ry(b) Rx(c), continuous beyond ±π.
     angles = np.unwrap(rotations.as_euler("ZYX"), axis=0)
     if like is not None:
         angles -= 2.0 * np.pi * np.round((angles.mean(axis=0) - like[:, 3:].mean(axis=0)) / (2.0 * np.pi))
@@ -77,12 +80,12 @@ def poses_in_target(
 
 
 def describe_time_shift(demonstrations: Demonstrations) -> list[str]:
-    """Return a remark that an export shifts demonstrations to start at time zero; nothing if all start there."""
+    """Return a remark that an export shifts demonstrations to start at time zero; an empty list if all do."""
     starts = sorted(float(t[0]) for t in demonstrations.times)
     if not any(starts):
         return []
     where = f"{starts[0]:g}" if starts[0] == starts[-1] else f"{starts[0]:g} to {starts[-1]:g}"
-    return [f"time starts at each demonstration's first sample, where it was {where}"]
+    return [f"time is shifted to start at 0; the first samples were at {where} s"]
 
 
 def is_commanded(name: str) -> bool:
@@ -100,7 +103,9 @@ def choose_signal(candidates: Sequence[str], given: str | None, where: str, opti
         InputError: If these rules do not determine one signal.
     """
     if not candidates:
-        raise InputError(f"{where} holds no poses, transforms or joint positions: nothing can be imported")
+        raise InputError(
+            f"{where} holds no poses, transforms, joint positions or vectors of floats: nothing can be imported"
+        )
     if given is not None:
         if given not in candidates:
             raise InputError(f"{where} has no {given}: {option} is one of {', '.join(candidates)}")

@@ -42,7 +42,10 @@ _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bit
 
 
 def find_bags(path: Path) -> list[Path]:
-    """Return the bag at a path, or all bags in the folder, sorted by name; a folder's name may also end in .mcap."""
+    """Return the bag at a path, or all bags in the folder, sorted by name; empty without one.
+
+    A folder is a bag if it has a `metadata.yaml`, and a file if its name ends in .mcap.
+    """
     if _is_bag(path):
         return [path]
     return in_order(filter(_is_bag, path.iterdir())) if path.is_dir() else []
@@ -53,11 +56,13 @@ def _is_bag(path: Path) -> bool:
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:
-    """Return one demonstration per bag; see `choose_signal` for `topic`, and `poses_in_target` for `target`.
+    """Return one motion per bag; see `choose_signal` for `topic`, and `poses_in_target` for `target`.
 
     Raises:
-        InputError: If a bag cannot be read, no single topic can be chosen, its messages are not one motion, `target` is
-            given for a topic without poses, or the outputs of two bags differ.
+        InputError: If a bag cannot be read, or no single topic can be chosen. Also if a topic has several publishers,
+            fewer than two messages, more than `MAX_LINES`, or messages of different sizes or joints; if `target` is
+            given for a topic without poses; or if the outputs of two bags differ.
+        MissingExtraError: If rosbags is not installed.
     """
     recorded = Recorded([], [], ())
     for bag in find_bags(path):
@@ -121,7 +126,7 @@ def _read_bag(
             if len(message.data) != len(names):
                 raise InputError(
                     f"message {number} on {chosen} of {bag} has {len(message.data)} numbers instead of {len(names)}: "
-                    "record the same number in every message"
+                    "record the same number in every message, one for each label, or six without labels"
                 )
         return times, np.array([message.data for message in messages]), names, assumptions
     if kinds[chosen] == JOINTS:
@@ -145,7 +150,7 @@ def _read_bag(
 def _array_names(message: Any) -> tuple[str, ...]:
     """Return the names of an array's numbers: the labels of dimensions of size 1, as `write_mcap` writes them.
 
-    The numbers of a single longer dimension are counted. An array without dimensions is a pose.
+    With a single longer dimension, the names are its label and an index. An array without dimensions is a pose.
     """
     dimensions = message.layout.dim
     if len(dimensions) == 1 and dimensions[0].size == len(message.data) > 1:
@@ -182,7 +187,7 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
 def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
     """Return the time of each message since the first one [s] (N,), with remarks.
 
-    It is computed from the header stamps if they increase, otherwise from the times of receipt.
+    Times are those of the header stamps if these increase, otherwise those of receipt.
     """
     headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
@@ -196,7 +201,7 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
 
 
 def _frame(message: Any, path: Sequence[str]) -> str:
-    """Return a description of the frame in which a pose is given; `path` has the attributes that lead to the pose."""
+    """Return a description of the frame of a pose; `path` has the attributes that lead from the message to the pose."""
     for holder in (message, reduce(getattr, path[:1], message)):
         header = getattr(holder, "header", None)
         if header is not None and header.frame_id:
@@ -207,10 +212,12 @@ def _frame(message: Any, path: Sequence[str]) -> str:
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     """Write a folder with one ROS 2 bag in MCAP per demonstration; return remarks.
 
-    A message is an array of the outputs of one sample, and the labels of its layout are their names.
+    Each message holds the outputs (O,) of one sample; the labels of its layout are the names of the outputs. The folder
+    must be new or empty.
 
     Raises:
         InputError: If a bag cannot represent the demonstrations' times, or the folder cannot be written.
+        MissingExtraError: If rosbags is not installed.
     """
     import_extra("rosbags")
     from rosbags.rosbag2 import StoragePlugin, Writer

@@ -54,9 +54,9 @@ def test_data_that_pyarrow_cannot_read_is_refused(dataset, monkeypatch):
 
 def test_lerobot_export_states_a_shifted_start(dataset, tmp_path):
     notes = write_lerobot(tmp_path / "later", Demonstrations([CLOCK - 0.2], [CLOCK[:, None]]))
-    assert "where it was -0.2" in notes[-1]
+    assert "first samples were at -0.2 s" in notes[-1]
     np.testing.assert_allclose(read_lerobot(tmp_path / "later", "action").times[0], CLOCK)
-    assert "where it was" not in " ".join(write_lerobot(tmp_path / "zero", Demonstrations([CLOCK], [CLOCK[:, None]])))
+    assert "shifted" not in " ".join(write_lerobot(tmp_path / "zero", Demonstrations([CLOCK], [CLOCK[:, None]])))
 
 
 def test_lerobot_export_refuses_samples_too_far_apart(tmp_path):

@@ -128,7 +128,7 @@ def test_assumption_names_no_frame_of_poses_without_header(tmp_path):
 def test_bag_export_shifts_negative_time(tmp_path):
     t = 0.1 * np.arange(5)
     notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
-    assert "first sample, where it was -0.2 to 0.3" in notes[-1]
+    assert "first samples were at -0.2 to 0.3 s" in notes[-1]
     loaded = read_bags(tmp_path / "bags", None, None)
     np.testing.assert_allclose(loaded.times, [t, t], atol=1e-9)
     np.testing.assert_array_equal(loaded.outputs, [t[:, None]] * 2)
