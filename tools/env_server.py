@@ -3,8 +3,9 @@
 Started by `python -m guiderail.tools.env_server TASK_OR_RUN [OPTIONS]`; OPTIONS is a JSON object of environment
 options. It reads requests from standard input and answers on standard output, and ends when its input ends. Requests
 are `{"reset": SEED}`, with null to continue the random stream, and `{"action": [...]}`. The first line and every answer
-has `observation`, `pose`, `wrench`, `is_done`, `is_success` and `termination`; the first line also has `action_size`
-and `period` [s]. A refused request is answered with `error`, and the simulation does not advance.
+have `observation`, `pose`, `wrench`, `is_done`, `is_success` and `termination`. The first line also has `action_size`
+and `period`, the duration of an action [s]. A refused request is answered with `error` alone, and the simulation does
+not advance.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.run_folder import RunFolder, as_arguments
 
-MAX_LINE = 100_000  # longest request [characters]
+MAX_LINE = 100_000  # longest request, including the end of its line [characters]
 
 
 def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
-    """Return the environment of a run's folder or of a task, with changed options.
+    """Return the environment of a run or of a task, with some options changed.
 
     Args:
         name: Folder of a run, or name of a task.
@@ -65,12 +66,12 @@ class EnvServer:
             self._observation = env.reset(seed=0)[0]
 
     def describe(self) -> dict[str, Any]:
-        """Return the content of the first line."""
+        """Return the content of the first line, which describes the environment and its state."""
         action_space = self._env.action_space
         return {"action_size": action_space.shape[0], "period": self._env.time_step} | self._state()
 
     def answer(self, request: Any) -> dict[str, Any]:
-        """Return the answer to a request."""
+        """Return the answer to a request, which is any value that JSON can represent."""
         try:
             if not isinstance(request, dict) or len(request) != 1 or next(iter(request)) not in ("reset", "action"):
                 raise InputError('a request is {"reset": SEED} or {"action": [...]}')

@@ -41,6 +41,8 @@ _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in it
 def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     """Return the name of a task, given its name or its folder's path, and the imports that a run of it needs.
 
+    An unknown name is returned unchanged.
+
     Raises:
         InputError: If the folder's task is not valid.
     """
@@ -51,11 +53,11 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
 
 
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
-    """Return a digest of the files that a task consists of; empty if all of them are installed.
+    """Return a digest of the files that a task consists of; "" if all of them belong to installed packages.
 
     These are the files of the task folder, the files that an option of the environment names, such as demonstrations
     or the code of FILE.py:FUNCTION, the policy of a folder that an option names, such as a base policy, and the
-    imported files, as `import_modules` returns them.
+    imported files. Only absolute paths are read, as `import_modules` returns them.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
@@ -87,7 +89,7 @@ def _read(file: Path) -> bytes:
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none.
+    """Return the options of a task's environment with their defaults; `inspect.Parameter.empty` for a required one.
 
     Raises:
         InputError: If the task is unknown.
@@ -102,7 +104,7 @@ def task_options(task: str) -> dict[str, Any]:
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a task's environment with all defaults filled in.
+    """Return the arguments of a task's environment with all defaults filled in; register its base policy, if any.
 
     Raises:
         InputError: If the task or an argument is unknown, or a value is refused.
@@ -126,7 +128,7 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def declared_models(task: str) -> list[type[Options]]:
-    """Return the models of all options that a task of this package may have, with any guidance and on any station."""
+    """Return the pydantic models of all options that a registered task may have, with any guidance and station."""
     declared: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
     declared += [PrimitiveOptions, TemplateOptions]
     workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"
@@ -181,8 +183,8 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of an environment that differ from the defaults.
 
-    Guidance, station and difficulty are compared with the task's defaults, and all other arguments with the defaults
-    for these three.
+    Guidance, station and difficulty are compared with the task's defaults. All other arguments are compared with the
+    defaults that these three determine.
 
     Raises:
         InputError: If the task or one of the three is unknown.
@@ -200,7 +202,7 @@ def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapp
     the options that the new station does not have.
 
     Raises:
-        InputError: If there is no such difficulty.
+        InputError: If the difficulty changes and the resulting arguments are not valid.
     """
     removed = _options_of_station_only(environment.get("station"), changes.get("station"))
     environment = {key: value for key, value in environment.items() if key not in removed}
@@ -219,7 +221,7 @@ def _options_of_station_only(own: Any, other: Any) -> set[str]:
 
 
 def _is_like(value: Any, default: Any) -> bool:
-    """Return True if a value has the type of a default, or the default has no type."""
+    """Return True if a value has the type of a default, or there is no default or it is None."""
     if default is None or default is inspect.Parameter.empty:
         return True
     if isinstance(default, float):
@@ -230,7 +232,10 @@ def _is_like(value: Any, default: Any) -> bool:
 
 
 def as_value(text: str) -> Any:
-    """Return a value typed on the command line, parsed as YAML; text that is not YAML is returned unchanged."""
+    """Return a value typed on the command line, parsed as YAML; text that is not YAML is returned unchanged.
+
+    A list becomes a tuple, and any text that `float` accepts becomes a number, quoted text included.
+    """
     if re.fullmatch(r"-?(0|[1-9][0-9]{0,14})", text):  # plain values do not need the reader, which is slow to import
         return int(text)
     if text not in ("null", "true", "false") and re.fullmatch(r"-?[0-9]{1,9}\.[0-9]{1,15}|[a-z_]+", text):

@@ -1,4 +1,7 @@
-"""Baseline policies, which ignore the observation: they show the success rate of a task without learning."""
+"""Policies that show the success rate of a task without learning: baseline policies, and scripted ones of a task.
+
+Baseline policies ignore the observation.
+"""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -30,7 +33,7 @@ def zero(rng: np.random.Generator, size: int) -> PolicyFn:
 
 
 def uniform_random(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return a policy of independent uniform actions in [−1, 1], like those of an untrained policy."""
+    """Return a policy of independent uniform actions in [−1, 1]."""
     return lambda observation: rng.uniform(-1.0, 1.0, size)
 
 
@@ -45,12 +48,12 @@ def random_hold(rng: np.random.Generator, size: int) -> PolicyFn:
 
 
 def bang_bang(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return a policy of actions at a corner of [−1, 1]^A, which is sampled again with `SWITCH_PROBABILITY`."""
+    """Return a policy of actions at a corner of [−1, 1]^size, which is sampled again with `SWITCH_PROBABILITY`."""
     return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: rng.uniform() < SWITCH_PROBABILITY)
 
 
 def random_corner(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return a policy of one random corner of [−1, 1]^A for the whole episode."""
+    """Return a policy of one random corner of [−1, 1]^size for the whole episode."""
     return _repeat(lambda: rng.choice([-1.0, 1.0], size), lambda count: False)
 
 
@@ -83,7 +86,7 @@ class BaselinePolicy(Callback):
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
     def start_episode(self, index: int) -> None:
-        """Continue with episode `index`, independent of the episodes that this process has run before."""
+        """Make `on_episode_start` begin episode `index`, whichever episodes this process has run before."""
         self._episode = index - 1
 
     def on_episode_start(self) -> None:
@@ -101,7 +104,7 @@ zero_policy: MakePolicy = partial(BaselinePolicy, zero)
 
 
 def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
-    """Return the policy with the same action (A,) in every episode."""
+    """Return the policy that returns the same action (A,) at every step of every episode."""
     return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
 
 
@@ -126,7 +129,7 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
 
 
 def _file_hint(name: str) -> str:
-    """Return how to name the file of a policy that the user seems to mean; empty without such a file."""
+    """Return advice on how to give the file of a policy that the user seems to mean; "" without such a file."""
     if name.endswith(".py"):
         return f"give the function in a file too, as {name}:FUNCTION"
     file = next((name + ending for ending in ENDINGS if Path(name + ending).is_file()), None)
@@ -136,8 +139,8 @@ def _file_hint(name: str) -> str:
 def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
     """Return a function that makes a baseline policy, or a scripted policy of a task, for an environment.
 
-    The name is a key of `BASELINES`, that of a scripted policy, or "scripted" for the default of the difficulty. The
-    seed is that of a baseline's random generators.
+    The name is a key of `BASELINES`, the name of a scripted policy, or "scripted" for the default of the difficulty.
+    `seed` is the seed of a baseline policy's random generators.
 
     Raises:
         InputError: If the task has no policy of that name.

@@ -63,18 +63,18 @@ Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
 
 
 class _SuccessReport(Callback):
-    """Callback that adds to an episode's row whether the environment reports success."""
+    """Callback that adds the column `REPORTS_SUCCESS` to an episode's row."""
 
     def on_episode_start(self) -> None:
-        """Begin an episode without a report."""
+        """Reset the column for a new episode."""
         self._is_reported = False
 
     def on_step(self, transition: Transition) -> None:
-        """Look for a success in `info`, true or not."""
+        """Note whether `info` has a key for success, whatever its value."""
         self._is_reported |= not {"is_success", "success"}.isdisjoint(transition.info)
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the column."""
+        """Return the column: 1 if any `info` of the episode had such a key."""
         return {REPORTS_SUCCESS: int(self._is_reported)}
 
 
@@ -92,25 +92,26 @@ def evaluate_policies(
     """Evaluate several policies on the same held-out episodes of one environment.
 
     Episodes are distributed over forks of this process. The conditions of an episode depend only on its seed, so the
-    results do not depend on the number of processes. A policy with internal state resets it in
-    `Callback.on_episode_start`. A policy that draws random numbers has a method `start_episode(index)`, which is called
-    before each episode and seeds the policy's generator.
+    results do not depend on the number of processes. A policy with internal state must reset it in
+    `Callback.on_episode_start`. A policy that samples random numbers must seed its generator in a method
+    `start_episode(index)`, which is called before each episode.
 
     Args:
-        env: Environment; values that are constant in a run stay the same unless the reset option `new_run` is given.
+        env: Environment. Its values that are constant in a run do not change without the reset option `new_run`.
         policies: Policies by name.
         episodes: Number of episodes of each policy.
         seed: Seed of the first episode; episode i has seed + i.
         options: Further options of the resets.
         labels: Labels of the progress bars on standard error, by policy name; no bar by default.
-        collect: Function that returns the data to keep of each episode.
+        collect: Function from the environment and an episode's row to the data to keep of the episode.
         processes: Largest number of processes; None for the number of cores.
 
     Yields:
-        Name of a policy, its rows, and the data that `collect` returned for each of its episodes.
+        Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
 
     Raises:
-        InputError: If a number is out of range.
+        InputError: If `episodes`, `seed` or `processes` is out of range.
+        KilledError: If a process is killed.
     """
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
     if has_image(env.observation_space):
@@ -142,7 +143,7 @@ def evaluate_policies(
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
     """Return the rows of held-out episodes of one policy; see `evaluate_policies` for the other arguments.
 
-    The label is that of the progress bar on standard error; without a label there is no bar.
+    `label` is the label of the progress bar on standard error; without a label there is no bar.
     """
     ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **how)
     return rows
@@ -161,6 +162,9 @@ def evaluate_run(
     Hidden values that are constant in a run are the same as in its training. With `skips_incompatible`, a policy whose
     observation or action shape does not match the environment has no rows. Further arguments are those of
     `evaluate_policy`.
+
+    Raises:
+        InputError: If the environment cannot be made, or an argument is out of range.
     """
     with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
@@ -181,11 +185,14 @@ def evaluate_once(
 ) -> pd.DataFrame | None:
     """Return the stored rows of held-out episodes; if there are none, evaluate the policy and store its rows.
 
-    The run decides the task and the hidden values. See `episodes_file` for `about`; further arguments are those of
-    `evaluate_policy`, with the policy's name as the default label.
+    The task, and the seed of the hidden values, are those of `config`. See `episodes_file` for `about`. Further
+    arguments are those of `evaluate_policy`; the default label is `name`.
 
     Returns:
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
+
+    Raises:
+        InputError: If the stored file is damaged or cannot be written, or an argument is invalid.
     """
     file = episodes_file(folder, name, config, environment, about=about, **how)
     how = {"label": name, "skips_incompatible": True, **how}
@@ -210,26 +217,25 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
-    The rows of the baseline policies are stored in the run's folder and used again. The rows of the run's policy in its
-    own environment are stored for a report.
+    The rows of the baseline policies are stored in the run's folder, under the policies' names, and used again. The
+    rows of the run's policy in its own environment are stored for a report.
 
     Args:
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
             a model of Stable-Baselines3.
-        env: Name of the task, an environment, or the id of one that is registered with Gymnasium, that a policy
-            without a run is evaluated in. An environment that is not of this package is reset with the seed of the
-            episode and reports success as `info["is_success"]` or `info["success"]`. If it reports none, the statistics
-            of success are None.
+        env: Environment of a policy without a run: name of a task, an environment, or an id that is registered with
+            Gymnasium. An environment that is not of this package is reset with the seed of the episode, and its success
+            is `info["is_success"]` or `info["success"]`. If `info` has neither, the statistics of success are None.
         episodes: Number of held-out episodes.
-        baselines: Baseline policies: their names, or functions that make them for an environment, by name; None for the
-            default set of the task. The demonstration alone is always evaluated if the guidance has one.
+        baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
+            None is the default set of the task. The demonstration alone is always evaluated if the guidance has one.
         environment: Options of the environment that differ from the run's options or the task's defaults.
         seed: Seed of the first episode; episode i has seed + i.
-        processes: Largest number of processes; None for the number of cores. The results do not depend on it, see
-            `evaluate_policies` for policies with a memory.
+        processes: Largest number of processes; None for the number of cores. The results do not depend on it; see
+            `evaluate_policies` for policies with internal state.
         trust_policy: True to read a policy file that can execute code: a zip of Stable-Baselines3 or TorchScript.
-        resample_offsets: True if values that are hidden and constant in a run are sampled again in every episode.
+        resample_offsets: True to sample the hidden values, which are constant in a run, again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the
             commanded poses, because their difference from the measured poses causes the contact force.
@@ -239,15 +245,16 @@ def evaluate(
         Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, the
         conditions that the result is valid for; the statistics `COMPARED`, each also as `demonstration_<name>` (None
         without a demonstration) and `<baseline>_<name>`; `baselines`, the names of the evaluated baseline policies, and
-        `skipped_baselines`, those with another observation or action; `best_baseline` and `p`, see `Comparison`;
-        `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run;
-        `saved`, the number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is.
-        Collisions are None if the task declares no collision signal.
+        `skipped_baselines`, those that do not fit the environment's observation or action; `best_baseline` and `p`, if
+        there is a `Comparison`; `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the
+        training, None without a run; `saved`, the number of saved demonstrations, if `save` is given; `differences`, if
+        `describe_differences` is given. `collisions` and `collision_steps` are None if the task declares no collision
+        signal.
 
     Raises:
         InputError: If there is no trained policy, an argument is out of range, the policy's observation, action or
-            guidance does not match the environment, nothing can be resampled, or an episode would repeat the offset of
-            the run.
+            guidance does not match the environment, or `save` cannot be written. With `resample_offsets`, also if the
+            task has no hidden offset, or an episode has the seed of the run and so its offset.
     """
     _check_saved(save, signal)
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
@@ -338,7 +345,7 @@ def _check_saved(save: Path | None, signal: str) -> None:
 def _episodes_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
     """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
 
-    Those of the run's own policy are stored only if the environment is the run's own and nothing is resampled.
+    Episodes of the run's own policy are stored only in the run's own environment, and if nothing is resampled.
     """
     folder, config = subject.folder, subject.config
     if folder is None or config is None or not subject.is_stored:
@@ -351,7 +358,10 @@ def _episodes_file(subject: Subject, name: str, environment: Mapping[str, Any], 
 
 
 def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any]:
-    """Return the statistics of the policy, of the demonstration and of each baseline policy."""
+    """Return the statistics of the policy, of the demonstration and of each baseline policy, by prefixed name.
+
+    Statistics of collisions are None unless `counts` is True.
+    """
     result: dict[str, Any] = {}
     for name, table in ({POLICY: pd.DataFrame(), "demonstration": pd.DataFrame()} | dict(rows)).items():
         result |= statistics(table, "" if name == POLICY else f"{name}_")
@@ -359,7 +369,7 @@ def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any
 
 
 def _training(folder: RunFolder | None) -> dict[str, Any]:
-    """Return the number of training episodes and the episodes to convergence; None without a table of episodes."""
+    """Return the episodes to convergence and the number of training episodes; None without a table of episodes."""
     if folder is None or not (folder.path / "episodes.csv").is_file():
         return {"episodes_to_convergence": None, "trained_episodes": None}
     rows = folder.episodes()

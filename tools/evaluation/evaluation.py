@@ -21,12 +21,11 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
 
-REPORTS_SUCCESS = (
-    "reports_success"  # column of an environment of another origin: 1 if `info` had a success, true or not
-)
-POLICY = "policy"  # name of the run's own policy
-POLICY_FOLDER = "held_out"  # folder of the policy's episodes, in the run
-BASELINES_FOLDER = "baselines"  # folder of the baseline policies' episodes, in the run
+# Column for environments of other packages: 1 if `info` had `is_success` or `success`, true or false; else 0.
+REPORTS_SUCCESS = "reports_success"
+POLICY = "policy"  # name of the evaluated policy
+POLICY_FOLDER = "held_out"  # folder of the policy's evaluated episodes, in the run's folder
+BASELINES_FOLDER = "baselines"  # folder of the baseline policies' evaluated episodes, in the run's folder
 
 
 def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
@@ -46,10 +45,14 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataF
 def episodes_file(
     folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
 ) -> Path:
-    """Return the path of a policy's evaluated episodes, with its `name` and a digest of all that they depend on.
+    """Return the path of the file for a policy's evaluated episodes; its name is `name` and a digest.
 
-    The digest covers the environment, the run's seed, the task's files, package versions, and the arguments `how` of
-    `evaluate_policy` except `label` and `processes`. `about` is anything else, such as the digest of the policy.
+    The digest covers the options of the environment, the run's seed, the task's files, package versions, and the
+    arguments `how` of `evaluate_policy` except `label` and `processes`. `about` is anything else that the episodes
+    depend on, such as the digest of the policy.
+
+    Raises:
+        InputError: If a file of the task cannot be read.
     """
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
@@ -61,7 +64,7 @@ def episodes_file(
 def policy_digest(source: Path) -> str:
     """Return the digest of a policy's weights in a folder, or of its file.
 
-    For module:function it is a unique value, because the function may read other files.
+    For `module:function` the result is unique in each call, because the function may read other files.
     """
     file = source / "policy.safetensors" if source.is_dir() else source
     if not file.is_file():
@@ -86,7 +89,7 @@ COMPARED = (
     "success_rate", "success_low", "success_high", "mean_return", "mean_steps", "max_commanded_violation",
     "max_measured_violation", "collisions", "collision_steps", "peak_force", "mean_force",
 )  # fmt: skip
-"""Statistics of the policy and of every baseline policy."""
+"""Names of the statistics of the policy and of every baseline policy; see `STATISTICS`."""
 COLLISIONS = ("collisions", "collision_steps")  # statistics that need a task with a collision signal
 LABELS = {
     POLICY: "policy", "demonstration": "demonstration alone", "zero": "zero action",
@@ -99,7 +102,7 @@ class Comparison(NamedTuple):
     """Comparison of a policy's success with that of the best baseline policy, on the same episodes."""
 
     baseline: str  # name of the baseline policy with the most successes
-    successes: int  # number of successes of this baseline policy
+    successes: int  # number of successful episodes of this baseline policy
     p: float  # largest p-value of the tests against each baseline policy; see `compare`
 
 
@@ -110,7 +113,7 @@ class Evaluation(Mapping[str, Any]):
     Attributes:
         statistics: Statistics, as `guiderail evaluate --json` prints them.
         rows: Episodes by name of the policy, one row each; the first policy is the evaluated one.
-        is_held_out: False for an environment that was given as an object, which has no held-out conditions.
+        is_held_out: False if the environment was given as an object; its episodes may have the conditions of training.
     """
 
     statistics: Mapping[str, Any]
@@ -128,7 +131,7 @@ class Evaluation(Mapping[str, Any]):
 
     @cached_property
     def table(self) -> pd.DataFrame:
-        """Statistics `COMPARED`, one row for each policy; statistics without any value are left out.
+        """Statistics `COMPARED`, one row for each policy; a statistic that no policy has is left out.
 
         `success_low` and `success_high` are the ends of the 95 % interval of the success rate.
         """
@@ -138,7 +141,7 @@ class Evaluation(Mapping[str, Any]):
 
     @property
     def comparison(self) -> Comparison | None:
-        """Comparison with the best baseline policy; None without one."""
+        """Comparison with the best baseline policy; None without one, or if the environment reports no success."""
         return compare(self.rows)
 
     @property
@@ -190,8 +193,8 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     The test is McNemar's, exact and one-sided. It uses only the episodes in which exactly one of the two policies
     succeeds: a policy that is not better succeeds in at most half of these on average. The result has the largest
     p-value of all baseline policies, so that "better than the best baseline" means better than each of them
-    (intersection-union test). No correction for the number of baseline policies is needed. Without a baseline policy,
-    and in an environment that reports no success, the result is None.
+    (intersection-union test). No correction for the number of baseline policies is needed. The result is None without
+    a baseline policy, and in an environment that reports no success.
     """
     if not reports_success(rows[POLICY]):
         return None

@@ -1,4 +1,4 @@
-"""Computation of independent results in forks of this process, which inherit all that it has imported and built."""
+"""Parallel computation of independent results in forks, which inherit everything that this process has imported."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Forks:
     """
 
     def __init__(self, compute: Callable[[Any], Any], processes: int):
-        """Start processes that call `compute`, whose argument and result can be pickled."""
+        """Start `processes` forks that call `compute`, whose arguments and results must support pickling."""
         context = multiprocessing.get_context("fork")
         self._idle: list[Connection] = []
         self._busy: list[Connection] = []
@@ -74,7 +74,7 @@ class Forks:
         return bool(self._idle)
 
     def submit(self, argument: Any) -> None:
-        """Let an idle process compute a result; see `has_idle`.
+        """Send `argument` to an idle process; there must be one (`has_idle`).
 
         Raises:
             KilledError: If the process was killed.
@@ -89,9 +89,11 @@ class Forks:
     def collect(self, timeout: float | None = None) -> list[Any]:
         """Return the results that are complete, at least one unless the timeout [s] passes.
 
+        At least one process must be computing. An exception of `compute` is raised again, with the traceback of the
+        fork as a note; one that cannot be pickled is raised as a RuntimeError.
+
         Raises:
-            KilledError: If a process was killed. An exception of `compute` is raised with the process's traceback as a
-                note, or as a RuntimeError if it cannot be pickled.
+            KilledError: If a process was killed.
         """
         results = []
         for connection in wait(self._busy, timeout):
@@ -122,10 +124,11 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
     """Yield `compute(0)`, …, `compute(count - 1)` in this order, computed in `Forks` of this process.
 
     Results must not depend on the order of the calls. They are computed in this process if `processes` or `count` is
-    less than 2, or if this process cannot have forks (`can_fork`).
+    less than 2, or if this process cannot have forks (`can_fork`). An exception of `compute` is raised as by
+    `Forks.collect`.
 
     Raises:
-        KilledError: If a process is killed. An exception of `compute` is raised as by `Forks.collect`.
+        KilledError: If a process is killed.
     """
     processes = min(processes, count)
     if processes < 2 or not can_fork():

@@ -22,15 +22,15 @@ from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 
-CONFIDENCE = 0.95
-RESAMPLES = 1000
+CONFIDENCE = 0.95  # level of all confidence intervals
+RESAMPLES = 1000  # number of bootstrap resamples
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the lower and upper ends, (n,) each, of the 95 % interval of the mean over at least two runs (runs, n)."""
+    """Return lower and upper ends, (n,) each, of the 95 % interval of the mean of `values` (R, n) over R ≥ 2 runs."""
     return _bootstrap(np.asarray(values, float), np.mean)
 
 
@@ -75,13 +75,16 @@ def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tu
 
 
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the fraction of runs that have not converged, by Kaplan and Meier.
+    """Estimate the fraction of runs that have not converged, by the Kaplan-Meier estimator.
 
-    A run that never converged, None in `converged`, is censored at the last episode after which ten consecutive
-    successes would have fitted.
+    A run that never converged is censored at the last episode after which ten consecutive successes would have fitted.
+
+    Args:
+        converged: Episodes to convergence of each run; None for a run that never converged.
+        episodes: Number of episodes of each run.
 
     Returns:
-        Numbers of episodes at which the fraction changes, and the fraction from each of them on, (k,) each.
+        Numbers of episodes in order, beginning with 0, and the fraction from each of them on, (k,) each.
     """
     known = [after for after in converged if after is not None]
     censored = [max(n - CONVERGED_SUCCESSES, 0) for after, n in zip(converged, episodes, strict=True) if after is None]
@@ -92,7 +95,10 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
 
 
 def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
-    """Return the step (k,) of `survival` after which half of the runs have converged; None if less than half do."""
+    """Return the number of episodes after which half of the runs have converged; None if fewer than half do.
+
+    The arguments are the results of `survival`, (k,) each.
+    """
     reached = steps[fractions <= 0.5]
     return float(reached[0]) if len(reached) else None
 
@@ -101,7 +107,7 @@ def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
 class Episode:
     """Finished episode."""
 
-    index: int  # number of the episode
+    index: int  # number of the episode, from 0
     trace: EpisodeTrace  # every control step
     total: float  # sum of the rewards that the environment returned
     terms: Mapping[str, float]  # sum of each reward term
@@ -125,7 +131,7 @@ class Episode:
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     """Return the mean jerk of poses (n, O) at intervals of `period` [s]: "linear" [m/s³] and "angular" [rad/s³].
 
-    Rotations are the last three of six numbers; without them, "angular" is 0.
+    The latter is that of the orientation's three coordinates; it is 0 unless O is 6.
     """
     poses = np.array(poses)
     angular = mean_jerk(poses[:, 3:], period) if poses.shape[1] == 6 else 0.0
@@ -177,8 +183,13 @@ COLUMNS = (
     *_violations(_statistic),
     Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
-    Metric("saturated_steps", STEPS, "control steps with an actuator at its limit", _count("saturated_steps")),
-    Metric("fallback_steps", STEPS, "control steps that repeated the last safe command", _count("fallback_steps")),
+    Metric("saturated_steps", STEPS, "control steps with the controller at a limit", _count("saturated_steps")),
+    Metric(
+        "fallback_steps",
+        STEPS,
+        "control steps at which guidance replaced the requested pose by a safe one",
+        _count("fallback_steps"),
+    ),
 )
 
 
@@ -191,8 +202,9 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
     """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
-    The success of the episode is `is_success` or `success` in the `info` of any step. Of `constraint_violation` and
-    `contact_force`, the largest value of any step is used. `is_terminated` is False for a time limit.
+    `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step.
+    The largest `constraint_violation` and `contact_force` of any step are the columns `max_commanded_violation` and
+    `peak_force`. `is_terminated` is False if the episode was truncated.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -208,15 +220,17 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     return row
 
 
-WORDS = ("termination", "fault")  # columns of text; the latter on hardware only
+WORDS = ("termination", "fault")  # columns of text; `fault` exists on hardware only
+# Columns of whole numbers.
 COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
 
 
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
-    """Return a table of episodes that was read from `source`, unchanged.
+    """Return a table of episodes unchanged; `source` is its file, for the message.
 
     Raises:
-        InputError: If a column other than `WORDS` holds text, or a column of `COUNTS` a number that is not whole.
+        InputError: If a column other than `WORDS` holds text, a column of `COUNTS` holds a number that is not whole, or
+            `success` holds a number other than 0 and 1.
     """
     words = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     parts = [name for name in COUNTS if name in rows and name not in words and not (rows[name] % 1 == 0).all()]
@@ -234,7 +248,7 @@ def own_episodes(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def episodes_to_convergence(rows: pd.DataFrame) -> int | None:
-    """Return the number of episodes before the first ten consecutive successes (the thesis's figure 3.8), or None.
+    """Return the number of episodes before the first ten consecutive successes (thesis, figure 3.8), or None.
 
     A demonstration counts as an episode, but not as a success.
     """
@@ -313,7 +327,12 @@ _STATISTICS = (
     ),
     Metric("collisions", "", "collisions that began in all episodes", _total("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision, in all episodes", _total("collision_steps")),
-    Metric("fallback_steps", STEPS, "repeated safe commands, in all episodes", _total("fallback_steps")),
+    Metric(
+        "fallback_steps",
+        STEPS,
+        "control steps at which guidance replaced the requested pose, in all episodes",
+        _total("fallback_steps"),
+    ),
     Metric("ended_in_success", "", "episodes that ended in success", _ended("success")),
     Metric("ended_in_collision", "", "episodes that a collision ended", _ended("collision")),
     Metric("ended_in_spill", "", "episodes that a spill ended", _ended("spill")),
@@ -326,11 +345,11 @@ _STATISTICS = (
 )
 STATISTICS = {metric.name: metric for metric in _STATISTICS}
 SYMBOLS = ("N", "N²", "s", VIOLATION, *JERKS.values())
-"""Units that are symbols, not words, and therefore short enough for a table."""
+"""Units that are short enough for a table, because they are symbols and not words."""
 
 
 def statistics_of(task: str | None = None) -> dict[str, Metric]:
-    """Return the statistics of a task's episodes by name: the common ones and its own; None stands for all tasks."""
+    """Return the statistics of a task's episodes by name: the common ones and its own; with None, those of all."""
     tasks = TASKS.names() if task is None else [task] if task in TASKS.names() else []
     return STATISTICS | {metric.name: metric for name in tasks for metric in TASKS.get(name).statistics}
 

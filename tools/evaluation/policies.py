@@ -1,7 +1,7 @@
 """Policies of any origin: a run, a policy's folder, a file of another library, a function, or an object with `predict`.
 
 Code in a file is executed only if the user allows it: a policy's folder and an ONNX file hold only numbers, but a zip
-of Stable-Baselines3 is a pickle and a TorchScript file is a program. `module:function` names code to execute.
+of Stable-Baselines3 is a pickle and a TorchScript file is a program. With `module:function`, the user names the code.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ from guiderail.tools.pretrained import PRETRAINED, find_run
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
 
-# Algorithm that reads a zip of Stable-Baselines3, by the module of the policy's class; the zip names no algorithm.
+# Package and algorithm that read a zip of Stable-Baselines3, by the module of the policy's class, because the zip does
+# not name its algorithm.
 _SB3_ALGORITHMS = {
     "stable_baselines3.common.policies": ("stable_baselines3", "PPO"),  # A2C and TRPO have the same policy
     "stable_baselines3.sac.policies": ("stable_baselines3", "SAC"),
@@ -70,10 +71,10 @@ class ForeignPolicy(Callback):
         action_shape: tuple[int, ...] | None = None,
         errors: tuple[type[Exception], ...] = (),
     ):
-        """Construct the policy from a function from an observation to an action; shapes are given if they are known.
+        """Construct the policy from `act`, a function from an observation to an action.
 
-        A leading dimension of 1 of the action is removed. `errors` are the exceptions that `act` raises for an
-        observation of a wrong shape.
+        An action of shape (1, A) becomes (A,). A shape is None if it is unknown. `errors` are the exceptions
+        that `act` raises for an observation of a wrong shape.
         """
         self.observation_shape, self.action_shape = observation_shape, action_shape
         self._act, self._errors = act, errors
@@ -82,7 +83,8 @@ class ForeignPolicy(Callback):
         """Return the action for an observation.
 
         Raises:
-            ValueError: If the observation has another shape than the policy takes.
+            ValueError: If the observation has another shape than the policy takes, or the function raised one of its
+                `errors`.
         """
         if self.observation_shape not in (None, np.shape(observation)):
             raise ValueError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
@@ -94,9 +96,10 @@ class ForeignPolicy(Callback):
 
 
 class PredictPolicy(ForeignPolicy):
-    """Policy with a `predict` method, such as a model of Stable-Baselines3, acting deterministically.
+    """Policy with a `predict` method, such as a model of Stable-Baselines3.
 
-    The internal state of a recurrent policy is passed from call to call and reset at the start of an episode.
+    It acts deterministically if `predict` has a parameter `deterministic`. If `predict` has the parameters `state` and
+    `episode_start`, the state is passed from call to call and reset at the start of an episode.
     """
 
     def __init__(self, model: Any):
@@ -126,7 +129,7 @@ class PredictPolicy(ForeignPolicy):
 
 
 def as_policy(given: Any) -> PolicyFn:
-    """Return a function, or an object with a `predict` method, as a function from an observation to an action.
+    """Convert an object with a `predict` method to a function from observation to action; return a function unchanged.
 
     Raises:
         InputError: If `given` is neither.
@@ -144,7 +147,7 @@ def as_policy(given: Any) -> PolicyFn:
 
 
 def is_policy_file(source: str | Path) -> bool:
-    """Return True if a source names a file or a function, and not a folder, a task or a baseline policy."""
+    """Return True if a source is a policy's file, by its ending, or `module:function`."""
     return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
 
 
@@ -158,7 +161,8 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
         trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
 
     Raises:
-        InputError: If the file is missing, damaged or executable without trust, or its package is not installed.
+        InputError: If the file or function is missing, the file is damaged, it can execute code and is not trusted, or
+            its package is not installed.
     """
     if (function := _function_of(str(source))) is not None:
         return _load_function(*function)
@@ -178,8 +182,10 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
 def add_base_policy(source: str) -> str:
     """Return the name of a base policy; register it first if it is given as a file or `module:function`.
 
+    Another source, such as the folder of a run, is returned unchanged.
+
     Raises:
-        InputError: If the source can execute code and `trust_imports` is not active, or `load_policy` raises one.
+        InputError: If the source can execute code and `trust_imports` is not active, or the policy cannot be loaded.
     """
     if source in BASE_POLICIES.names() or not is_policy_file(source):
         return source
@@ -194,7 +200,7 @@ def add_base_policy(source: str) -> str:
 
 
 def _function_of(source: str) -> tuple[str, str] | None:
-    """Return module and name of `module:function`; None for another source."""
+    """Return the module and the function's name of `module:function`; None for another source."""
     module, separator, name = source.rpartition(":")
     is_name = bool(separator) and name.isidentifier() and bool(module) and not source.startswith(PRETRAINED)
     return (module, name) if is_name else None
@@ -258,7 +264,7 @@ def _load_onnx(path: Path) -> PolicyFn:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a fork has no threads of its parent
+    options.intra_op_num_threads = options.inter_op_num_threads = 1  # a fork does not have its parent's threads
     content = read_bytes(path, "policy", MAX_WEIGHTS_SIZE)
     try:
         session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
@@ -282,7 +288,7 @@ def _load_onnx(path: Path) -> PolicyFn:
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
     """Return a policy unchanged if its observation and action shapes match an environment.
 
-    The error message compares the environment with the options `learned_in` of the policy's training.
+    `learned_in` has the options of the environment in training; the error message names those that differ.
 
     Raises:
         InputError: If the shape of the policy's observations or actions differs from the environment's.
@@ -324,8 +330,8 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
 def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
     """Return the shapes of a policy's observation and action; None if a shape is unknown.
 
-    If a policy states no shape and cannot take the environment's observations, flat observations of other sizes are
-    tried, up to `_MAX_SIZE`: a network takes exactly one size.
+    If a policy declares no shape and fails for the environment's observations, it is called with flat observations of
+    all sizes up to `_MAX_SIZE`. The result is known if it takes exactly one of them, as a network does.
     """
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
@@ -343,7 +349,7 @@ _MAX_SIZE = 256  # largest size of a flat observation that is tried
 
 
 def _only_shapes(policy: PolicyFn) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Return the only flat shape that a policy takes and the shape of its action; None without one or with several."""
+    """Return the only flat observation shape that a policy takes, and its action's shape; None if it is not unique."""
     found = []
     for size in range(1, _MAX_SIZE + 1):
         with suppress(Exception):  # code of others can raise any exception
@@ -364,9 +370,10 @@ _MAX_FITTING = 2  # largest number of combinations that a message names
 
 
 def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> list[str]:
-    """Return combinations of options of a task's environment with which a policy is compatible, smallest change first.
+    """Return changes of a task's `options` with which a policy is compatible, as command-line text, smallest first.
 
-    Guidance, observation and difficulty are varied, because they decide the sizes of observation and action.
+    Guidance, observation and difficulty are varied, because they determine the sizes of observation and action. At most
+    `_MAX_FITTING` changes are returned.
     """
     kind = TASKS.get(task)
     values = {

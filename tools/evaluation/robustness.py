@@ -45,10 +45,10 @@ class Axis:
     name: str  # name, as `--axes` takes it
     label: str  # label of the plot's axis, with the unit
     values: tuple[float, ...]  # values, including the default
-    default: float  # value of an environment with default options
+    default: float  # value that the default options have
     # Function from an environment's options and a value to the options that change.
     change: Callable[[Environment, float], dict[str, Any]]
-    # True if the hidden values of a run are sampled again in every episode, because the axis changes them.
+    # True if the axis changes the hidden values of a run, which are therefore sampled again in every episode.
     resamples: bool = False
 
 
@@ -132,12 +132,14 @@ class Point:
     axis: Axis
     value: float  # value on the axis
     environment: Environment  # options of the environment with this value
-    trained: float | None  # value in training if it is the axis's default, otherwise None
+    trained: float | None  # the axis's default if the policy was trained with it, otherwise None (unknown)
     options: Mapping[str, Any] = field(default_factory=dict)  # options of every reset
 
 
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
-    """Return the points of some axes that an environment supports, and a sentence for each point left out.
+    """Return the points of `axes` that an environment supports, and sentences about the points that are left out.
+
+    There is one sentence for each axis and reason.
 
     Raises:
         InputError: If the environment itself is invalid.
@@ -180,10 +182,13 @@ COLORS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3a
 
 
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
-    """Draw the rows of a table: success rate and force over each axis, with a line for each policy.
+    """Draw the rows of a table to a picture: success rate and force over each axis, with a line for each policy.
 
     Bars are Wilson's 95 % intervals. A solid line shows the mean of the episodes' peak forces, a dot the largest one. A
-    dashed line marks the value that the policy was trained with.
+    dashed line marks the value that the first policy was trained with.
+
+    Raises:
+        InputError: If the picture cannot be written.
     """
     table = pd.DataFrame(rows)
     axes = list(dict.fromkeys(table["axis"]))
@@ -224,9 +229,9 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     return save_figure(figure, path)
 
 
-EPISODES = 30  # episodes of each policy at each point
+EPISODES = 30  # default number of episodes of each policy at each point
 MAX_NAME_LENGTH = 120  # largest number of characters of a table's name
-DEMONSTRATION = "demonstration"  # name of the zero policy if it executes the demonstration alone
+DEMONSTRATION = "demonstration"  # name of the zero policy if the guidance then follows the demonstrations
 
 
 @dataclass(frozen=True)
@@ -235,7 +240,7 @@ class _Actor:
 
     name: str  # name in the table
     make_policy: MakePolicy  # function from an environment to the policy
-    # Configuration of the run; its environment has the changes given to `robustness`.
+    # Configuration of the run, with the `environment` options given to `robustness`.
     config: RunConfig
     about: str | None = None  # digest of a learned policy
 
@@ -256,30 +261,32 @@ def robustness(
 ) -> dict[str, Any]:
     """Evaluate policies under one disturbance at a time; the rest of the environment is as in training.
 
-    The episodes of every point are stored in the folder: the same call resumes an interrupted evaluation, and if a
-    run is added, only its episodes are simulated.
+    The episodes of every point are stored in the folder `out`. The same call resumes an interrupted evaluation, and if
+    a run is added, only its episodes are simulated.
 
     Args:
-        policies: Runs of one task; with `task`, any policies that `find_subject` takes. Baseline policies act through
-            the guidance of the first one.
+        policies: Runs of one task; with `task`, any policies that `find_subject` takes. Baseline policies act in the
+            environment of the first one.
         task: Task of policies without a run.
         episodes: Number of held-out episodes of each policy at each point, with the same seeds.
         seed: Seed of the first episode.
-        environment: Options of the environment that differ throughout, such as the station.
+        environment: Options of the environment that differ from training at all points, such as the station.
         axes: Names of axes, comma-separated; all by default.
         baselines: Baseline policies: their names, or functions that make them, by name; None for the default set of
-            the task.
+            the task without "constant".
         out: Folder to write; by default `robustness/<station>` in the run. Required for several policies, and for a
             policy without a run.
-        log: Function called with a sentence on the differences between the runs and one for each point left out.
+        log: Function called with a sentence on the differences between the runs, and the sentences of `points`.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
         trust_policy: True to read a policy file that can execute code.
 
     Returns:
-        `table` and `picture`, the paths of the files; `rows`, the table's rows; `policies`, the names of the policies.
+        `table` and `picture`, the paths of the files; `rows`, the table's rows; `policies`, the names of the policies,
+        without baseline policies.
 
     Raises:
-        InputError: If there is no trained run, runs are of different tasks, or an argument is invalid.
+        InputError: If there is no trained run, runs are of different tasks, an argument is invalid or missing, or all
+            points are left out.
     """
     episodes, seed = as_whole(episodes, "the number of episodes"), check_seed(seed)
     if episodes < 1:
@@ -392,7 +399,7 @@ def _row(point: Point, policy: str, rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def values_below(rows: Sequence[Mapping[str, Any]], policy: str) -> dict[str, list[float]]:
-    """Return the values of each axis at which a policy's success rate is below 90 %."""
+    """Return, by axis, the values at which a policy's success rate is below 90 %."""
     result: dict[str, list[float]] = {}
     for row in rows:
         if row["policy"] == policy:

@@ -1,4 +1,4 @@
-"""Episode loop of training, evaluation, replays, studies, fuzzing and teleoperation, and its progress bar."""
+"""Loop over the actions of an episode, with callbacks, and the progress bar of many episodes."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Transition:
         terminated: True if the task ended the episode.
         truncated: True if the episode ended for another reason.
         info: `info` of the environment's step.
-        privileged: Privileged observation before the action, (m,), if the environment observes it.
-        next_privileged: Privileged observation after the action, (m,).
+        privileged: Privileged observation before the action, (m,); None if the environment provides none.
+        next_privileged: Privileged observation after the action, (m,), or None.
     """
 
     observation: np.ndarray
@@ -56,7 +56,7 @@ class Transition:
 
 
 class Callback:
-    """Callback of an episode, such as a learner or a camera."""
+    """Base class of callbacks of an episode, such as a learner or a camera."""
 
     def on_episode_start(self) -> None:
         """Handle the start of an episode, after the reset."""
@@ -70,7 +70,7 @@ class Callback:
 
 
 class EnvCallback(Callback):
-    """Callback that reads more of an environment than its step returns.
+    """Callback that reads more data of an environment than those that a step returns.
 
     Attributes:
         env: Environment.
@@ -111,11 +111,14 @@ def rollout(
     Args:
         env: Environment.
         act: Policy; if it is a `Callback`, its callback methods are called too.
-        callbacks: Callbacks.
+        callbacks: Callbacks, called in this order, after the policy.
         index: Number of the episode, for its row.
-        seed: Seed of the reset; default: the next conditions of the training distribution.
-        held_out: Sample the conditions from the held-out distribution, by the seed.
+        seed: Seed of the reset. By default the random stream continues; with `held_out` the seed is then 0.
+        held_out: True to sample the conditions from the held-out distribution instead of that of training.
         options: Options of the reset.
+
+    Raises:
+        InputError: If the reset or an action is refused, or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
@@ -183,7 +186,7 @@ class Paths(EnvCallback):
 
 
 def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Start an episode with held-out conditions; `options` are further options of the reset.
+    """Start an episode with held-out conditions and return its first observation; `options` are passed to the reset.
 
     An environment from outside this package has no option `held_out`: its conditions depend on the seed.
     """
@@ -193,9 +196,10 @@ def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
 
 
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's actions for several observations have the shape of the environment's actions.
+    """Return True if the policy's actions for several observations have the shape of the environment's actions.
 
-    Several observations are tried because a scripted policy may read a component only if others have certain values.
+    It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
+    others have certain values.
     """
     act, shape = make_policy(env), env.observation_space.shape or ()
     try:
@@ -205,7 +209,7 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
     return shapes == {env.action_space.shape}
 
 
-WINDOW = 10  # number of training episodes over which success and return are averaged
+WINDOW = 10  # default number of last episodes over which success and return are averaged
 INTERVAL = 10.0  # time between lines if standard error is not a terminal [s]
 
 
@@ -231,8 +235,8 @@ class EpisodeProgress:
             name: Name of the bar.
             window: Number of last episodes over which success and return are averaged; None for all episodes.
             console: Console; standard error by default, so that results can be piped.
-            asks: True if questions are asked while the bar is shown. The bar is then redrawn only after episodes, so
-                that it covers no question.
+            asks: True if the program asks questions while the bar is shown. The bar is then redrawn only after
+                episodes, so that it covers no question.
         """
         from rich.console import Console  # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -263,7 +267,7 @@ class EpisodeProgress:
         self._bar.stop()
 
     def update(self, row: Mapping[str, Any]) -> None:
-        """Add a finished episode."""
+        """Add a finished episode, given its row."""
         self._done, self._count = int(row["episode"]) + 1, self._count + 1
         self._recent.append((float(row["success"]), float(row["return"])))
         violation = float(row.get("max_commanded_violation", -math.inf))
@@ -277,7 +281,7 @@ class EpisodeProgress:
             self._console.print(text, soft_wrap=True)
 
     def status(self) -> str:
-        """Return success and return of the last episodes, and the largest constraint violation of all."""
+        """Return success and return of the last episodes and the largest violation of all; call it after `update`."""
         from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # pandas takes a second
 
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))

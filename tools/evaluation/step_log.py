@@ -1,4 +1,4 @@
-"""Step log of a run: one row for every control step, one Parquet file for each episode, in the run's `steps/`."""
+"""Step log of a run: a Parquet file for each episode in the run's `steps/`, with one row for every control step."""
 
 from __future__ import annotations
 
@@ -42,20 +42,26 @@ _FLAGS = {"collision", "command_timed_out", "fallback"}
 
 
 class StepLog(EnvCallback):
-    """Callback that writes an episode's control steps when the episode ends, before a checkpoint includes the episode.
+    """Callback that writes an episode's control steps to a file when the episode ends.
+
+    The file is thus written before a checkpoint includes the episode.
 
     Attributes:
         seconds: Time spent on writing so far [s].
     """
 
     def __init__(self, env: gymnasium.Env, folder: Path):
-        """Construct the callback of episodes in `env`; each has a file in the folder."""
+        """Construct the callback for episodes in `env`; it writes one file per episode into `folder`."""
         super().__init__(env)
         self._folder = folder
         self.seconds = 0.0
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Write the episode's control steps; add no column to its row."""
+        """Write the episode's control steps; add no column to its row.
+
+        Raises:
+            InputError: If the file cannot be written.
+        """
         started = time.perf_counter()
         write_step_log(step_log_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
         self.seconds += time.perf_counter() - started
@@ -63,12 +69,15 @@ class StepLog(EnvCallback):
 
 
 def step_log_file(folder: Path, episode: int) -> Path:
-    """Return the path of an episode's file."""
+    """Return the path of the file of episode number `episode`, from 0."""
     return folder / f"episode-{episode:06d}.parquet"
 
 
 def remove_step_logs(folder: Path, episodes: int) -> None:
-    """Remove the files of all but the first `episodes` episodes; a stopped run may have logged some before its end."""
+    """Remove the files of all but the first `episodes` episodes.
+
+    A run that was stopped may have logged episodes after its last checkpoint.
+    """
     for file in folder.glob("episode-*.parquet"):
         if int(file.stem.removeprefix("episode-")) >= episodes:
             file.unlink()

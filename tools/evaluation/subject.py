@@ -1,4 +1,4 @@
-"""Policy that is evaluated or shown, the episode in which it is shown, and baselines next to it."""
+"""Policy that is evaluated or shown, the episode that is shown, and the baseline policies of an evaluation."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> 
 
 
 def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets: bool) -> str:
-    """Return the scope of an evaluation: the hidden offset of one run, or offsets sampled in every episode.
+    """Return the scope of an evaluation, as text: the conditions that its result is valid for.
 
     Raises:
         InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
@@ -63,7 +63,7 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
 
 
 def hides(task: str, environment: Mapping[str, Any]) -> bool:
-    """Return True if all episodes of a run have the same hidden offset, which only a reset with `new_run` changes."""
+    """Return True if all episodes of a run have the same hidden offset, unless a reset has the option `new_run`."""
     return _can_hide(task) and environment.get("fixture_offset", "per_run") == "per_run"
 
 
@@ -86,7 +86,7 @@ class Subject:
     """Policy that is evaluated or shown."""
 
     name: str  # name of the policy
-    # Configuration of its run; without a run, a configuration of the environment that it acts in; None if the
+    # Configuration of its run. Without a run: configuration of the environment that it acts in, or None if the
     # environment is given as an object.
     config: RunConfig | None
     make_policy: MakePolicy  # function from an environment to the policy
@@ -95,7 +95,11 @@ class Subject:
     digest: str | None = None  # digest of the policy, for the names of stored files; None for a baseline policy
 
     def changed_environment(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the environment's options with changes; raise an InputError for another guidance than its run's."""
+        """Return the environment's options with changes; `config` must not be None.
+
+        Raises:
+            InputError: If the policy's run has another guidance, or a change is invalid (`changed_environment`).
+        """
         assert self.config is not None
         changed = changed_environment(self.config.task, self.config.environment, changes)
         if self.folder is not None:
@@ -104,13 +108,17 @@ class Subject:
 
 
 def find_environment(env: Any) -> Any:
-    """Return an environment or the name of a task unchanged; make the environment of an id of another package.
+    """Return the environment or the name of the task that `env` denotes.
+
+    The id of an environment of another package is made into an environment, and "guiderail/NAME-v0" into the name. All
+    else is returned unchanged, unknown names included.
 
     Args:
         env: Environment, name or folder of a task, id of an environment registered with Gymnasium, or None.
 
     Raises:
-        InputError: If it is none of these, or an environment cannot be made.
+        InputError: If `env` has another type, is a vector environment, or is an id that is not registered; or if the
+            environment cannot be made.
     """
     if env is None or isinstance(env, gymnasium.Env | os.PathLike):
         return env
@@ -151,8 +159,8 @@ def find_subject(
         trust_policy: True to read a policy file that can execute code.
 
     Raises:
-        InputError: If there is no such policy or task, the files of a run's task have changed since it began, or a
-            policy without a run has no task.
+        InputError: If there is no such policy or task, the files of a run's task have changed since the run began, or
+            `env` is None for a policy without a run.
     """
     if isinstance(policy, os.PathLike):
         policy = Path(policy)
@@ -163,7 +171,9 @@ def find_subject(
             raise InputError(f"{policy} is a task: name the policy that acts in it, such as --policy scripted")
         folder = RunFolder(find_run(policy))
         run_config = folder.config()
-        run_config.refuse_changed_task(folder.path, "train again; with --task and --env its policy acts in any files")
+        run_config.refuse_changed_task(
+            folder.path, "train again; with --task and --env its policy acts in the changed task"
+        )
         # The policy is checked against the environment, which is not necessarily that of the run.
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
@@ -186,7 +196,7 @@ def find_subject(
 
 
 def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:
-    """Return a baseline or scripted policy for an environment, or refuse it if it does not fit."""
+    """Return a baseline or scripted policy for an environment; raise an InputError if it does not fit."""
     if not is_compatible(make_policy, env):
         raise InputError(
             f"the policy {name!r} does not fit the observations or actions of this environment: choose another one, or "
@@ -198,9 +208,12 @@ def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> 
 def make_baselines(
     config: RunConfig | None, environment: Mapping[str, Any], baselines: Mapping[str, MakePolicy] | Sequence[str] | None
 ) -> Mapping[str, MakePolicy]:
-    """Return functions that make baseline policies, by name; `baselines` are such functions, or only the names.
+    """Return functions that make baseline policies, by name.
 
-    With None, the default set is returned. `config` is None if the environment is given as an object.
+    Args:
+        config: Configuration with the task and the seed; None if the environment is given as an object.
+        environment: Options of the environment, which determine the default set.
+        baselines: Names of baseline policies, or the functions themselves by name; None for the default set.
 
     Raises:
         InputError: If a name is unknown.
@@ -224,11 +237,11 @@ class EpisodeSpec:
     task: str  # name of the task
     environment: Mapping[str, Any]  # options of the environment
     policy: MakePolicy  # function that returns the policy for an environment
-    acting: str  # label of the policy
-    title: str  # text next to task and guidance in a heading
+    acting: str  # label of the policy's motion
+    title: str  # name of the policy or learner in the heading
     run_seed: int = 0  # seed of the run, from which its hidden values are sampled
     seed: int = HELD_OUT_SEED  # seed of the episode
-    run: Path | None = None  # folder of the run, or None
+    run: Path | None = None  # folder of the run; None without one, or for a pretrained policy
 
     @classmethod
     def of_policy(
@@ -250,7 +263,8 @@ class EpisodeSpec:
             trust_policy: True to read a policy file that can execute code.
 
         Raises:
-            InputError: If there is no such policy, or `environment` has another guidance than the run.
+            InputError: If there is no such policy, the seed is invalid, or `environment` has another guidance than the
+                run.
         """
         subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder
