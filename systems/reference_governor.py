@@ -15,9 +15,9 @@ class ReferenceGovernor(LeafSystem):
 
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
-    with measured pose x and velocity v, stiffness K and damping D of six joints, and time step h. Motion faster than
-    F / √(k m) is slowed down, with force bound F, contact stiffness k and moving mass m (see `governed_error`). A
-    desired pose that needs no limiting is output unchanged up to rounding.
+    with measured pose x and velocity v, stiffness K and damping D of the six coordinates, and time step h. The spring
+    accelerates the mass m to at most F / √(k m), with force bound F and contact stiffness k (see `slow_down`). A pose
+    that needs no limiting is output unchanged up to rounding.
 
     .. pydrake_system::
 

@@ -26,8 +26,8 @@ class RelativePoses(LeafSystem):
         output_ports:
         - relative_poses
 
-    ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,): for each body its position in meters and its
-    orientation as a rotation vector of at most π radians.
+    ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,) for n bodies: the position of each body [m] and
+    its orientation as a rotation vector of at most π radians.
 
     Args:
         plant: Finalized plant.

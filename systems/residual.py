@@ -29,7 +29,7 @@ class Residual(LeafSystem):
         gain: Diagonal of K, (O,), in units of the reference per unit of action.
 
     Raises:
-        InputError: If the gain is not a vector of finite numbers.
+        InputError: If the gain is not a nonempty vector of finite numbers.
     """
 
     def __init__(self, gain: np.ndarray):

@@ -20,7 +20,7 @@ class RewardTerm:
     Args:
         name: Name of the term and of its output port.
         inputs: Size of each signal that the term depends on, by name. Terms that name the same signal share its port.
-        value: Pure function of these signals, called by name, that returns the term of this control step.
+        value: Pure function with these signals as keyword arguments; returns the term of this control step.
     """
 
     name: str
@@ -50,8 +50,9 @@ class RewardSystem(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If there is no term, a name is not allowed, two terms state different sizes of a signal, or the
-            parameters of a function are not named like its signals. At evaluation, if a term is not one finite number.
+        InputError: If there is no term, a name is not allowed, a signal's size is below 1 or differs between terms, or
+            the parameters of a function are not named like its signals. At evaluation, if a term is not one finite
+            number.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):

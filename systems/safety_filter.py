@@ -13,7 +13,8 @@ class SafetyFilter(LeafSystem):
 
         safe_pose = project(pose, desired_pose)
 
-    See `KeepOut.project`. The measured pose is sampled at control steps, so the command is constant between them.
+    `KeepOut.project` moves a command out of boxes and into linear constraints. The measured pose is sampled at
+    control steps, so the command is constant between them.
 
     .. pydrake_system::
 
@@ -26,7 +27,7 @@ class SafetyFilter(LeafSystem):
         - intervention
 
     ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1 if a box changed the
-    command.
+    command, and 0 if only the constraints did.
 
     Args:
         keep_out: Boxes and constraints.
@@ -34,6 +35,7 @@ class SafetyFilter(LeafSystem):
 
     Raises:
         InputError: If the period is not positive.
+        UnsolvableError: At evaluation, if a pose is not finite.
     """
 
     def __init__(self, keep_out: KeepOut, period: float):

@@ -19,7 +19,7 @@ class SctInputMapping(LeafSystem):
         H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
     where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input results in
-    a NaN pose, which `ActiveConstraintProjector` refuses.
+    a NaN pose, for which `ActiveConstraintProjector` repeats its last safe command.
 
     .. pydrake_system::
 

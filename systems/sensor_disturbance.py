@@ -16,9 +16,10 @@ class SensorDisturbance(LeafSystem):
 
         y = s ∘ u(t − k h) + b + C (x − x₀) + d + σ ∘ n,  n ~ N(0, 1), sampled once per period h
 
-    and then rounded to whole multiples of the resolution. s, b, C, k and the seed of noise and drift are parameters of
-    the context, which a reset sets. d is a random walk, and x₀ is the configuration x at the initialization. An
-    initialization restarts the noise and fills the delay line with zeros.
+    and then rounded to whole multiples of the resolution. The measurement u has the scale s, the bias b and the delay
+    k. C is the gradient of the error over the configuration x, and x₀ is the configuration at the initialization. The
+    drift d is a random walk. s, b, C, k and the seed of noise and drift are parameters of the context, which a reset
+    sets. An initialization restarts noise and drift, and fills the delay line with zeros.
 
     .. pydrake_system::
 
@@ -98,7 +99,7 @@ class SensorDisturbance(LeafSystem):
     get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
-        """Set scale s, (n,), bias b, (n,), in the units of the sensor, and the seed of noise and drift.
+        """Set scale s (n,), bias b (n,) in the units of the sensor, and the seed of noise and drift, not negative.
 
         `context` is this system's.
         """
@@ -116,7 +117,7 @@ class SensorDisturbance(LeafSystem):
         context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
 
     def set_gradient(self, context: Context, gradient: np.ndarray) -> None:
-        """Set the gradient C (n, m) of the error in the configuration; `context` is this system's."""
+        """Set the gradient C (n, m) of the error over the configuration; `context` is this system's."""
         context.get_mutable_numeric_parameter(self._gradient).SetFromVector(np.ravel(gradient))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:

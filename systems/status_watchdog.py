@@ -38,10 +38,10 @@ class StatusWatchdog(LeafSystem):
     ``status`` is abstract: the newest `JointStatus`, or None. ``torque`` is (n,), the torques that are sent after this
     check [Nm]. ``clock`` is (1,), the wall-clock time of this check [s]; if it is not connected, checks are one period
     apart. ``estimated_state`` is (2n,), positions and velocities [rad, rad/s], and ``external_torque`` is (n,) [Nm];
-    both are taken from the last accepted status, and zero before the first. ``velocity`` is (n,), the velocity for
-    damping [rad/s]: estimated from several sources, predicted while no status is accepted, and zero where it is
-    unknown. ``fault`` is (1,), a code of `Fault`. ``age`` is (1,), the age of the last accepted status relative to the
-    earliest arrival [s].
+    both are those of the last accepted status, with its velocities limited as described in `StateEstimator`, and zero
+    before the first. ``velocity`` is (n,), the velocity for damping [rad/s]: estimated from several sources, predicted
+    while no status is accepted, and zero where it is unknown. ``fault`` is (1,), a code of `Fault`. ``age`` is (1,),
+    the age of the last accepted status relative to the earliest arrival [s]; infinite before the first.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its inertia is used.

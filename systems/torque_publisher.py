@@ -29,7 +29,7 @@ class TorquePublisher(LeafSystem):
         write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
         num_joints: Number n of joints, at least 1.
         period: Publishing period [s], positive.
-        hold: Function that asks the driver to hold the arm, such as `Driver.hold`.
+        hold: Function that makes the driver hold the arm, such as `Driver.hold`.
 
     Raises:
         InputError: If an argument is out of range.

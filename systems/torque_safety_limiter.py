@@ -42,6 +42,9 @@ class SafetyLimits:
         damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
         decay_time: Decay time of the joint velocities during damping [s], at least two periods.
         ramp_time: Time in which the blend factor increases to 1 [s], positive.
+
+    Raises:
+        InputError: If a limit or a time is out of range, the numbers of joints differ, or the workspace is empty.
     """
 
     velocity: tuple[float, ...]
@@ -78,10 +81,10 @@ class TorqueSafetyLimiter(LeafSystem):
     The velocity is estimated from several sources, and predicted while no status is accepted.
 
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
-    the start the limiter waits for a valid status and then takes over without `resume`. The output is always finite and
-    within the torque limits; at zero torque the robot only compensates its weight. After a stop, zero torque is sent
-    for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the driver can hold the arm
-    by itself (brakes, position control), ``is_holding`` requests this after a status fault stopped the arm.
+    the start the limiter waits until no fault is present and then takes over without `resume`. The output is always
+    finite and within the torque limits; at zero torque the robot only compensates its weight. After damping, zero
+    torque is sent for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the driver can hold the arm
+    by itself (brakes, position control), ``is_holding`` requests this after a fault of `STATUS_FAULTS`.
 
     .. pydrake_system::
 
@@ -111,10 +114,10 @@ class TorqueSafetyLimiter(LeafSystem):
     ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s], are outputs of a `StatusWatchdog`.
     ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
 
-    ``fault`` is (1,), the code of the `Fault` that stopped the arm, or 0. ``arm_state`` is (1,), a value of `ArmState`.
-    ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are sent. ``is_holding`` (1,) is 1 while the
-    driver has to hold the arm instead. ``not_following`` (1,) is 1 while the desired pose is not followed: the arm is
-    stopped or taking over, or no valid command is available.
+    ``fault`` is (1,), the code of the `Fault` that stopped the arm, otherwise that of a present fault, or 0.
+    ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are
+    sent. ``is_holding`` (1,) is 1 while the driver has to hold the arm instead. ``not_following`` (1,) is 1 while the
+    desired pose is not followed: the arm is waiting, taking over or stopped, or no valid command is available.
 
     Args:
         plant: Model of the arm and its payload alone, finalized; its inertia is used.
@@ -195,7 +198,7 @@ class TorqueSafetyLimiter(LeafSystem):
     get_not_following_output_port = output_getter("not_following", "flag that the desired pose is not followed, (1,)")
 
     def stop(self, context: Context) -> None:
-        """Stop the arm with the fault `Fault.USER_STOP`; `context` is this system's."""
+        """Stop the arm with the fault `Fault.USER_STOP`, unless it is stopped already; `context` is this system's."""
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state == ArmState.WAITING:
             # No velocity has been accepted yet and no torque has been sent, so there is nothing to damp.

@@ -19,8 +19,9 @@ class WrenchSensor(LeafSystem):
 
         F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
 
-    See `external_wrench`. The wrist is a joint; the tool is the child of the wrist and the bodies welded to it. F is
-    transformed to the center of compliance P and expressed in axes that are fixed in the world.
+    F is the `external_wrench` on a tool with spatial inertia M, velocity V and acceleration A, where F_wrist is the
+    reaction of the wrist, a joint. The tool is the child of the wrist and the bodies welded to it. F is transformed to
+    the center of compliance P and expressed in axes that are fixed in the world. y is the output.
 
     .. pydrake_system::
 
@@ -33,8 +34,8 @@ class WrenchSensor(LeafSystem):
         output_ports:
         - wrench
 
-    The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is
-    state: one sample old, zero after a reset, without direct feedthrough.
+    The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is a
+    discrete state without direct feedthrough: one sample old, and zero in the default context.
 
     Args:
         plant: Finalized plant, connected to this system.
@@ -43,7 +44,7 @@ class WrenchSensor(LeafSystem):
         center: Center of compliance P, fixed to the first body of `tool`.
         R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
         period: Sampling period [s], positive; ideally the plant's time step.
-        time_constant: τ of the filter [s]; 0 disables it.
+        time_constant: Time constant τ of the filter [s], not negative; 0 disables it.
 
     Raises:
         InputError: If an argument is out of range, or the first body of `tool` is not the child of the wrist.

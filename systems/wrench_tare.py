@@ -16,7 +16,8 @@ class WrenchTare(LeafSystem):
         y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
 
     k counts samples since the initialization. The first s samples are skipped, because filters settle during this time.
-    The next n finite samples are averaged. A contact force during these n samples would be subtracted too.
+    The next n finite samples are averaged; others are not counted. A contact force during these n samples would be
+    subtracted too.
 
     .. pydrake_system::
 

@@ -27,7 +27,7 @@ from guiderail.models.common.errors import InputError
 
 
 class SignalPorts:
-    """Vector input ports of a system, one per signal named in a constructor argument.
+    """Vector input ports of a system, one per signal name.
 
     Args:
         system: System under construction; ports are declared in the order in which names first appear.
@@ -76,7 +76,7 @@ def get_signal_input_port(self: Any, name: str) -> InputPort:
 
 
 def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` describes it."""
+    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` names the function."""
     try:
         takes = signature(function)
     except (ValueError, TypeError):
@@ -102,7 +102,7 @@ Source: TypeAlias = InputPort | CacheEntry | DiscreteStateIndex | DependencyTick
 
 
 def tickets(system: LeafSystem, sources: Iterable[Source]) -> set[DependencyTicket]:
-    """Return the dependency tickets of input ports, cache entries and discrete states of a system."""
+    """Return the dependency tickets of a system's sources; tickets among them are returned unchanged."""
 
     def ticket(source: Source) -> DependencyTicket:
         if isinstance(source, DiscreteStateIndex):
@@ -163,10 +163,10 @@ def part_output(
 
 
 def start_pose(port: InputPort, context: Context) -> np.ndarray:
-    """Return the measured pose (O,) of a port, at which a motion starts.
+    """Return the measured pose (O,) of a port, which is the first command of a motion.
 
     Raises:
-        InputError: If it is not finite, because it would then be the first command.
+        InputError: If the pose is not finite.
     """
     pose = port.Eval(context)
     if not is_finite(pose):
@@ -180,7 +180,7 @@ def after_start(
     """Return a method of a system that updates the discrete state except at time zero, when no step has ended.
 
     An event offset of one period cannot be used: period + k * period differs from (k + 1) * period in the last bit for
-    every third k.
+    about a quarter of all k.
     """
 
     @wraps(update)
@@ -243,9 +243,9 @@ def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sour
 def plant_context(
     system: LeafSystem, plant: MultibodyPlant, state: Callable[[Context], np.ndarray], sources: Iterable[Source]
 ) -> CacheEntry:
-    """Declare a cache entry that contains a context of the finalized plant, for its kinematics and inertia.
+    """Declare a cache entry with a context of the finalized plant, from which kinematics and inertia are computed.
 
-    `state` computes the joint positions, or positions and velocities, from `sources`.
+    `state` computes the joint positions, or the positions followed by the velocities, from `sources`.
     """
     num_positions = plant.num_positions()
 

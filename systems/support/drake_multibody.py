@@ -29,18 +29,18 @@ def pose_to_transform(pose: np.ndarray) -> RigidTransform:
 
 
 def transform_to_pose(X: RigidTransform) -> np.ndarray:
-    """Return the pose (6,) of a transform, with a and c in (−π, π] and b in [−π/2, π/2] [m, rad]."""
+    """Return the pose [x y z a b c] (6,) [m, rad] of a transform, a and c in [−π, π], b in [−π/2, π/2]."""
     return np.concatenate([X.translation(), RollPitchYaw(X.rotation()).vector()[::-1]])
 
 
 def transform_to_vector(X: RigidTransform) -> np.ndarray:
-    """Return the position and the rotation vector (6,) of a transform [m, rad]."""
+    """Return the position and the rotation vector, of at most π, of a transform (6,) [m, rad]."""
     turn = X.rotation().ToAngleAxis()
     return np.concatenate([X.translation(), turn.angle() * turn.axis()])
 
 
 def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
-    """Return the quaternion (η, ε) of R_desired Rᵀ with η ≥ 0, which is the shorter rotation and has no singularity."""
+    """Return the quaternion η, ε (3,) of R_desired Rᵀ with η ≥ 0, which is the shorter rotation."""
     q = (R_desired @ R.inverse()).ToQuaternion()
     sign = 1.0 if q.w() >= 0.0 else -1.0
     return sign * q.w(), sign * q.xyz()

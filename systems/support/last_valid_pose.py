@@ -13,10 +13,10 @@ _MAX_COORDINATE = 1e6  # largest number in a command [m, rad], so that no wrench
 
 
 class CommandValidity:
-    """Check of a command: finite, within 1e6 m and rad, neither stale nor in the future.
+    """Check of a command: its numbers are finite and at most 1e6, and it is neither stale nor in the future.
 
-    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A time stamp that lies further in the
-    future is refused, because such a command would time out too late. A time stamp that is not finite is refused too.
+    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A command from further in the future is
+    not valid, because it would time out too late. A time stamp that is not finite is not valid either.
 
     Args:
         desired_pose: Input port of the system, (O,).
@@ -26,7 +26,7 @@ class CommandValidity:
         timeout: Age above which a command is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If the timeout is out of range.
     """
 
     def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
@@ -49,7 +49,7 @@ class LastValidPose:
     """Desired pose to follow: the present command while it is valid, otherwise the last valid one.
 
     The last valid pose and the time of the last check are discrete states, updated by a periodic event. Validity is
-    evaluated at the time of the last check instead of the present time, so that outputs which depend on it are computed
+    evaluated for the time of the last check, not for the present time: outputs that depend on it are then computed
     again only when the command changes or an event occurs. A command becomes stale at the first event after its
     timeout; a new command is valid at once. Before the first valid command the pose is the one measured at
     initialization.
