@@ -25,7 +25,8 @@ from guiderail.tools.learning.learner import LEARNERS
 def describe_all() -> dict[str, Any]:
     """Describe all registered tasks, guidance, stations, robots, end effectors, learners and kernels by name.
 
-    The descriptions have the ports and the options; `options` has the options that tasks share.
+    Guidance and stations have their ports and options, tasks their options. The entry `options` has the options that
+    tasks share.
     """
     return {
         "tasks": {name: describe_task(name) for name in TASKS.names()},
@@ -75,6 +76,8 @@ def describe_task(name: str) -> dict[str, Any]:
 
 def describe_task_options(name: str) -> dict[str, str]:
     """Describe the options of a task's environment and of its reset as text: meaning, range and default.
+
+    For a task that is only registered with Gymnasium, the texts are the defaults.
 
     Raises:
         InputError: If there is no task of that name.

@@ -34,7 +34,7 @@ from guiderail.tools.tables import write_table
 GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
 SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
 BUDGET_MARGIN = 1.5  # ratio of the budgets to the worst corrections of the adversary
-# Smallest budgets, at one step and in total, of the excess over ±1 of the actions that are equivalent to corrections.
+# Addition to the budget of the excess, at one step and in total; see `Budget.excess`.
 MIN_EXCESS = ((0.01,), (0.1,))
 MIN_KEY_BYTES = 16  # shortest key that the checker accepts
 ROUNDING = 1.0 + 1e-6  # tolerance factor: an adversary may reach an exact bound up to rounding
@@ -67,7 +67,7 @@ def certify_skill(
         budgets that corrections used.
 
     Raises:
-        InputError: If there is no such run or task, or its guidance cannot be certified.
+        InputError: If there is no such run or task, its guidance cannot be certified, or an argument is invalid.
     """
     if attack < 0:
         raise InputError(f"an attack has a number of steps, not {attack}")
@@ -185,7 +185,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
 
 
 def _search_budget(loop: CertifiedLoop) -> AttackResult:
-    """Return the worst corrections that an adversary finds in `SEARCH_STEPS` steps; the loop has a history."""
+    """Return the worst corrections that an adversary finds in `SEARCH_STEPS` steps of a loop with a history."""
     every_step = np.ones(loop.primitive.num_steps, bool)
     return Adversary(loop, every_step, seed=SEARCH_STEPS, attacks_budgets=True).attack(SEARCH_STEPS)
 

@@ -145,7 +145,10 @@ def expand_choices(text: str) -> str:
 def command(
     example: str, name: str | None = None, group: typer.Typer = app
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Register a command of a group; `name` is the function's name by default, and `example` omits `guiderail`."""
+    """Return a decorator that registers a function as a command of a group.
+
+    `name` is the function's name by default. `example` is a command line without `guiderail`.
+    """
     return group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
 
 
@@ -219,8 +222,7 @@ def _trust(context: typer.Context, value: bool) -> bool:
 TrustImports = Annotated[
     bool,
     option(
-        "Execute the modules and files that config.yaml or a study names under imports; without it they are refused by "
-        "name.",
+        "Execute the modules and files that config.yaml or a study names under imports; without it they are refused.",
         "--trust-imports",
         callback=_trust,
     ),
@@ -233,8 +235,8 @@ Baselines = Annotated[
     str | None,
     option(
         "Baseline policies that are evaluated on the same episodes, comma-separated: scripted, {baselines}; or none. "
-        "The demonstration is always evaluated where the guidance has one; zero is then the same.  "
-        "[default: uniform_random, scripted where the task has one, constant in evaluate, and zero without a "
+        "The demonstration is always evaluated if the guidance has one; zero is then the same.  "
+        "[default: uniform_random; scripted if the task has one; constant, only in evaluate; zero without a "
         "demonstration]"
     ),
 ]
@@ -249,7 +251,9 @@ Processes = Annotated[
 ]
 Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
 
-RobotUrl = Annotated[str | None, option("Hardware: LCM URL of the driver's bus, or host.  [default: LCM's default]")]
+RobotUrl = Annotated[
+    str | None, option("Hardware: LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")
+]
 Driver = Annotated[str | None, option("Hardware: driver fci (Franka) or rtde (UR).  [default: the robot's on LCM]")]
 Robot = Annotated[
     str | None, option("Hardware: robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
@@ -323,7 +327,9 @@ def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]
 
 
 def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
-    """Register a task, given by its name or folder; return its name and the imports that a run must store.
+    """Import modules and register the task if it is given by its folder.
+
+    Returns the task's name and, for a folder, the imports that a run must store; another text is returned unchanged.
 
     Raises:
         InputError: If an import fails or the task folder is invalid.

@@ -19,7 +19,9 @@ def import_(
         Path, argument("LeRobot v3 dataset, ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
     ],
     out: cli.DemonstrationsOut,
-    signal: Annotated[str | None, option("Topic or feature to import.  [default: the only suitable one]")] = None,
+    signal: Annotated[
+        str | None, option("Topic or feature to import.  [default: the only one, or the only commanded one]")
+    ] = None,
     target: Annotated[
         str | None, option(f"{POSE}: pose of the task's target in the recording's frame [m, degrees].")
     ] = None,
@@ -34,8 +36,8 @@ def import_(
 ) -> None:
     """Import demonstrations from another format.
 
-    The assumptions made are printed. If a file does not state a unit or a frame, the error message
-    names the option that sets it.
+    The assumptions made are printed. If a file does not state a unit, the error message names the option that sets it.
+    Without --target, poses stay in the frame of the recording.
     """
     from guiderail.tools.datasets.convert import import_recording
 
@@ -63,7 +65,8 @@ def validate(
     file: cli.Demonstrations,
     draw: Annotated[Path | None, option("Picture of the demonstrations to write: {pictures}.")] = None,
     fit: Annotated[
-        bool, option("Choose components, kernel and λ that reproduce the demonstrations, with the reason.", "--fit")
+        bool,
+        option("Choose components, length_scale, lambda_ and beta that reproduce the demonstrations.", "--fit"),
     ] = False,
     as_json: cli.Json = False,
 ) -> None:
@@ -123,15 +126,18 @@ def create_task(
         str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the socket, degrees].")
     ] = "0,0,0,0,0,0",
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
-    center: Annotated[str | None, option("x,y,z of a point on the axis.  [default: the plug's center of mass]")] = None,
+    center: Annotated[
+        str | None, option("x,y,z of a point on the axis [unit of the socket].  [default: the plug's center of mass]")
+    ] = None,
     turn: Annotated[
-        float, option("Rotation of the plug at the bottom [degrees]; its mesh shows it after the rotation.")
+        float,
+        option("Rotation of the plug at the bottom [degrees], counterclockwise from outside; its mesh includes it."),
     ] = 0.0,
     pitch: Annotated[
         float, option("Advance of a screw per full turn during --turn [mm], positive if it is right-handed.")
     ] = 0.0,
     search_turn: Annotated[
-        float, option("Largest unknown turn of the socket [degrees]; actions then turn the plug, too.")
+        float, option("Largest unknown turn of the socket [degrees]; if positive, actions turn the plug, too.")
     ] = 0.0,
     shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,

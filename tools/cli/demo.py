@@ -76,7 +76,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         (picture, "paths before and after learning, and the return over the episodes"),
         (run.pictures["replay"], "animation in three dimensions: open it in a browser"),
         (out / "episodes.csv", "every training episode: return, success, violations, forces, jerk"),
-        (out / "learning_curve.png", "plots of these"),
+        (out / "learning_curve.png", "plots of these values"),
     ):
         console.print(f"  {path}\n      {content}")
     name = _command_name()

@@ -193,7 +193,10 @@ def certify(
     out: Annotated[Path | None, option("Folder to write.  [default: certificate in the run]")] = None,
     start_within: Annotated[
         float | None,
-        option("Largest start offset of the robot, in the outputs' units.  [default: that of a reset]"),
+        option(
+            "Largest start offset of the robot, in the outputs' units.  [default: that of a reset, plus the error of "
+            "the pose measurement]"
+        ),
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
     verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,

@@ -24,7 +24,7 @@ def deploy(
     rate: cli.Rate = None,
     scenario: cli.Scenario = None,
     force_limit: Annotated[
-        float | None, option("Lower force limit for a first motion [N].  [default: that of the training]")
+        float | None, option("Force limit of a first motion [N].  [default and maximum: that of the training]")
     ] = None,
     yes: cli.Yes = False,
     out: Annotated[
@@ -52,7 +52,7 @@ def deploy(
 def teleoperate(
     task: Annotated[str, argument("Folder of a task, or one of {tasks}.", "TASK", "tasks")],
     record: Annotated[
-        Path | None, option("Demonstrate in the browser and write the demonstrations to this file, .npz or .csv.")
+        Path | None, option("Demonstrate in the browser and write the demonstrations to this new file, .npz or .csv.")
     ] = None,
     guidance: cli.Guidance = None,
     env: cli.Env = None,
@@ -61,8 +61,8 @@ def teleoperate(
 ) -> None:
     """Act in place of the policy, or demonstrate a task.
 
-    Without --record, a gamepad or the keyboard gives the action of the task's guidance. With --record, sliders, keys or
-    a gamepad in the browser move the desired pose, the robot follows by its impedance, and the page shows the force.
+    Without --record, a gamepad, sliders or keys give the action of the task's guidance. With --record, they move the
+    desired pose, the robot follows by its impedance, and the page in the browser shows the force.
     Each demonstration is kept or discarded, and written as soon as it is kept.
     """
     name = cli.find_task(task, imports)[0]
@@ -86,7 +86,7 @@ def sim_driver(
     ] = "",
     driver: cli.Driver = None,
     seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
-    command_timeout: Annotated[float, option("Longest wait for a command [s].")] = 5.0,
+    command_timeout: Annotated[float, option("Without --rate: longest wait for a command [s].")] = 5.0,
     task: Annotated[
         str, option("Task with the fixture in front of the robot: {tasks}.", choices="tasks")
     ] = "BncConnector",
@@ -99,7 +99,7 @@ def sim_driver(
 ) -> None:
     """Simulate a robot and its driver: an iiwa on LCM with a safety monitor, or with --driver fci a Franka.
 
-    The robot stands in front of a task's fixture. The exit code is 1 if commands stopped arriving.
+    The robot stands in front of a task's fixture. Without --rate, the exit code is 1 if commands stopped arriving.
     """
     from guiderail.tools.hardware.sim_driver import run_sim_driver
 
@@ -132,7 +132,7 @@ def safety_monitor(
     """Bring a robot to rest when torque commands stop arriving, or its status is wrong.
 
     It is for drivers that repeat the last torque after the program that sent it has ended. It runs next to the driver,
-    on the same machine, until it is terminated; without it, guiderail deploy moves nothing.
+    on the same machine, until it is terminated; without it, guiderail deploy does not move such a robot.
     """
     from guiderail.tools.hardware.sim_driver import run_safety_monitor
 

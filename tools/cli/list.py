@@ -19,7 +19,7 @@ def list_(
     """List tasks, guidance, stations, robots, presets and learners.
 
     With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
-    a table. `guiderail list --json` prints everything: each entry with its ports, options and ranges.
+    a table. `guiderail list --json` also prints descriptions, ports, and options with their ranges.
     """
     from guiderail.diagrams.tasks.registry import IMPORT_HINT
     from guiderail.tools.imports import import_modules

@@ -19,7 +19,7 @@ def train(
     ] = None,
     episodes: Annotated[
         int | None,
-        option("Total number of episodes; with --resume also fewer than planned, if not done yet.  [default: 60]"),
+        option("Total number of episodes; --resume can change it, but not below the episodes done.  [default: 60]"),
     ] = None,
     seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
     preset: Annotated[

@@ -15,7 +15,10 @@ def visualize(
     subject: cli.Subject,
     html: Annotated[
         Path | None,
-        option("Page to write, .html.  [default: replay.html in the run, or none with --image or --video]"),
+        option(
+            "Page to write, .html.  [default: replay.html, or replay-STATION.html with a station, in the run or the "
+            "current folder; none with --image or --video]"
+        ),
     ] = None,
     image: Annotated[Path | None, option("Picture of six camera frames to write: {pictures}.")] = None,
     video: Annotated[Path | None, option("Animated camera image to write: {videos}.")] = None,

@@ -36,7 +36,7 @@ def import_recording(
     Args:
         source: File or folder.
         out: File to write, .npz or .csv; it must not exist.
-        signal: ROS topic or LeRobot feature; by default the only one with suitable data. Not for CSV files.
+        signal: ROS topic or LeRobot feature; by default as `choose_signal` chooses. Not for CSV files.
         target: Pose of the task's target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees.
         rate: Sampling rate of the result [1/s]; the recording's by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
@@ -45,8 +45,8 @@ def import_recording(
         Summary of the demonstrations, with the assumptions made.
 
     Raises:
-        InputError: If the source cannot be read, a required unit or signal is neither stated in it nor given, or
-            `out` cannot be written.
+        InputError: If the source cannot be read, a required unit or signal is neither stated in it nor given, an
+            option is out of range or does not apply to the source, or `out` cannot be written.
     """
     if out.suffix not in ENDINGS:
         raise InputError(f"{out} has the ending {out.suffix!r}: demonstrations are .npz or .csv")
@@ -94,7 +94,8 @@ def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None
         rate: Sampling rate of the result [1/s]; the demonstrations' by default.
 
     Raises:
-        InputError: For an unknown format, demonstrations that it cannot represent, or a folder that cannot be written.
+        InputError: For an unknown format, demonstrations that it cannot represent, a rate out of range, or a folder
+            that cannot be written.
     """
     if kind not in WRITERS:
         raise InputError(f"there is no format {kind!r}: {did_you_mean(kind, WRITERS)}")

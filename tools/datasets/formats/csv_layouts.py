@@ -39,7 +39,7 @@ _ALSO = {
     "ns": ("nsec",),
 }  # other spellings of units
 _SAME_UNIT = {other: unit for unit, others in _ALSO.items() for other in others}
-_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods of a robot [s]; a step outside means another unit
+_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods [s]; a time step outside is in another unit
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
 _NO_POSE = re.compile(
     r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
