@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -58,8 +59,12 @@ class SensorDisturbance(LeafSystem):
         self._noise = np.array(noise, dtype=float)
         if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
             raise InputError(f"a sensor's noise is a standard deviation for each of its numbers, not {noise}")
-        if delay < 0:
-            raise InputError(f"a sensor's delay is a number of periods from 0, not {delay}")
+        if not (is_whole(delay, 0) and is_whole(configuration_size, 0)):
+            raise InputError(
+                "a sensor's delay is a whole number of periods, and the size of its configuration a whole number, at "
+                f"least 0 each, not {delay} and {configuration_size}"
+            )
+        delay, configuration_size = int(delay), int(configuration_size)
         size, self._delay = len(self._noise), delay
         self._drift = np.zeros(size) if drift is None else np.array(drift, dtype=float)
         self._resolution = np.zeros(size) if resolution is None else np.array(resolution, dtype=float)

@@ -64,6 +64,8 @@ class SafetyLimits:
         for value in (*self.velocity, *self.torque, *self.external_torque, self.force, *times):
             if not 0.0 < value < np.inf:
                 raise InputError(f"an arm's limits and times must be positive and finite, not {value}")
+        if not len(self.lower) == len(self.upper) == 3:
+            raise InputError(f"a workspace has corners of three numbers, not {self.lower} and {self.upper}")
         if not (self.lower < np.array(self.upper)).all():
             raise InputError(f"a workspace from {self.lower} to {self.upper} is empty")
         if not np.isfinite([self.lower, self.upper]).all():

@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import is_finite, is_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
@@ -40,8 +40,10 @@ class WrenchTare(LeafSystem):
 
     def __init__(self, period: float, skipped: int, averaged: int):
         super().__init__()
-        if skipped < 0 or averaged < 1:
-            raise InputError(f"a tare skips samples from 0 and averages at least one, not {skipped} and {averaged}")
+        if not (is_whole(skipped, 0) and is_whole(averaged, 1)):
+            raise InputError(
+                f"a tare skips a whole number of samples and averages at least one, not {skipped} and {averaged}"
+            )
         self._skipped, self._averaged = skipped, averaged
         self._count = self.DeclareDiscreteState(1)  # number k of samples so far
         self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # mean of the averaged samples so far

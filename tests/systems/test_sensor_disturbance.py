@@ -70,11 +70,12 @@ def test_initialization_restarts_noise_and_delay():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"noise": np.array([-1.0])}, {"noise": np.zeros(1), "delay": -1}, {"noise": np.zeros(1), "period": 0.0}]
+    "wrong",
+    [{"noise": np.array([-1.0])}, {"delay": -1}, {"delay": 1.5}, {"configuration_size": -1}, {"period": 0.0}],
 )
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
-        SensorDisturbance(**{"period": PERIOD, **wrong})
+        SensorDisturbance(**{"period": PERIOD, "noise": np.zeros(1), **wrong})
 
 
 def test_delay_of_an_episode_is_at_most_the_largest():

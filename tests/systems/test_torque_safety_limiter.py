@@ -332,6 +332,8 @@ def test_default_limits_are_unchanged():
         {"ramp_time": 0.0},
         {"lower": (-0.2, -0.2, 0.3)},
         {"lower": (-np.inf,) * 3},
+        {"lower": (-0.2, -0.2), "upper": (0.2, 0.2)},
+        {"lower": (-0.2, -0.2)},
         {"upper": (0.2, 0.2, np.inf)},
     ],
 )

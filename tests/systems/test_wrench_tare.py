@@ -64,7 +64,7 @@ def test_initialization_tares_again(tare):
     np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [(0.0, 1, 1), (PERIOD, -1, 1), (PERIOD, 0, 0)])
+@pytest.mark.parametrize("wrong", [(0.0, 1, 1), (PERIOD, -1, 1), (PERIOD, 0, 0), (PERIOD, 0.5, 1), (PERIOD, 0, np.nan)])
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         WrenchTare(*wrong)
