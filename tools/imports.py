@@ -39,7 +39,7 @@ def trust_imports(trusted: bool = True) -> Iterator[None]:
 
 
 def is_trusted() -> bool:
-    """Return True within a context of `trust_imports`."""
+    """Return True if files may import the code that they name; see `trust_imports`."""
     return _TRUSTED.get()
 
 
@@ -77,13 +77,21 @@ def import_modules(
 
 
 def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
-    """Import the modules that a file names, as `import_modules`, if importing executes no new code or is trusted.
+    """Import the modules that a file names, unless that would execute new code without trust (`trust_imports`).
 
     A task folder holds no code. A module or file that this process has imported before needs no trust; such a file is
     executed again if its content has changed.
 
+    Args:
+        modules: Names of modules, or paths of files or task folders.
+        source: File that names them, for messages.
+
+    Returns:
+        Names with which the modules can be imported again, as `import_modules` returns them.
+
     Raises:
-        InputError: If code would be executed without trust, or if `import_modules` raises one.
+        InputError: If new code would be executed without trust, a module, file or folder is missing, or it cannot be
+            imported.
     """
     modules = tuple(modules)
     if not _TRUSTED.get() and (untrusted := [module for module in modules if _executes(module)]):
@@ -114,7 +122,7 @@ def _is_dotted_name(name: str) -> bool:
 
 
 def _is_module(name: str) -> bool:
-    """Return True if there is a module of that name, even if its package cannot be imported."""
+    """Return True if there is a module of that name, even if its package imports another module that is missing."""
     if not _is_dotted_name(name):
         return False
     try:

@@ -33,8 +33,8 @@ from guiderail.tools.learning.run_folder import RunConfig
 class RobotSession:
     """Session at a robot."""
 
-    env: RobotEnv  # the environment
-    # Function that returns statistics of the intervals between statuses until now.
+    env: RobotEnv  # environment, with confirmed pre-flight checks
+    # Function that returns statistics of the intervals between statuses so far; empty in lockstep.
     timing: Callable[[], Mapping[str, Any]]
 
 
@@ -48,7 +48,8 @@ def robot_session(
     need no confirmation; if the driver is also simulated, resuming after a stop needs none either.
 
     Raises:
-        InputError: If the task cannot be done on hardware, no robot answers, or a check fails or is not confirmed.
+        InputError: If the task has no observable success, its reward needs simulation state, no robot answers, or a
+            check fails or is not confirmed.
     """
     task = EnvConfig.resolve(config.task, config.environment).make_task()
     if not isinstance(task, InsertionTask) or task.observable_success() is None:

@@ -26,10 +26,12 @@ from guiderail.tools.hardware.connection import SIMULATED
 from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
-START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # initial pose of the default task: the plug above the jack
+# Initial pose of the default task, with the plug above the jack [m], [rad].
+START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
-START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])  # initial pose relative to another task's start pose
-PLANT_STEPS_PER_STATUS = 5  # if not in lockstep: 1 kHz, like a real arm's own control loop
+# Difference of the initial pose from the start pose, for tasks other than the default [m], [rad].
+START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])
+PLANT_STEPS_PER_STATUS = 5  # in real time; steps at 1 kHz, like a real arm's own control loop (in lockstep: 1)
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
@@ -49,24 +51,27 @@ def run_sim_driver(
     """Simulate a robot and its driver in front of a task's fixture: by default an iiwa with a safety monitor on LCM.
 
     Args:
-        url: LCM URL of the driver's bus; LCM's default if empty.
+        url: LCM URL of the driver's bus, LCM's default if empty; with "fci" the address to listen on, 127.0.0.1 if
+            empty.
         seconds: Simulated time to run [s].
-        command_timeout: Longest wait for the acknowledgement of a status [s of wall clock time].
+        command_timeout: Longest wait of the iiwa in lockstep for the acknowledgement of a status [s of wall clock
+            time]; ten times as long for the first.
         task: Name of an insertion task.
-        rate: Rate of the robot's clock relative to the wall clock; None to wait for an acknowledgement of each status
-            instead (lockstep).
-        offset: Offset (x, y) of the fixture from its nominal position [m].
-        scenario: Scenario file with the surroundings; see `load_scenario`.
-        driver: "fci" for a Franka arm on the Franka Control Interface at the address `url`. It runs in lockstep while a
-            `FciLockstepClock` is connected, otherwise by the wall clock.
+        rate: Rate of the robot's clock relative to the wall clock, in (0, 1]. With None, the iiwa waits for an
+            acknowledgement of each status instead (lockstep), and the Franka has the rate 1.
+        offset: Offset (x, y) of the fixture from its nominal position [m]; zero by default.
+        scenario: Scenario file with the surroundings of the iiwa (see `load_scenario`); refused with "fci".
+        driver: "fci" for a Franka arm on the Franka Control Interface, otherwise the iiwa. The Franka runs in lockstep
+            while a `FciLockstepClock` is connected, otherwise by the wall clock.
         joint_friction: Friction of each joint of the Franka [Nm]; by default the residual of friction compensation.
         log: Function that shows a message.
 
     Returns:
-        True if acknowledgements arrived until the end; always True if not in lockstep.
+        False if the iiwa in lockstep stopped because acknowledgements stopped arriving; otherwise True.
 
     Raises:
-        InputError: If the task is no insertion, or an argument is out of range.
+        InputError: If the task is no insertion, there is no such simulated driver, an argument is out of range, or the
+            scenario is invalid or refused.
     """
     for name, value in {"seconds": seconds, "command_timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
@@ -126,11 +131,16 @@ def run_safety_monitor(
 ) -> None:
     """Damp a robot to rest when torque commands stop or its status is wrong, until this process is terminated.
 
-    The arm carries the workpiece of the insertion task. The address of the robot's driver is LCM's default if empty.
-    The rate of the robot's clock relative to this machine's is 1 for a real robot.
+    Args:
+        url: Address of the robot's driver; LCM's default if empty.
+        robot: Name of the robot arm.
+        task: Name of the insertion task whose workpiece the arm carries.
+        rate: Rate of the robot's clock relative to this machine's, in (0, 1]; 1 for a real robot.
+        log: Function that shows a message.
 
     Raises:
-        InputError: If the robot, the task or the address is unusable.
+        InputError: If there is no such robot, driver or insertion task, the address is unusable, the driver cannot read
+            the commands of other programs, or `rate` is out of range.
     """
     check_rate(rate)
     driver_type = find_driver(robot)
@@ -159,27 +169,36 @@ class PartRandomizer:
     """Sampler of the offsets of a task's parts, which sends them to the simulated driver."""
 
     def __init__(self, task: InsertionTask, move_parts: Callable[[list[list[float]]], object], seed: int):
-        """Sample the offset of the run; it is the same as in simulation with this seed.
+        """Sample the hidden offset of the run; it is the same as in simulation with this seed.
 
-        The function `move_parts` sends the offsets of fixture and workpiece, as `publish_part_offsets` does.
+        Args:
+            task: Task whose parts are moved.
+            move_parts: Function that sends the offsets of fixture and workpiece, as `publish_part_offsets` does.
+            seed: Seed of the run.
         """
         self._task, self._move_parts = task, move_parts
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Move the parts to offsets sampled with the options of a reset in simulation; return the offsets by name."""
+        """Sample the offsets of the parts by the options of a reset in simulation, send them, and return them by name.
+
+        An offset is (x, y) [m], after which a task may have angles [rad].
+
+        Raises:
+            InputError: If the task has no such option, or a value is out of range.
+        """
         reset = validate_options(self._task.Reset, options, "a simulated driver")
         fixture, workpiece = self._task.offsets.draw(rng, reset)
         self._move_parts([fixture.tolist(), workpiece.tolist()])
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
     def remove_fixture(self) -> None:
-        """Take the fixture off a held workpiece, as an operator does; the next call puts it back."""
+        """Move the fixture away from a held workpiece, as an operator does; the next sampled offset puts it back."""
         self._move_parts([list(REMOVED), [0.0, 0.0]])
 
 
 def publish_part_offsets(driver: LcmDriver, offsets: list[list[float]]) -> None:
-    """Send the offsets of fixture and workpiece to a simulated robot with `subscribe_part_offsets`."""
+    """Send the offsets of fixture and workpiece, (x, y) [m] each, to a robot that uses `subscribe_part_offsets`."""
     driver.lcm.Publish(PART_OFFSETS_CHANNEL, json.dumps(offsets).encode())
 
 

@@ -50,18 +50,19 @@ def train_on_robot(
 
     Args:
         task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose;
-            None with `resume`.
+            optional with `resume`.
         out: Run folder; with `resume`, that of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
-        settings: Settings of the learner.
+        settings: Settings of the learner by name.
         resume: Continue a run from its last episode. The address of the robot may differ.
         assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
         log: Function that shows a message.
 
     Raises:
-        InputError: If the task cannot be trained on hardware, or a check fails or is not confirmed.
+        InputError: If the task cannot be trained on hardware, a setting is invalid or needs demonstrations, the folder
+            exists or, with `resume`, contradicts an argument, no robot answers, or a check fails or is not confirmed.
     """
     folder = RunFolder(out)
     options = connection.environment_options(str(environment["station"]))
@@ -167,8 +168,9 @@ def _train(
                 env.rest()
             finally:
                 # An error in one step must not skip the others: the disk or the training process may have failed. The
-                # current policy is saved before the training process finishes, and again after it.
-                # Only waiting is skipped, because it would resume the arm; the checkpoint waits without the arm.
+                # current policy is saved before the training process finishes, and again after it. Only
+                # `wait_until_learned` is skipped, because it would resume the arm; the checkpoint waits for the weights
+                # without moving the arm.
                 left = (save for save in due if save is not wait_until_learned)
                 for save in (*left, save_learned, learner.finish, save_learned):
                     with suppress(Exception):

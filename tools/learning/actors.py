@@ -71,7 +71,8 @@ class ParallelLearner(Learner):
             callbacks: Callbacks of the episodes; they run in the actors' processes.
 
         Raises:
-            InputError: If the learner is not an `OffPolicyLearner`, or the system cannot fork.
+            InputError: If the learner is not an `OffPolicyLearner`, observations have images, or this process cannot
+                have forks.
         """
         if not isinstance(learner, OffPolicyLearner):
             raise InputError("only an off-policy learner has parallel actors: choose sac or tqc, or --num-envs 0")
@@ -92,7 +93,11 @@ class ParallelLearner(Learner):
         return self._learner.act(observation)
 
     def episode(self, index: int) -> dict[str, Any]:
-        """Learn from episode `index`, the next one, and return its row."""
+        """Learn from episode `index`, which must be the next one, and return its row.
+
+        Raises:
+            InputError: If an actor was killed or learning diverged. An exception in an actor is raised here.
+        """
         try:
             return self._learn(index)
         except KilledError:
@@ -166,7 +171,7 @@ class ParallelLearner(Learner):
         return self._learner.policy(description)
 
     def has_diverged(self) -> bool:
-        """Return True if a parameter of the learner is NaN or infinite."""
+        """Return True if a parameter of the actor network is NaN or infinite."""
         return self._learner.has_diverged()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -183,7 +188,11 @@ class ParallelLearner(Learner):
         return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; episodes simulated ahead of the checkpoint are simulated again."""
+        """Set the state to what `state` returned; episodes simulated ahead of the checkpoint are simulated again.
+
+        Raises:
+            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+        """
         self._learner.restore(entries_of(arrays, "learner"), values["learner"])
         self._snapshots = {}
         for number, counts in values["snapshots"].items():
@@ -207,7 +216,7 @@ class _EpisodeRecorder(Callback):
 
 
 def record_transition(transitions: list[Transition], transition: Transition) -> bool:
-    """Append a transition for learning; return False if it is left out because the simulation failed.
+    """Append a transition, without its `info`; return False if it is left out because the simulation failed.
 
     If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
     """

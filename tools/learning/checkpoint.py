@@ -1,4 +1,4 @@
-"""Checkpoint files, which resume a run bit for bit and store no code, and the selection of the actor to export."""
+"""Checkpoint files, from which a run resumes bit for bit and which hold no code; selection of the exported actor."""
 
 import json
 from collections.abc import Mapping
@@ -37,8 +37,8 @@ class CheckpointSelection:
     """Selection of the latest actor in the middle of the longest streak of successful greedy episodes.
 
     Learning at the edge of contact oscillates: a policy that succeeds for twenty episodes can fail for two and recover,
-    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes of the
-    next few episodes do not prove an actor good either, because later actors achieved them.
+    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes after an
+    actor's own episode do not suffice, because later actors achieved them; the score also counts those before it.
     """
 
     def __init__(self, window: int):
@@ -67,7 +67,7 @@ class CheckpointSelection:
         self._open.pop()
 
     def result(self) -> Actor | None:
-        """Return the best actor so far; None if no actor has a score of at least 1."""
+        """Return the parameters of the best actor so far; None if no actor has a score of at least 1."""
         best = self._best()
         return None if best is None else best.actor
 

@@ -54,7 +54,7 @@ class BcLearner(Learner):
         self.episodes += 1
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the policy's action, clipped to the action space."""
+        """Return the policy's action (A,) for an observation (n,), clipped to the action space."""
         space: Any = self._space
         with torch.no_grad():
             action = self.network(torch.as_tensor(observation, dtype=torch.float32)).numpy()
@@ -119,6 +119,9 @@ class BcLearner(Learner):
 
 
 def perceptron(sizes: list[int]) -> torch.nn.Sequential:
-    """Return a multilayer perceptron: linear layers with ReLU activations between them."""
+    """Return a multilayer perceptron: linear layers with ReLU activations between them.
+
+    The sizes are the numbers of inputs, of units of each hidden layer, and of outputs.
+    """
     layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
     return torch.nn.Sequential(*layers[:-1])

@@ -74,22 +74,22 @@ class OffPolicyConfig(LearnerConfig):
     batch_size: BatchSize = 64  # transitions
     n_steps: Annotated[Positive, Field(le=1000)] = 1  # transitions of an n-step return
     buffer_size: Positive = 1_000_000  # transitions in the replay buffer
-    learning_starts: Positive = 100  # transitions with uniformly random actions before the first training
+    learning_starts: Positive = 100  # transitions before the first training; the learner acts at random until then
     ent_coef: EntCoef = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     net_arch: NetArch = (256, 256)  # units of the hidden layers
     constant_episodes: NonNegative = 0  # episodes after the demonstrated ones that each repeat one random action
     ez_greedy: Fraction = 0.0  # probability that an exploring action starts a temporally extended action (εz-greedy)
     ez_greedy_longest: Positive = 8  # maximum number of actions that an extended action lasts
-    ez_greedy_until: NonNegative = 0  # consecutive greedy successes that end this exploration; 0: never ended
+    ez_greedy_until: NonNegative = 0  # greedy successes in a row that pause εz-greedy until a greedy failure; 0: never
     greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
     privileged_critic: bool = False  # critics also observe hidden values and the exact wrench; the policy never does
     layer_norm: bool = False  # normalize hidden layers before their activation
-    selection_window: NonNegative = 0  # greedy successes that count at most before and after an actor; 0: last actor
+    selection_window: NonNegative = 0  # limit of the greedy successes counted before and after an actor; 0: last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
     image_encoder: Literal["average_pooling", "convolutional"] = "average_pooling"  # features of observed images
-    random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of images in training [pixels] (DrQ)
+    random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Fraction = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
     init_from: Folder = ""  # run from whose networks, optimizers and replay buffer learning starts
@@ -149,8 +149,8 @@ class PpoConfig(OnPolicyConfig):
     """Settings of proximal policy optimization (PPO)."""
 
     n_epochs: Positive = 10  # passes through the transitions of a training
-    clip_range: Factor = 0.2  # largest change of an action's probability
-    ent_coef: Fraction = 0.0  # weight of the entropy
+    clip_range: Factor = 0.2  # difference from 1 at which an action's probability ratio is clipped
+    ent_coef: Fraction = 0.0  # weight of the entropy in the loss
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -189,7 +189,7 @@ class ChunkConfig(BcConfig):
     net_arch: NetArch = (64, 64)  # units of the hidden layers of each network
     members: Annotated[Positive, Field(le=50)] = 5  # E, networks of the ensemble
     chunk_steps: Annotated[Positive, Field(le=1000)] = 16  # K, control steps of a chunk
-    observation_noise: Noise = 0.1  # standard deviation added to observations in training
+    observation_noise: Noise = 0.1  # standard deviation of the noise of observations in training
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
@@ -199,14 +199,14 @@ class DistillationConfig(ChunkConfig):
     algorithm: str = "distillation"
     demonstration_episodes: NonNegative = 0  # always 0: the teacher acts in every episode
     teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
-    action_noise: Fraction = 0.2  # standard deviation added to the teacher's actions
+    action_noise: Fraction = 0.2  # standard deviation of the noise of the teacher's actions
     noisy_copies: NonNegative = 4  # noisy copies of each observation, labeled by the teacher
-    copy_noise: Noise = 0.2  # noise of a copy, in standard deviations of each entry
+    copy_noise: Noise = 0.2  # standard deviation of a copy's noise, in standard deviations of each entry
     members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble
     net_arch: NetArch = (128, 128)  # units of the hidden layers
     batch_size: BatchSize = 256  # observations
     gradient_steps: Positive = 8000  # gradient steps after the last episode
-    observation_noise: Noise = 0.0  # noise added in training; labels do not change
+    observation_noise: Noise = 0.0  # standard deviation of further noise in training; labels do not change
 
     def __post_init__(self) -> None:
         if self.demonstration_episodes:
@@ -215,11 +215,11 @@ class DistillationConfig(ChunkConfig):
 
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
-)  # table 4.1 states no batch and buffer size: they are from table 3.2
+)  # table 4.1 of the thesis states no batch and buffer size: they are from table 3.2
 _TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
 _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
-# The measurements behind each preset are in docs/experiments.md.
+# docs/experiments.md has the measurements that each preset results from.
 PRESETS = {
     # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that,
     # greedy episodes show the critics the returns of the mean action, and checkpoint selection takes an actor whose
@@ -237,7 +237,7 @@ PRESETS = {
         actor_ema=0.003,
     ),
     # The force cost is learned long before a success, so policies avoid contact. A large entropy coefficient and
-    # temporally extended actions restore contact. Extended actions push hardest and end once greedy episodes succeed.
+    # temporally extended actions restore contact. Extended actions push hardest: they pause if greedy episodes succeed.
     "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,
@@ -342,7 +342,7 @@ def check_choices(
 ) -> None:
     """Check the choices of a run that do not depend on its task's options, without importing Drake.
 
-    None stands for a default. Guidance and station are checked only for a task of this package, because a task of
+    None selects the default. Guidance and station are checked only for a task of this package, because a task of
     another package may have its own.
 
     Raises:
@@ -363,7 +363,7 @@ def check_choices(
 
 
 def check_episodes(episodes: object) -> int:
-    """Return a number of episodes as an int; raise an InputError if it is no whole number, or a run has too many."""
+    """Return a number of episodes as an int; raise an InputError unless it is whole and in [1, `MAX_EPISODES`]."""
     episodes = as_whole(episodes, "the number of episodes")
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")

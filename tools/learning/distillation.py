@@ -29,7 +29,7 @@ class DistillationLearner(ChunkLearner):
         y_{t+k} = LC-NS-KMP(t + k, π(s_t)),   k = 0 … K−1,
 
     computed for the visited observations and for copies of them with noise. The network is trained after the last
-    episode, and is a base policy (`guidance=base_policy`).
+    episode, and is a base policy (`guidance=base_policy`). The setting `symmetry` has no effect.
     """
 
     Config = DistillationConfig
@@ -39,8 +39,8 @@ class DistillationLearner(ChunkLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If no teacher is given, the teacher's observations or actions differ from the environment's, or
-                the guidance is not KGRL driven by the clock.
+            InputError: If no teacher is given or it has no policy, its observations or actions differ from the
+                environment's, the guidance is not KGRL driven by the clock, or as for `ChunkLearner`.
         """
         super().__init__(config, env, **arguments | {"symmetry": None})
         if not config.teacher:
@@ -60,7 +60,7 @@ class DistillationLearner(ChunkLearner):
         self._steps: list[int] = []  # control step of each observation
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the teacher's action with noise."""
+        """Return the teacher's action (A,) with noise, clipped to ±1."""
         action = self._teacher(observation)
         noisy = action + self.config.action_noise * self._random.standard_normal(action.shape)
         return np.clip(noisy, -1.0, 1.0).astype(np.float32)

@@ -60,7 +60,11 @@ class Linear:
         torch.sum(d, 1, out=self._bias_gradient)
 
     def input_gradient(self, d: torch.Tensor, shared: bool, columns: slice = slice(None)) -> torch.Tensor:
-        """Return the gradient with respect to `columns` of the input, (n or 1, batch, columns); summed if `shared`."""
+        """Return the gradient with respect to `columns` of the input, (n or 1, batch, columns).
+
+        `d` is the gradient with respect to the outputs, (n, batch, outputs). If the n networks have one input,
+        `shared`, the gradient is summed over them.
+        """
         by_network = torch.bmm(d, self.weight[:, :, columns])
         return by_network.sum(0, keepdim=True) if shared and self._networks > 1 else by_network
 
@@ -151,7 +155,7 @@ def _parts(flat: torch.Tensor, shapes: Sequence[torch.Size]) -> list[torch.Tenso
 
 
 class FlatAdam:
-    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the state dictionary of `torch.optim.Adam`.
+    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the stored moments of `torch.optim.Adam`.
 
     It is not derived from `torch.optim.Optimizer`, because creating such an optimizer imports PyTorch's compiler, which
     takes seconds.
@@ -181,7 +185,10 @@ class FlatAdam:
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the moments of each parameter by its index, as `torch.optim.Adam` does; none before the first step."""
+        """Return the moments of each parameter by its index, as `torch.optim.Adam` does; none before the first step.
+
+        `param_groups` is empty.
+        """
         if not self._steps:
             return {"state": {}, "param_groups": []}
         moments = [_parts(moment, self._shapes) for moment in self._moments]
@@ -224,7 +231,8 @@ else:
 class FastTrainingStep(_Algorithm):
     """Mixin that replaces the training step; list it before SAC or TQC among the base classes.
 
-    A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient` and `_critic_loss`.
+    A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient`, and for the logger `_critic_loss` and
+    `_actor_value`.
 
     Attributes:
         records_metrics: True to record losses, values and the entropy coefficient in the algorithm's logger.
@@ -365,7 +373,7 @@ class FastTrainingStep(_Algorithm):
         self.logger.record_mean(f"train/{name}", float(value))
 
     def _ent_coef_step(self, log_prob: torch.Tensor) -> torch.Tensor:
-        """Return the entropy coefficient, (1,), and then take a gradient step on it if it is learned."""
+        """Take a gradient step on the entropy coefficient if it is learned; return its value before the step, (1,)."""
         if self.ent_coef_tensor is not None:
             return self.ent_coef_tensor
         ent_coef = self.ent_coef_optimizer.values.exp()
@@ -435,7 +443,7 @@ class FastTqc(FastTrainingStep, TQC):
         return ((0.5 - self._quantile_weights - (errors < 0).float()).abs() * huber).mean()
 
     def _critic_gradient(self, values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the gradient of the quantile Huber loss, for which errors beyond ±1 count as ±1.
+        """Return the gradient of the quantile Huber loss, in which errors are clipped to ±1.
 
         With a clipped error e, the weighted error |τ − (e < 0)| e equals e/2 − (½ − τ)|e|.
         """

@@ -1,8 +1,9 @@
 """Human-in-the-loop training: a supervisor corrects the policy, stops episodes and labels them.
 
-Interventions are recorded with the run. A correction, clipped to the action's limits, replaces the policy's action
-and is stored as a transition. It also becomes via-points through which the demonstrations pass from the next episode
-on. Corrections and via-points go through guidance: the resulting commands satisfy the constraints like all others.
+Interventions are recorded with the run. A correction, clipped to the action's limits, replaces the policy's action,
+and an off-policy learner stores it as a transition. It also becomes via-points through which the demonstrations pass
+from the next episode on. Corrections and via-points go through guidance: the resulting commands satisfy the constraints
+like all others.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class Supervisor:
         """Start an episode of `env`."""
 
     def correction(self, observation: np.ndarray) -> np.ndarray | None:
-        """Return the wanted offset from the demonstrations, (A,), in units of a full action; None for no correction.
+        """Return the desired offset from the demonstrations, (A,), in units of a full action; None for no correction.
 
         In this episode the offset is clipped to ±1. The next episode's demonstrations pass through the full offset.
         """
@@ -71,7 +72,14 @@ class InterventionPolicy(Callback):
     """
 
     def __init__(self, env: gymnasium.Env, supervisor: Supervisor, act: PolicyFn, corrections: ViaPointCorrections):
-        """Construct the policy `act`, overridden by `supervisor`; `corrections` are the via-points of `env` so far."""
+        """Construct the policy.
+
+        Args:
+            env: Environment of the episode.
+            supervisor: Supervisor whose corrections override the policy.
+            act: Policy that acts while there is no correction.
+            corrections: Via-points of `env` so far.
+        """
         self._env, self._supervisor, self._act, self._corrections = env, supervisor, act, corrections
         self._offsets: dict[int, np.ndarray] = {}
         self._offset: np.ndarray | None = None
@@ -113,7 +121,7 @@ class ViaPointCorrections:
 
     Attributes:
         points: Via-points so far, as the option `via_points`.
-        reach: Mean displacement of a full action, (A,), in units of the output.
+        reach: Displacement by a full action, (A,), as an RMS over the motion, in units of the output.
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any]):
@@ -139,10 +147,15 @@ class ViaPointCorrections:
         self._constraints = instance.constraints()
 
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
-        """Return the via-points including an episode's corrections; new ones replace old ones nearby.
+        """Return the via-points so far with those of an episode's corrections.
 
-        The offsets (A,) by control step are in units of a full action. A correction that `is_held` until the episode's
-        end applies to the rest of the motion.
+        The new via-points replace all old ones from less than `VIA_POINT_SPACING` steps before the first new one to
+        less than `VIA_POINT_SPACING` steps after the last.
+
+        Args:
+            offsets: Corrections (A,) by control step, in units of a full action.
+            is_held: True if the last correction was held until the episode's end; it then applies to the rest of the
+                motion.
         """
         if not offsets:
             return self.points

@@ -35,7 +35,7 @@ LOGGED_COLUMNS = {
 
 
 def reject_bool(value: Any) -> Any:
-    """Raise a ValueError if a number is given as a truth value."""
+    """Return a value; raise a ValueError if it is a bool, because a number is expected."""
     if isinstance(value, bool):
         raise ValueError("it is a number")
     return value
@@ -56,6 +56,7 @@ class LearnerConfig:
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
+            On-policy learners ignore it.
         pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
             older. The result is deterministic too.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
@@ -147,7 +148,7 @@ class Learner(Callback, ABC):
 
 
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
-# takes seconds to import: `LEARNERS.declared(name, "Config")` imports no learner that shows its `Config` in its source.
+# takes seconds to import: `LEARNERS.declared(name, "Config")` imports no module whose source shows the `Config`.
 LEARNERS: Registry[Any] = Registry(
     "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
 )
@@ -206,7 +207,11 @@ class LearningLog:
     """
 
     def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
-        """Construct the log; files in `folder` are opened at the first entry. See `check_log_formats` for errors."""
+        """Construct the log; files in `folder` are opened at the first entry.
+
+        Raises:
+            InputError: If a format is unknown, or its package is not installed.
+        """
         self._folder, self._formats = folder, check_log_formats(formats)
         self._logger: Any = None
 
@@ -217,9 +222,12 @@ class LearningLog:
         *,
         is_finished: bool = False,
     ) -> None:
-        """Write the entry of the last of `rows`, one row per episode, with the learner's metrics.
+        """Write the entry of the last episode.
 
-        After the learner's `finish`, `is_finished` is True: the entry has only metrics that were recorded since.
+        Args:
+            rows: Rows of all episodes so far.
+            metrics: Function that returns the learner's metrics, `Learner.metrics`.
+            is_finished: True after the learner's `finish`; the entry then has only the metrics recorded since.
         """
         if not self._formats:
             return

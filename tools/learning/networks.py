@@ -67,8 +67,8 @@ def observe_privileged(
         and the number of privileged entries.
 
     Raises:
-        InputError: If the task declares no privileged observation or no symmetry of it, or the algorithm has no critic
-            apart from its actor.
+        InputError: If the observation is not a vector, the task declares no privileged observation or, with `symmetry`,
+            no symmetry of it, or the algorithm has no critic apart from its actor.
     """
     base: Any = env.unwrapped
     observed, hidden = env.observation_space, getattr(base, "privileged_space", None)
@@ -123,8 +123,9 @@ def packed_space(space: spaces.Box) -> spaces.Box:
 def pack_observation(observation: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Return an observation with an image as a vector of uint8, channel by channel, followed by the state's bytes.
 
-    A replay buffer of such vectors needs one byte per pixel. No number is rounded. The observation is an image (height,
-    width, channels) of uint8, or a vector [image / 255, state] of float32.
+    The observation is an image (height, width, channels) of uint8, or a vector [image / 255, state] of float32 whose
+    image is ordered channel by channel. A replay buffer of packed vectors needs one byte per pixel and channel, and the
+    packing loses nothing.
     """
     if observation.ndim == 3:
         return np.moveaxis(observation, -1, 0).ravel()
@@ -138,7 +139,7 @@ class ImageFeatures(BaseFeaturesExtractor):
     The image's features are the averages of squares of pixels (thesis, 4.4.1), or the outputs of convolutions. In
     training mode, the image of a convolutional extractor is shifted at random (DrQ; Yarats et al., 2021).
 
-    Without pooling or convolutions, an image of 110×144×3 needs a first layer of twelve million weights per network.
+    Without pooling or convolutions, an image of 110×144×3 needs twelve million weights in a first layer of 256 units.
 
     Attributes:
         pool: Side of the averaged squares [pixels]; 1 for convolutions.
@@ -202,7 +203,7 @@ class DetachedFeatures(BaseFeaturesExtractor):
         self.features: Any = features
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
-        """Map observations to features."""
+        """Map packed observations (batch, n) to features (batch, features)."""
         with torch.no_grad():
             return self.features(observations)
 
@@ -249,7 +250,7 @@ class DroppedNormalizedReLU(NormalizedReLU):
 
 
 def add_dropout(critic: Any, probability: float) -> None:
-    """Replace the activations of the critics by activations with dropout."""
+    """Replace each layer of the critics that is not linear by a `DroppedNormalizedReLU`."""
     for network in critic.q_networks:
         for index, layer in enumerate(network):
             if not isinstance(layer, torch.nn.Linear):
@@ -285,7 +286,13 @@ def export_layers(
 ) -> Policy:
     """Return the policy of linear layers with one kind of activation between them, and of convolutions before them.
 
-    Batch renormalization is merged into the next linear layer. The encoder has weight and bias of each convolution.
+    Batch renormalization is merged into the next linear layer.
+
+    Args:
+        layers: Layers from input to output.
+        space: Action space.
+        description: Further entries of the policy's description.
+        encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution.
 
     Raises:
         InputError: If there are other layers, or the layers are in another order.
@@ -311,7 +318,7 @@ def export_layers(
     if not re.fullmatch("n?l(an?l)+", order) or len({*activations}) != 1 or None in activations:
         raise InputError(
             f"an actor of {', '.join(type(layer).__name__ for layer in layers)} can't be exported: use linear layers "
-            "with one kind of rectifier between them"
+            "with one kind of activation between them: ReLU, normalized ReLU or tanh"
         )
     return Policy(
         [(weight.detach().numpy().copy(), bias.detach().numpy().copy()) for weight, bias in linear],

@@ -2,9 +2,8 @@
 
 Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploring and the schedule of
 trainings are here, so that all state that a run depends on can be written to a checkpoint. To add an algorithm, derive
-a class from `OffPolicyLearner`, set its attribute `algorithm` and register it by `register_learner`. The learner
-then uses the algorithm's own training step. SAC and TQC use an equivalent faster step
-(`guiderail.tools.learning.fast_sb3`) unless the setting `training_step` is "sb3".
+a class from `OffPolicyLearner`, set its attribute `algorithm` and register it by `register_learner`. The learner then
+uses the algorithm's own training step. SAC and TQC have an equivalent faster one (`guiderail.tools.learning.fast_sb3`).
 """
 
 import copy
@@ -59,7 +58,8 @@ class OffPolicyLearner(Learner):
 
     Attributes:
         algorithm: Class of the algorithm; a subclass sets it.
-        fast_algorithm: The same algorithm with a faster training step, or None; used unless `training_step` is "sb3".
+        fast_algorithm: The same algorithm with a faster training step, or None; used if `training_step` is "fast", on
+            the CPU, without dropout and without convolutions.
         config: The settings.
         model: Instance of the algorithm.
         averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
@@ -84,7 +84,10 @@ class OffPolicyLearner(Learner):
         max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
+        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
+
+        A privileged critic also sets `observes_privileged` of `env`. Settings that do not fit raise an InputError.
+        """
         self.symmetry = symmetry if config.symmetry else None
         self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # buffer entries per transition
         networks: dict[str, Any] = {"net_arch": list(config.net_arch), "optimizer_kwargs": {"fused": True}}
@@ -180,7 +183,7 @@ class OffPolicyLearner(Learner):
         return {}
 
     def is_learning(self) -> bool:
-        """Return True once there are enough transitions to learn from; until then actions are uniformly random."""
+        """Return True once there are `learning_starts` transitions; until then actions are uniformly random."""
         return self.transitions >= self.config.learning_starts
 
     def on_episode_start(self) -> None:
@@ -234,7 +237,7 @@ class OffPolicyLearner(Learner):
             self.selection.exclude()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action: uniform before learning starts, then sampled, or the mean in a greedy episode."""
+        """Return the action (A,): the mean in a greedy episode, otherwise one explored as the settings prescribe."""
         if self._constant_action is not None:
             return self._constant_action
         if self._follows_base_motion():
@@ -255,14 +258,13 @@ class OffPolicyLearner(Learner):
     def _follows_base_motion(self) -> bool:
         """Return True if this action is zero, so that the base motion has no residual (Policy Decorator).
 
-        This is the progressive exploration of Yuan et al. (2025): the policy acts with a probability that grows
-        linearly.
+        In the progressive exploration of Yuan et al. (2025), the probability that the policy acts grows linearly.
         """
         steps = self.config.base_motion_steps
         return not self.is_greedy and self.transitions < steps and self.random.random() * steps >= self.transitions
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
-        """Return a sampled action; a subclass with a deterministic policy adds noise."""
+        """Return a sampled action (A,) for an observation (n,); a subclass with a deterministic policy adds noise."""
         return self.model.predict(observation, deterministic=False)[0]
 
     def _temporally_extended(self) -> np.ndarray | None:
@@ -318,7 +320,7 @@ class OffPolicyLearner(Learner):
             self.model.replay_buffer.num_demonstrated = self.model.replay_buffer.size()
 
     def learn(self) -> None:
-        """Train if it is due: every `train_freq` transitions of the run, independent of the episodes' lengths."""
+        """Train after every `train_freq` transitions of the run; raise an InputError if learning diverged."""
         if not self.is_learning() or self.transitions % self.config.train_freq:
             return
         self.model.records_metrics = self.records_metrics
@@ -335,7 +337,7 @@ class OffPolicyLearner(Learner):
                     mean.copy_(value)
 
     def metrics(self) -> Mapping[str, float]:
-        """Return what the last training recorded in Stable-Baselines3's logger, such as `train/critic_loss`."""
+        """Return the values that the last training recorded in the logger, such as `train/critic_loss`."""
         recorded = dict(self.model.logger.name_to_value)
         self.model.logger.dump()
         return recorded

@@ -50,7 +50,10 @@ class OnPolicyLearner(Learner):
         max_transitions: int,
         symmetry: Symmetry | None = None,
     ):
-        """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
+        """Construct the learner; `Learner` describes the arguments.
+
+        Only the spaces of `env` are used; `max_transitions` and `symmetry` have no effect.
+        """
         self.config = config
         algorithm: Any = self.algorithm
         self.model = algorithm(
@@ -77,7 +80,7 @@ class OnPolicyLearner(Learner):
         self._is_start = True
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return a sampled action, clipped to the action space."""
+        """Return a sampled action (A,) for an observation (n,), clipped to the action space."""
         policy, space = self.model.policy, self.model.action_space
         with torch.no_grad():
             self._sampled = policy(policy.obs_to_tensor(observation)[0])
@@ -86,8 +89,11 @@ class OnPolicyLearner(Learner):
     def on_step(self, transition: Transition) -> None:
         """Store a transition and train if the buffer is full.
 
-        A transition in which the simulation failed is not stored. The transition before it becomes the episode's last,
-        as at a time limit.
+        A transition is not stored if the simulation failed in it, or if its action is not from `act`, such as a
+        supervisor's correction. The transition before it is then treated as the episode's last, as at a time limit.
+
+        Raises:
+            InputError: If learning diverged.
         """
         buffer = self.model.rollout_buffer
         if "simulation_failure" in transition.info or self._sampled is None:

@@ -38,8 +38,8 @@ class PipelinedLearner(Learner):
     Exploration and checkpoint selection stay in this process; the second one only trains.
 
     Attributes:
-        known: Number of episodes that the current weights were learned from.
-        submitted: Number of episodes submitted to the training process.
+        known: Number of the submitted episodes that the current weights were learned from.
+        submitted: Number of episodes submitted since construction; after a resumption it begins with 0 again.
         late: Number of episodes that began before their weights were learned.
     """
 
@@ -58,10 +58,11 @@ class PipelinedLearner(Learner):
         Args:
             acting: Learner that acts; its weights are replaced as they are learned.
             arguments: Positional and keyword arguments of the learner in the training process, configuration first.
-            waits: Wait at the start of an episode until its weights, described above, are learned.
+            waits: Wait at the start of an episode until its weights are learned, as described above.
             excluded: Terminations of episodes that are not learned from.
             niceness: Niceness of the training process.
-            imports: Modules or files (.py) that the training process imports, such as one that registers the learner.
+            imports: Modules, files (.py) or task folders that the training process imports, such as a module that
+                registers the learner.
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`.
@@ -82,7 +83,7 @@ class PipelinedLearner(Learner):
         child_pipe.close()
 
     def warm_up(self) -> None:
-        """Run every code path of acting once: first calls would miss the control deadline of a robot."""
+        """Run every code path of acting in advance: first calls would miss the control deadline of a robot."""
         space = self._acting.model.observation_space
         observation = np.zeros(space.shape, space.dtype)
         for _ in range(3):
@@ -95,7 +96,11 @@ class PipelinedLearner(Learner):
         return self._acting.act(observation)
 
     def on_episode_start(self) -> None:
-        """Start an episode with the weights learned so far."""
+        """Start an episode with the newest weights; with `waits`, first wait for the weights of this episode.
+
+        Raises:
+            InputError: If learning diverged, a step log could not be written, or the training process has ended.
+        """
         required = self.submitted - 1
         while self.known < required and self._waits:
             self._receive_weights()
@@ -123,14 +128,22 @@ class PipelinedLearner(Learner):
         return {}
 
     def submit_episode(self) -> None:
-        """Send the finished episode to the training process, unless it was excluded."""
+        """Send the finished episode to the training process, unless it was excluded.
+
+        Raises:
+            InputError: If the training process has ended.
+        """
         if self._pending is not None:
             self._send(("learn", self._pending, self.records_metrics))
             self._pending = None
             self.submitted += 1
 
     def receive_learned(self) -> bool:
-        """Receive the weights learned so far without waiting; return True if all submitted episodes are learned."""
+        """Receive the weights learned so far without waiting; return True if all submitted episodes are learned.
+
+        Raises:
+            InputError: As `on_episode_start`.
+        """
         while self.known < self.submitted and self._pipe.poll():
             self._receive_weights()
         return self.known == self.submitted
@@ -140,7 +153,11 @@ class PipelinedLearner(Learner):
         self._send(("write", path, table))
 
     def finish(self) -> None:
-        """Block until everything is learned and written, and end the training process."""
+        """Block until everything is learned and written, and end the training process.
+
+        Raises:
+            InputError: As `on_episode_start`.
+        """
         self.submit_episode()
         while self.known < self.submitted:
             self._receive_weights()
@@ -166,7 +183,7 @@ class PipelinedLearner(Learner):
         return self._acting.policy(description)
 
     def has_diverged(self) -> bool:
-        """Return True if a parameter of the acting learner is NaN or infinite."""
+        """Return True if a parameter of the acting learner's actor network is NaN or infinite."""
         return self._acting.has_diverged()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -186,7 +203,11 @@ class PipelinedLearner(Learner):
         return both | stored, {"acting": values, "learning": learned_values}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned, and submit the pending episode."""
+        """Set the state to what `state` returned, and submit the pending episode.
+
+        Raises:
+            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+        """
         self._acting.restore(entries_of(arrays, "acting"), values["acting"])
         self._send(("restore", entries_of(arrays, "learning"), values["learning"]))
         if (message := self._receive()) is not None:
@@ -231,7 +252,7 @@ def _serve(
     pipe: Connection, niceness: int, imports: tuple[str, ...], given: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
     """Run the training process: answer requests until the other end of the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the acting one decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the acting one handles it
     os.nice(niceness)
     torch.set_num_threads(1)
     requests: SimpleQueue[tuple[Any, ...]] = SimpleQueue()

@@ -38,9 +38,9 @@ class RunConfig:
     learner: SkipValidation[LearnerConfig]  # all settings, an instance of the learner's `Config`
     preset: str | None  # preset that the learner's settings were derived from
     episodes: Annotated[int, Field(ge=1, le=MAX_EPISODES, strict=True)]  # total number of episodes
-    seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of everything random
+    seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of all random numbers
     versions: dict[str, str] = field(default_factory=dict)  # versions of the packages that the result depends on
-    imports: tuple[str, ...] = ()  # modules or files that register the task, the learner, …
+    imports: tuple[str, ...] = ()  # modules, files or task folders that register the task, the learner, …
     step_log: bool = True  # True if every control step is written to the step log
     task_content: str = ""  # digest of the files that define the task; empty if there are none
     human_in_the_loop: bool = False  # True if a supervisor corrects the policy; see the option via_points
