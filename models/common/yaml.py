@@ -61,7 +61,7 @@ def parse_yaml(text: str, where: str = "text") -> Any:
 
     Raises:
         InputError: If it is not YAML or not a single document, has a tag, a date, a duplicate key or a key that is not
-            text (an alias as a key is not checked), or is too large or too deep.
+            text, or is too large or too deep.
     """
     with _refusals(text, where):
         return _make_yaml().load(text)
@@ -140,21 +140,28 @@ class _Parser(Parser):
         self._num_entries = 0
         self._parents: list[_Collection] = []
         self._sizes: dict[str, tuple[int, int]] = {}  # entries and levels of anchored nodes
+        self._anchored: dict[str, Any] = {}  # events of anchored nodes
+        loader.composer.warn_double_anchors = False  # an alias is that of the last anchor with its name
 
     def get_event(self) -> Any:
         event = super().get_event()
         entries, levels = 0, 0
+        is_key = bool(self._parents) and self._parents[-1].is_mapping and self._parents[-1].children % 2 == 0
         if isinstance(event, CollectionEndEvent):
             collection = self._parents.pop()
             entries, levels = self._sizes[collection.anchor] = collection.entries, collection.levels
         elif isinstance(event, AliasEvent):
             if any(parent.anchor == event.anchor for parent in self._parents):
                 _refuse(f"{brief(event.anchor)} contains itself: leave this alias out", event)
+            if is_key and event.anchor in self._anchored:
+                _check_key(self._anchored[event.anchor], self.resolver, event)
             entries, levels = self._sizes.get(event.anchor, (1, 1))
             self._num_entries += entries
         elif isinstance(event, ScalarEvent | CollectionStartEvent):
-            is_key = bool(self._parents) and self._parents[-1].is_mapping and self._parents[-1].children % 2 == 0
-            _check_node(event, self.resolver, self.tags, is_key=is_key)
+            _check_node(event, self.resolver, self.tags)
+            if is_key:
+                _check_key(event, self.resolver, event)
+            self._anchored[event.anchor] = event
             self._num_entries += 1
             if isinstance(event, CollectionStartEvent):
                 self._parents.append(_Collection(event))
@@ -171,17 +178,25 @@ class _Parser(Parser):
         return event
 
 
-def _check_node(event: Any, resolver: Any, tags: Collection[str], *, is_key: bool) -> None:
+def _check_node(event: Any, resolver: Any, tags: Collection[str]) -> None:
     if event.tag is not None and event.tag not in tags:
         _refuse(f"the tag {brief(event.tag)} has no meaning here: leave it out", event)
-    kind = "collection"
-    if isinstance(event, ScalarEvent):
-        kind = str(resolver.resolve(ScalarNode, event.value, event.implicit)).removeprefix(_TAG)
-    if kind == "timestamp":
+    if _kind(event, resolver) == "timestamp":
         _refuse(f"{brief(event.value)} is a date, or a subtraction: put it in quotes", event)
-    if is_key and kind not in ("str", "merge"):
-        key = "a list or a mapping" if kind == "collection" else brief(event.value)
+
+
+def _check_key(node: Any, resolver: Any, event: Any) -> None:
+    """Refuse a node as a key; `event` is the node's own, or that of an alias."""
+    kind = _kind(node, resolver)
+    if kind not in ("str", "merge"):
+        key = "a list or a mapping" if kind == "collection" else brief(node.value)
         _refuse(f"the key {key} is not text: put it in quotes", event)
+
+
+def _kind(event: Any, resolver: Any) -> str:
+    if not isinstance(event, ScalarEvent):
+        return "collection"
+    return str(resolver.resolve(ScalarNode, event.value, event.implicit)).removeprefix(_TAG)
 
 
 def _refuse(problem: str, event: Any) -> NoReturn:

@@ -1,6 +1,7 @@
 """The YAML reader returns plain values and refuses documents beyond its limits."""
 
 import tracemalloc
+import warnings
 
 import pytest
 
@@ -48,6 +49,16 @@ def test_aliases_and_merges_are_resolved():
     }
 
 
+def test_alias_of_a_text_is_a_key():
+    assert parse_yaml("a: &x b\n*x : 2") == {"a": "b", "b": 2}
+
+
+def test_reused_anchor_is_that_of_its_last_node_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert parse_yaml("a: &x 1\nb: &x 2\nc: *x") == {"a": 1, "b": 2, "c": 2}
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -68,6 +79,10 @@ def test_aliases_and_merges_are_resolved():
         ("a: 1\na: 2", 'duplicate key "a"'),
         ("1: 2", "put it in quotes"),
         ("? [a]\n: b", "put it in quotes"),
+        ("a: &x 1\n*x : 2", "line 2: the key '1' is not text: put it in quotes"),
+        ("a: &x []\n*x : 2", "line 2: the key a list or a mapping is not text: put it in quotes"),
+        ("a: &x b\nb: &x\nc: {*x : 2}", "line 3: the key '' is not text: put it in quotes"),
+        ("*x : 2", "undefined alias"),
         ("a: !!python/object/apply:os.system [ls]", "tag"),
         ("a: !!timestamp 2001-99-99", "tag"),
         ("a: !!binary abc", "tag"),
