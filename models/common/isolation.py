@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import resource
@@ -9,6 +10,9 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.errors import InputError, brief
 
 _WALL_FACTOR, _WALL_SLACK = 6.0, 20.0  # limit of wall time: multiple of the limit of CPU time, plus a constant [s]
 
@@ -23,13 +27,17 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     Args:
         function: Function; it need not be importable, because the child process is a copy of this one.
         arguments: Arguments of the function, which are not pickled.
-        cpu_seconds: Limit of the function's CPU time, a whole number [s].
+        cpu_seconds: Limit of the function's CPU time, a whole number of at least 1 [s].
         max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
 
     Raises:
+        InputError: If `cpu_seconds` is not a whole number of at least 1.
         IsolatedError: If the function raised, its result cannot be pickled, or its process aborted, was killed or
             exceeded a limit.
     """
+    if not is_whole(cpu_seconds, 1):
+        raise InputError(f"cpu_seconds must be a whole number of at least 1, not {brief(cpu_seconds)}")
+    cpu_seconds = int(cpu_seconds)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds, max_bytes))
@@ -65,16 +73,23 @@ def _children_seconds() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
+def _limit(kind: int, soft: int, hard: int) -> None:
+    """Set a limit of this process, at most its present hard limit, which only root may raise."""
+    present = resource.getrlimit(kind)[1]
+    largest = math.inf if present == resource.RLIM_INFINITY else present
+    resource.setrlimit(kind, (int(min(soft, largest)), int(min(hard, largest))))
+
+
 def _child(
     sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int, max_bytes: int | None
 ) -> None:
     used_seconds = int(sum(os.times()[:2])) + 1
-    resource.setrlimit(resource.RLIMIT_CPU, (used_seconds + cpu_seconds, used_seconds + cpu_seconds + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _limit(resource.RLIMIT_CPU, used_seconds + cpu_seconds, used_seconds + cpu_seconds + 1)
+    _limit(resource.RLIMIT_CORE, 0, 0)
     if max_bytes is not None:
         pages = int(Path("/proc/self/statm").read_text().split()[0])  # address space inherited from the parent
-        limit = pages * resource.getpagesize() + max_bytes
-        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+        size = pages * resource.getpagesize() + max_bytes
+        _limit(resource.RLIMIT_AS, size, size)
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, 1)  # compiled libraries print their progress and their aborts
     os.dup2(devnull, 2)

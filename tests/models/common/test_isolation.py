@@ -1,10 +1,12 @@
 """An isolated function returns its result, or an error with the reason."""
 
 import os
+import resource
 import signal
 
 import pytest
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 
 
@@ -20,6 +22,11 @@ def spin():
 def spin_on():
     signal.signal(signal.SIGXCPU, signal.SIG_IGN)
     spin()
+
+
+def limit_and_isolate():
+    resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
+    return run_isolated(lambda: resource.getrlimit(resource.RLIMIT_CPU), cpu_seconds=1000)
 
 
 def kill():
@@ -43,6 +50,16 @@ def test_run_isolated_returns_the_result():
 def test_run_isolated_gives_the_reason_when_a_function_fails(function, words):
     with pytest.raises(IsolatedError, match=words):
         run_isolated(function, cpu_seconds=1)
+
+
+def test_run_isolated_keeps_a_lower_limit_of_the_system():
+    assert run_isolated(limit_and_isolate, cpu_seconds=1000) == (100, 100)
+
+
+@pytest.mark.parametrize("seconds", [1.5, 0, "1", None])
+def test_run_isolated_refuses_a_limit_that_is_not_whole_seconds(seconds):
+    with pytest.raises(InputError, match="cpu_seconds must be a whole number of at least 1"):
+        run_isolated(os.getpid, cpu_seconds=seconds)
 
 
 def test_run_isolated_limits_memory():
