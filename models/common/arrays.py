@@ -53,11 +53,11 @@ _EXACT = 2**53  # a double represents smaller whole numbers exactly
 def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
     """Convert numbers, nested in any way that NumPy accepts, to a new array of doubles.
 
-    `what` is the name of the values for messages. Bools become 0 and 1; None becomes NaN.
+    `what` is the name of the values for messages. Bools become 0 and 1.
 
     Raises:
-        InputError: If the values are ragged, or include text, dates, complex numbers, objects that `float` does not
-            convert, or integers of 2^53 and more, which a double rounds.
+        InputError: If the values are ragged, or include text, None, dates, complex numbers, objects that `float` does
+            not convert, or integers of 2^53 and more, which a double rounds.
     """
     try:
         raw = np.asarray(values)
@@ -65,16 +65,44 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
             raise InputError(f"{what} is not an array of numbers: it holds {raw.dtype}")
         if any(isinstance(value, str | bytes) for value in _objects(raw)):
             raise InputError(f"{what} is not an array of numbers: it holds text")
+        if any(value is None for value in _objects(raw)):
+            raise InputError(f"{what} is not an array of numbers: it holds None")
         array = np.array(raw, dtype=float)
     except InputError:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is not an array of numbers: {error}") from error
-    is_rounded = raw.dtype.kind in "iu" and raw.dtype.itemsize == 8 and bool((np.abs(array) >= _EXACT).any())
+    is_large = raw.dtype.kind in "iuf" and raw.dtype.itemsize == 8 and bool((np.abs(array) >= _EXACT).any())
+    is_rounded = is_large and raw.dtype.kind != "f"
+    if is_large and not is_rounded and raw is not values:
+        raw = np.asarray(values, dtype=object)  # whole numbers among others, which NumPy has already rounded
     # NumPy holds whole numbers of 2^64 and more as objects.
     if is_rounded or any(isinstance(value, int | np.integer) and abs(int(value)) >= _EXACT for value in _objects(raw)):
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
+
+
+def as_number(value: object, what: str) -> float:
+    """Return one number as a float; `what` is its name for the message.
+
+    Raises:
+        InputError: If it is not one number: "3", None and [3.0] are refused, NaN and infinity are not.
+    """
+    number = np.empty(0) if value is None or isinstance(value, str) else as_numbers(cast(ArrayLike, value), what)
+    if number.ndim:
+        raise InputError(f"{what} must be one number, not {brief(value)}")
+    return float(number)
+
+
+def find_asymmetric(matrices: np.ndarray) -> int | None:
+    """Return the index of the least symmetric of matrices (N, n, n), or None if all are symmetric up to rounding.
+
+    Rounding is 1e-9 of a matrix's largest entry.
+    """
+    asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
+    excess = asymmetry - 1e-9 * np.abs(matrices).max(axis=(1, 2))
+    worst = int(np.argmax(excess))
+    return worst if excess[worst] > 0.0 else None
 
 
 def _objects(array: np.ndarray) -> Iterable[object]:
