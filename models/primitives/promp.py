@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, as_whole, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 
@@ -39,13 +39,13 @@ class ProMp:
             num_basis: K; by default `NUM_BASIS`, but at most a fourth of the number of steps, and at least 2.
 
         Raises:
-            InputError: If the clocks differ, or K is less than 2 or more than half the number of steps (2 is accepted
-                for any number of steps).
+            InputError: If the clocks differ, or K is not a whole number, or less than 2 or more than half the number of
+                steps (2 is accepted for any number of steps).
         """
         steps = len(demonstrations.times[0])
         if any(not np.array_equal(t, demonstrations.times[0]) for t in demonstrations.times):
             raise InputError("a ProMP needs demonstrations on one clock: use resampled()")
-        count = min(NUM_BASIS, max(steps // 4, 2)) if num_basis is None else num_basis
+        count = min(NUM_BASIS, max(steps // 4, 2)) if num_basis is None else as_whole(num_basis, "num_basis")
         if not 2 <= count <= max(steps // 2, 2):
             raise InputError(f"basis functions must be between 2 and half the number of steps, {steps // 2}: {count}")
         clock = demonstrations.times[0]
@@ -85,7 +85,7 @@ class ProMp:
             raise InputError(f"a via-point has {self.num_outputs} outputs and their covariance, not {output.shape}")
         if not (np.isfinite(output).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
             raise InputError("a via-point must be finite, and its covariance positive definite")
-        if np.abs(covariance - covariance.T).max() > 1e-9 * np.abs(covariance).max():
+        if find_asymmetric(covariance[None]) is not None:
             raise InputError("a via-point's covariance is not symmetric")
         blocks = self._blocks(np.array([phase]))[0]
         across = self.covariance @ blocks.T

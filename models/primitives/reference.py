@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_numbers
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_numbers, as_whole, find_asymmetric
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel
 from guiderail.models.primitives.promp import ProMp
@@ -123,15 +123,7 @@ class ReferenceTrajectory:
             )
         demonstrations = demonstrations.resampled(num_steps)
         times, outputs = demonstrations.times[0], np.stack(demonstrations.outputs)
-        floor = as_numbers(floor, "floor")
-        if floor.shape not in ((), (1,), outputs.shape[-1:]):
-            raise InputError(
-                f"floor is one standard deviation, or one for each of the {outputs.shape[-1]} outputs, not of shape "
-                f"{floor.shape}"
-            )
-        floor = np.broadcast_to(floor, outputs.shape[-1:])
-        if not (np.isfinite(floor).all() and (floor >= 0).all()):
-            raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
+        floor = _checked_floor(floor, outputs.shape[-1])
         if model == "promp":
             means, covariances = ProMp.fit(demonstrations).moments(np.linspace(0.0, 1.0, len(times)))
         else:
@@ -155,13 +147,13 @@ class ReferenceTrajectory:
             floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
 
         Raises:
-            InputError: If the times do not increase, the floor is negative, or a covariance is singular: give a floor.
+            InputError: If the times do not increase, the floor has the wrong shape or is negative, or a covariance is
+                singular: give a floor.
         """
         times = as_numbers(times, "times")
         if times.ndim != 1 or len(times) < 2 or not times[-1] > times[0]:
             raise InputError(f"a reference trajectory needs at least two increasing times (N,), not {times.shape}")
-        if not (np.isfinite(floor).all() and np.greater_equal(floor, 0.0).all()):
-            raise InputError(f"floor is a standard deviation and must not be negative: {floor}")
+        floor = _checked_floor(floor, promp.num_outputs)
         means, covariances = promp.moments((times - times[0]) / (times[-1] - times[0]))
         return cls(times, means, covariances + np.eye(promp.num_outputs) * np.square(floor))
 
@@ -223,8 +215,8 @@ class ReferenceTrajectory:
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
         """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
 
-        The clock of this trajectory must be uniform, which is not checked. Means and covariances are interpolated
-        linearly. The number of steps is the new duration divided by the period, rounded.
+        Means and covariances are interpolated linearly over the clock. The number of steps is the new duration, which
+        counts a mean time step after the last time, divided by the period, rounded.
 
         Raises:
             InputError: If an argument is not positive, or fewer than two steps remain.
@@ -237,7 +229,8 @@ class ReferenceTrajectory:
         if number < 2:
             raise InputError(f"a motion of {duration:g} s has fewer than two steps of {period:g} s")
         clock = period * np.arange(number)
-        nodes, at = np.arange(self.num_steps), np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
+        nodes = np.arange(self.num_steps) if self.uniform else (self.times - self.times[0]) / step
+        at = np.clip(clock / (time_scale * step), 0.0, self.num_steps - 1)
         columns = np.hstack([self.means, self.covariances.reshape(self.num_steps, -1)])
         resampled = np.column_stack([np.interp(at, nodes, column) for column in columns.T])
         outputs = self.num_outputs
@@ -246,10 +239,8 @@ class ReferenceTrajectory:
 
     def _check_covariances(self) -> None:
         """Make the covariances exactly symmetric; raise an InputError if one is asymmetric or singular."""
-        asymmetry = np.abs(self.covariances - self.covariances.transpose(0, 2, 1)).max(axis=(1, 2))
-        size = np.abs(self.covariances).max(axis=(1, 2))
-        worst = int(np.argmax(asymmetry - 1e-9 * size))
-        if asymmetry[worst] > 1e-9 * size[worst]:
+        worst = find_asymmetric(self.covariances)
+        if worst is not None:
             raise InputError(f"the covariance at step {worst} is not symmetric")
         self.covariances = (self.covariances + self.covariances.transpose(0, 2, 1)) / 2
         # Singularity is tested on correlations: outputs may have very different units.
@@ -264,6 +255,19 @@ class ReferenceTrajectory:
             )
 
 
+def _checked_floor(floor: float | np.ndarray, num_outputs: int) -> np.ndarray:
+    """Return a floor of standard deviations (O,)."""
+    checked = as_numbers(floor, "floor")
+    if checked.shape not in ((), (1,), (num_outputs,)):
+        raise InputError(
+            f"floor is one standard deviation, or one for each of the {num_outputs} outputs, not of shape "
+            f"{checked.shape}"
+        )
+    if not (np.isfinite(checked).all() and (checked >= 0).all()):
+        raise InputError(f"floor is a standard deviation and must not be negative: {checked}")
+    return np.broadcast_to(checked, num_outputs)
+
+
 def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps: int, num_outputs: int) -> np.ndarray:
     """Return the standard deviations (N, O) of a single demonstration over its steps [unit of the output].
 
@@ -274,10 +278,10 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
         num_outputs: Number of outputs O.
 
     Raises:
-        InputError: If the number of values does not fit, phases do not increase or are not in [0, 1], or a standard
-            deviation is not positive and finite.
+        InputError: If a value is no number, the number of values does not fit, phases do not increase or are not in
+            [0, 1], or a standard deviation is not positive and finite.
     """
-    numbers = np.ravel(np.asarray(prior_std, dtype=float))
+    numbers = np.ravel(as_numbers(prior_std, "prior_std"))
     size = 1 + num_outputs
     if len(numbers) in (1, num_outputs):
         rows = np.append(0.0, np.broadcast_to(numbers, num_outputs))[None]
@@ -375,10 +379,11 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
         components: Number of components C, from 1 to half the number of steps. By default the number with the least
             Bayesian information criterion, at most 20; the search stops once two numbers in a row are worse than the
             best before.
-        seed: Seed of scikit-learn's generator.
+        seed: Seed of scikit-learn's generator, from 0 to 2^32 − 1.
 
     Raises:
-        InputError: If there are fewer than two steps for each component, or less than one component.
+        InputError: If there are fewer than two steps for each component, less than one component, or the number of
+            components or the seed is not a whole number in its range.
     """
     _, center, scale = _standardize(times, outputs)
     candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)
@@ -401,6 +406,9 @@ def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
     """Return mixtures and their criteria by number of components; the search stops after two that are worse."""
+    candidates, seed = [as_whole(count, "components") for count in candidates], as_whole(seed, "seed")
+    if not 0 <= seed < 2**32:
+        raise InputError(f"seed must be from 0 to 2^32 − 1, not {brief(seed)}")
     for count in candidates:
         if not 1 <= count <= len(times) // 2:
             raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")

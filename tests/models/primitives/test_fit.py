@@ -165,3 +165,9 @@ def test_fit_refuses_too_few_demonstrations():
 def test_fit_refuses_too_many_components(components, demonstrations):
     with pytest.raises(InputError, match="components must be between 1 and half the number of steps, 40"):
         fit(demonstrations, components=components)
+
+
+@pytest.mark.parametrize("components", [2.5, "8"])
+def test_fit_refuses_a_number_of_components_that_is_not_whole(components, demonstrations):
+    with pytest.raises(InputError, match="components must be a whole number"):
+        fit(demonstrations, components=components)

@@ -77,6 +77,12 @@ def test_promp_is_refused_with_too_many_basis_functions():
         ProMp.fit(Demonstrations([T, 2.0 * T], [T[:, None], T[:, None]]))
 
 
+@pytest.mark.parametrize("number", [2.5, "8"])
+def test_number_of_basis_functions_is_whole(number):
+    with pytest.raises(InputError, match="num_basis must be a whole number"):
+        ProMp.fit(bundle(), number)
+
+
 def test_reference_of_a_promp_equals_that_of_demonstrations():
     d = bundle()
     direct = ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=[0.01, 0.02])
@@ -90,7 +96,7 @@ def test_reference_of_a_promp_equals_that_of_demonstrations():
         ReferenceTrajectory.from_demonstrations(d, model="dmp")
     with pytest.raises(InputError, match="increasing times"):
         ReferenceTrajectory.from_promp(ProMp.fit(d), [1.0, 1.0])
-    for floor in (-0.01, [0.01, np.nan]):
+    for floor in (-0.01, [0.01, np.nan], [0.01] * 3, [[0.01], [0.01]], "a", None):
         with pytest.raises(InputError, match="floor"):
             ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=floor)
 

@@ -132,6 +132,29 @@ def test_from_demonstrations_refuses_invalid_mixtures():
         ReferenceTrajectory.from_demonstrations(hourglass(), 5, floor=-1)
 
 
+@pytest.mark.parametrize("components", [2.5, True, "8"])
+def test_number_of_components_is_whole(components):
+    with pytest.raises(InputError, match="components must be a whole number"):
+        ReferenceTrajectory.from_demonstrations(hourglass(), components)
+
+
+@pytest.mark.parametrize(
+    ("seed", "words"), [(-1, "from 0 to"), (2**32, "from 0 to"), ("a", "whole number"), (0.5, "whole")]
+)
+def test_seed_is_that_of_a_generator(seed, words):
+    with pytest.raises(InputError, match=f"seed must be .*{words}"):
+        ReferenceTrajectory.from_demonstrations(hourglass(), 5, seed)
+
+
+@pytest.mark.parametrize("times", [[0.0, 1.0, 10.0], [2.0, 3.0, 4.0]])
+def test_resampled_reference_is_interpolated_over_its_clock(times):
+    means = np.array(times)[:, None] - times[0]
+    resampled = ReferenceTrajectory(times, means, 1.0 + means[:, None]).resampled(0.25, 0.5)
+    expected = np.minimum(2.0 * (resampled.times - times[0]), means[-1])
+    np.testing.assert_allclose(resampled.means[:, 0], expected, atol=1e-12)
+    np.testing.assert_allclose(resampled.covariances[:, 0, 0], 1.0 + expected, atol=1e-12)
+
+
 def test_regression_extrapolates_the_most_likely_component():
     """If every density underflows, the mean continues along the line of one component."""
     times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
