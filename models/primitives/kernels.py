@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, did_you_mean
 
@@ -47,8 +48,8 @@ def make_kernel(
         parameters: Further parameters of the kernel by name.
 
     Raises:
-        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is out of
-            range.
+        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is not one
+            number or out of range.
     """
     factory = KERNELS.get(name)
     parameters = parameters or {}
@@ -64,6 +65,8 @@ def make_kernel(
             f"the kernel {name!r} can't be made of length_scale and parameters ({error}): register a class with the "
             "argument length_scale, whose instances take two arrays of inputs"
         ) from error
+    for key, value in {"length_scale": length_scale, **parameters}.items():
+        as_number(value, f"the kernel's {key}")
     return _build(factory, length_scale, tuple(sorted(parameters.items())))
 
 
@@ -83,7 +86,7 @@ class _StationaryKernel:
     stationary = True
 
     def __post_init__(self) -> None:
-        if not _SMALLEST <= self.length_scale <= _LARGEST:
+        if not _SMALLEST <= as_number(self.length_scale, "the kernel's length_scale") <= _LARGEST:
             raise InputError(
                 f"the kernel's length_scale must be positive, {_SMALLEST:g} to {_LARGEST:g}, not {self.length_scale}"
             )

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
+from guiderail.models.common.arrays import as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.features import KernelBasis
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
@@ -52,7 +53,7 @@ class Kmp:
         covariance_lambda: float | None = None,
     ):
         inputs = _rows(inputs)
-        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
+        means, covariances = as_numbers(means, "means"), as_numbers(covariances, "covariances")
         is_matrix = means.ndim == 2 and means.size > 0
         if not is_matrix or len(inputs) != len(means) or covariances.shape != (*means.shape, means.shape[1]):
             raise InputError(
@@ -146,7 +147,7 @@ class Kmp:
             raise InputError(f"there is no via-point {identifier}: there are {sorted(self._via)}")
 
     def _check_point(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> _Point:
-        point, mean = np.atleast_1d(np.asarray(input_, dtype=float)), np.asarray(mean, dtype=float)
+        point, mean = np.atleast_1d(as_numbers(input_, "a via-point's input")), as_numbers(mean, "a via-point's mean")
         if point.shape != (self.num_inputs,) or mean.shape != (self.num_outputs,):
             raise InputError(
                 f"a via-point has input ({self.num_inputs},) and mean ({self.num_outputs},), not {point.shape} and "
@@ -155,7 +156,7 @@ class Kmp:
         if not (np.isfinite(point).all() and np.isfinite(mean).all()):
             raise InputError("a via-point must be finite")
         return _Point(
-            point, mean, _check_covariance(np.asarray(covariance, dtype=float), "via-point", self.num_outputs)
+            point, mean, _check_covariance(as_numbers(covariance, "a covariance"), "via-point", self.num_outputs)
         )
 
     def _queries(self, inputs: np.ndarray) -> np.ndarray:
@@ -209,15 +210,17 @@ def _append(
 
 
 def _rows(inputs: np.ndarray) -> np.ndarray:
-    inputs = np.asarray(inputs, dtype=float)
-    return inputs.reshape(-1, 1) if inputs.ndim < 2 else inputs
+    rows = as_numbers(inputs, "inputs")
+    if rows.ndim > 2:
+        raise InputError(f"inputs must be of shape (n,) or (n, I), not {rows.shape}")
+    return rows.reshape(-1, 1) if rows.ndim < 2 else rows
 
 
 def _check_covariance(covariance: np.ndarray, what: str, outputs: int | None = None) -> np.ndarray:
     shape = covariance.shape if outputs is None else (outputs, outputs)
     if covariance.shape != shape or not np.isfinite(covariance).all():
         raise InputError(f"the {what}'s covariance must be finite and of shape {shape}, not {covariance.shape}")
-    if np.abs(covariance - covariance.T).max(initial=0.0) > 1e-9 * np.abs(covariance).max(initial=0.0):
+    if find_asymmetric(covariance[None]) is not None:
         raise InputError(f"the {what}'s covariance is not symmetric")  # a Cholesky factorization reads only one half
     try:
         np.linalg.cholesky(covariance)

@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, is_whole
+from guiderail.models.common.arrays import as_numbers, as_whole, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
@@ -209,17 +209,19 @@ class LcNsKmp:
             history_inputs: Inputs of the history, (P,) or (P, I); None if P = 0.
 
         Raises:
-            InputError: As `predict`, if shapes do not match, a covariance is not positive definite, or the constraints
-                differ from step to step, which requires a clock.
+            InputError: As `predict`, if shapes do not match, the window is empty, a covariance is not symmetric or not
+                positive definite, or the constraints differ from step to step, which requires a clock.
             UnsolvableError: As `predict`.
         """
         if self.constraints.num_steps is not None:
             raise InputError("constraints that differ from step to step need a clock: use predict")
         x = self._stack(null_space_action, history)
-        inputs = np.asarray(inputs, dtype=float)
-        past = inputs[:0] if history_inputs is None else np.asarray(history_inputs, dtype=float)
+        inputs = as_numbers(inputs, "inputs")
+        if inputs.ndim not in (1, 2) or not inputs.size:
+            raise InputError(f"inputs must be of shape (H+1,) or (H+1, I), not {inputs.shape}")
+        past = inputs[:0] if history_inputs is None else as_numbers(history_inputs, "history_inputs")
         window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
-        if len(past) != self.history or past.shape[1:] != inputs.shape[1:]:
+        if past.shape != (self.history, *inputs.shape[1:]):
             raise InputError(f"history_inputs must be {self.history} inputs like the others, not {past.shape}")
         if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
             raise InputError("inputs, means and covariances must be finite")
@@ -244,7 +246,7 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`, if shapes do not match, or a covariance is not positive definite.
+            InputError: As `predict`, if shapes do not match, or a covariance is not symmetric and positive definite.
             UnsolvableError: As `predict`.
         """
         step = self._checked_step(step)
@@ -418,11 +420,10 @@ class LcNsKmp:
 
     def _checked_step(self, step: int) -> int:
         """Return a step, the last one for a step past the end; raise an `InputError` unless it is a whole number."""
-        if step < 0:
+        number = as_whole(step, "a step")
+        if number < 0:
             raise InputError(f"step counts from 0, not {step}")
-        if not float(step).is_integer():
-            raise InputError(f"a step is a whole number, not {brief(step)}")
-        return min(int(step), self.num_steps - 1)
+        return min(number, self.num_steps - 1)
 
     def _factor(self, step: int) -> StepFactor:
         step = self._checked_step(step)

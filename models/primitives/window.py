@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular
 
+from guiderail.models.common.arrays import as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.features import WindowFeatures
@@ -31,9 +32,10 @@ class Window:
         """Return the window of given means and covariances.
 
         Raises:
-            InputError: If means or covariances are not finite, or their shape does not match the constraints.
+            InputError: If means or covariances are not finite, their shape does not match the constraints, or a
+                covariance is not symmetric.
         """
-        means, covariances = np.asarray(means, dtype=float), np.asarray(covariances, dtype=float)
+        means, covariances = as_numbers(means, "means"), as_numbers(covariances, "covariances")
         steps, _, outputs = G.shape
         if means.shape != (steps, outputs) or covariances.shape != (steps, outputs, outputs):
             raise InputError(
@@ -41,6 +43,9 @@ class Window:
             )
         if not (np.isfinite(means).all() and np.isfinite(covariances).all()):
             raise InputError("means and covariances must be finite")
+        worst = find_asymmetric(covariances)
+        if worst is not None:  # a Cholesky factorization reads only one half
+            raise InputError(f"the covariance of point {worst} of a window is not symmetric")
         return cls(means, covariances, G, c)
 
 

@@ -3,6 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Matern52, SquaredExponential
+from guiderail.models.primitives.kernels import make_kernel
 
 A, B = np.array([[0.0, 0.0], [0.3, -0.4]]), np.array([[0.0, 0.5], [1.0, 2.0], [0.3, -0.4]])
 DISTANCE = np.array([[np.linalg.norm(a - b) for b in B] for a in A])
@@ -24,3 +25,10 @@ def test_matern52_matches_its_closed_form():
 def test_kernel_refuses_an_invalid_length_scale(kernel, scale):
     with pytest.raises(InputError, match="positive"):
         kernel(scale)
+
+
+@pytest.mark.parametrize("scale", ["a", [1.0], None])
+def test_length_scale_is_one_number(scale):
+    for make in (Matern52, lambda scale: make_kernel(length_scale=scale)):
+        with pytest.raises(InputError, match="the kernel's length_scale must be one number"):
+            make(scale)

@@ -79,10 +79,20 @@ def test_kmp_accepts_a_state_as_input():
     np.testing.assert_allclose(primitive.mean(inside), expected, atol=0.02)
 
 
+@pytest.mark.parametrize("inputs", [np.zeros((20, 1, 1)), ["a"] * 20, "a"])
+def test_inputs_are_rows_of_numbers(inputs):
+    primitive = Kmp(*data(20, 2))
+    for refused in (lambda: Kmp(inputs, *data(20, 2)[1:]), lambda: primitive.mean(inputs)):
+        with pytest.raises(InputError, match="inputs"):
+            refused()
+
+
 @pytest.mark.parametrize(
     ("via", "names"),
     [
         (([0.0, 1.0], [0.0, 0.0], np.eye(2)), "input"),
+        (("a", [0.0, 0.0], np.eye(2)), "input"),
+        ((0.0, ["a", 0.0], np.eye(2)), "mean"),
         ((0.0, [0.0], np.eye(2)), "mean"),
         ((np.nan, [0.0, 0.0], np.eye(2)), "finite"),
         ((0.0, [0.0, np.inf], np.eye(2)), "finite"),

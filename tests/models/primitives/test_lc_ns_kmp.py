@@ -371,6 +371,13 @@ def test_predict_at_accepts_other_inputs():
         p.predict_at(states[steps], *args, p.reference.times[6:8])
     with pytest.raises(InputError, match="finite"):
         p.predict_at(states[steps] * np.nan, *args, states[6:8])
+    for inputs in ([], 0.5, states[steps][None], "a"):
+        with pytest.raises(InputError, match="inputs"):
+            p.predict_at(inputs, *args, states[6:8])
+    with pytest.raises(InputError, match="history_inputs"):
+        p.predict_at(states[steps], *args, 0.5)
+    with pytest.raises(InputError, match="a step must be a whole number"):
+        p.predict("a", None, past)
 
 
 def test_cache_stays_within_its_limit():

@@ -24,7 +24,14 @@ def test_window_of_the_reference_gives_its_prediction(primitive, step):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("step", [-1, 0.5, np.nan])
+def test_covariances_of_a_window_are_symmetric(primitive):
+    covariances = np.tile(np.eye(2), (4, 1, 1))
+    covariances[2, 0, 1] = 0.1
+    with pytest.raises(InputError, match="the covariance of point 2 of a window is not symmetric"):
+        primitive.predict_window(0, np.zeros((4, 2)), covariances, history=np.zeros((2, 2)))
+
+
+@pytest.mark.parametrize("step", [-1, 0.5, np.nan, "a", None])
 def test_step_must_be_a_whole_number_from_zero(primitive, step):
     with pytest.raises(InputError, match="step"):
         primitive.predict_window(step, np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)), history=np.zeros((2, 2)))
