@@ -131,9 +131,12 @@ class LinearConstraints:
         point inside the constraints, so that there is a result for every finite output.
 
         Raises:
+            InputError: If `output` is not O numbers.
             UnsolvableError: If `output` is not finite.
         """
-        output = np.asarray(output, dtype=float)
+        output = as_numbers(output, "an output")
+        if output.shape != (self.num_outputs,):
+            raise InputError(f"an output must be of shape ({self.num_outputs},), not {output.shape}")
         if not np.isfinite(output).all():
             raise UnsolvableError(f"an output must be finite to have a nearest one within constraints, not {output}")
         if self.violation(output, step) <= 0:
@@ -148,7 +151,7 @@ class LinearConstraints:
     def _entry_point(self, output: np.ndarray, step: int) -> np.ndarray:
         """Return the first point (O,) within the constraints of a step on the line from `output` to a point inside."""
         G, c = (a[0] for a in self.window(np.array([step])))
-        inside = self._interior if self.G.ndim == 2 else self._interior[min(step, len(self._interior) - 1)]
+        inside = self._interior if self.G.ndim == 2 else self._interior[min(max(step, 0), len(self._interior) - 1)]
         inside = np.where((G == 0.0).all(axis=0), output, inside)  # outputs without a constraint do not move
         missing, gained = c - G @ output, G @ (inside - output)
         share = float(np.max(missing[missing > 0.0] / np.maximum(gained, missing)[missing > 0.0]))

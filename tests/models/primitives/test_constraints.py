@@ -285,6 +285,22 @@ def test_nearest_uses_the_first_step_by_default():
     assert box.nearest(inside) is not inside
 
 
+@pytest.mark.parametrize("output", [[1.0, 2.0], 1.0, "a", ["a"]])
+def test_nearest_refuses_other_than_one_number_for_each_output(output):
+    with pytest.raises(InputError, match="an output"):
+        LinearConstraints.box([0.0], [1.0]).nearest(output)
+
+
+def test_nearest_without_a_solver_uses_the_first_step_before_the_motion(monkeypatch):
+    box = LinearConstraints.box([[0.0, 0.0], [0.0, 8.0]], [[2.0, 1.0], [2.0, 9.0]])
+
+    def fail(*_):
+        raise UnsolvableError
+
+    monkeypatch.setattr("guiderail.models.primitives.constraints.solve_least_norm", fail)
+    np.testing.assert_array_equal(box.nearest([5.0, 0.0], -1), box.nearest([5.0, 0.0], 0))
+
+
 @pytest.mark.parametrize("gap", [0.0, 1e-7, 1e-12])
 def test_constructor_refuses_contradictions_of_fixed_outputs(gap):
     fixed = LinearConstraints.box([0.2, 0.0], [0.2 + gap, 1.0])
