@@ -11,6 +11,7 @@ linear, and two numbers that describe a gain follow from it exactly, for the act
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
@@ -25,7 +26,7 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
     outputs, all by default; the displacement of the others is returned as zero.
 
     Raises:
-        InputError: If there is no explored output, or an index does not exist.
+        InputError: If there is no explored output, an index does not exist, or a mask does not have O entries.
     """
     explored = _explored_mask(primitive, outputs)
     # Displacement of output i by a constant raw action of one in output j, (N, O, O).
@@ -48,8 +49,8 @@ def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.n
         outputs: Indices or mask of the explored outputs, all by default; the others get a gain of zero.
 
     Raises:
-        InputError: If κ is not positive, there is no explored output, an index does not exist, or the primitive has no
-            null space (β = 0).
+        InputError: If κ is not positive, there is no explored output, an index does not exist, a mask does not have O
+            entries, or the primitive has no null space (β = 0).
     """
     check_action_scale(action_scale)
     explored = _explored_mask(primitive, outputs)
@@ -95,15 +96,19 @@ def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 
     The actions are uniform in ±1, and each lasts `action_repeat` control steps.
 
     Raises:
-        InputError: If `action_repeat` is not a whole number of at least 1.
+        InputError: If `action_repeat` is not a whole number of at least 1, or `gains` are not O numbers.
     """
-    power = _white_power(primitive, action_repeat) @ np.asarray(gains, dtype=float) ** 2
+    power = _white_power(primitive, action_repeat) @ _checked_gains(primitive, gains) ** 2
     return np.sqrt(power) / deviation(primitive.reference)
 
 
 def authority(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
-    """Compute the displacement (O,), in demonstration standard deviations, by a constant action of ±1 times `gains`."""
-    return unit_authority(primitive) * np.asarray(gains, dtype=float) / deviation(primitive.reference)
+    """Compute the displacement (O,), in demonstration standard deviations, by a constant action of ±1 times `gains`.
+
+    Raises:
+        InputError: If `gains` are not O numbers.
+    """
+    return unit_authority(primitive) * _checked_gains(primitive, gains) / deviation(primitive.reference)
 
 
 def residual_gains(
@@ -120,10 +125,15 @@ def residual_gains(
         action_scale: κ, positive.
         groups: Indices of the outputs of each group; one group of all outputs by default. An output in no group gets a
             displacement of zero.
+
+    Raises:
+        InputError: If κ is not positive, or a group is empty or has an index that does not exist.
     """
+    check_action_scale(action_scale)
     variances = np.mean(reference.standard_deviations**2, axis=0)
     gains = np.zeros(len(variances))
-    for group in map(list, groups or (range(len(variances)),)):
+    for outputs in groups or (range(len(variances)),):
+        group = _checked_outputs(outputs, len(variances), "a group of outputs")
         gains[group] = np.sqrt(3.0) * action_scale * np.sqrt(variances[group].mean())
     return gains
 
@@ -150,12 +160,30 @@ def _check_response(primitive: LcNsKmp, response: np.ndarray) -> None:
 
 def _explored_mask(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:
     everything = np.arange(primitive.num_outputs)
-    if outputs is not None and np.asarray(outputs).dtype == bool:
-        outputs = np.flatnonzero(outputs)
-    indices = everything if outputs is None else np.asarray(outputs, dtype=int)
-    if not len(indices) or not np.isin(indices, everything).all():
-        raise InputError(f"action_dims must be among 0 … {primitive.num_outputs - 1}: {indices.tolist()}")
-    return np.isin(everything, indices)
+    return np.isin(everything, everything if outputs is None else _checked_outputs(outputs, len(everything), "outputs"))
+
+
+def _checked_outputs(outputs: ArrayLike | Sequence[int], num_outputs: int, what: str) -> np.ndarray:
+    """Return indices of outputs (n,), at least one, from indices or a mask."""
+    indices = as_numbers(outputs, what)
+    is_mask = np.asarray(outputs).dtype == bool
+    if is_mask and indices.shape == (num_outputs,):
+        indices = np.flatnonzero(indices)
+    elif is_mask or indices.ndim != 1 or not np.isin(indices, np.arange(num_outputs)).all():
+        indices = np.empty(0)
+    if not indices.size:
+        raise InputError(
+            f"{what} must be indices among 0 … {num_outputs - 1}, at least one, or a mask of {num_outputs} outputs, "
+            f"not {brief(outputs)}"
+        )
+    return indices.astype(int)
+
+
+def _checked_gains(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
+    checked = as_numbers(gains, "gains")
+    if checked.shape != (primitive.num_outputs,):
+        raise InputError(f"gains must be {primitive.num_outputs} numbers, one for each output, not {brief(gains)}")
+    return checked
 
 
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
-from guiderail.models.primitives.gains import authority, authority_gains, exploration_rms, rms_gains
+from guiderail.models.primitives.gains import authority, authority_gains, exploration_rms, residual_gains, rms_gains
 
 
 @pytest.fixture(scope="module", params=[0, 5])
@@ -63,8 +63,18 @@ def test_gains_are_zero_for_unexplored_outputs(primitive):
 def test_gains_refuse_invalid_arguments(primitive):
     with pytest.raises(InputError, match="action_scale"):
         authority_gains(primitive, action_scale=0)
-    with pytest.raises(InputError, match="action_dims"):
-        rms_gains(primitive, outputs=[2])
+    for outputs in ([2], [0.5], [], [True], [True, False, True], [[0]], 0, "a"):
+        with pytest.raises(InputError, match="outputs"):
+            rms_gains(primitive, outputs=outputs)
+    for gains in ([1.0] * 3, np.ones((2, 1)), 1.0, "a"):
+        for measure in (exploration_rms, authority):
+            with pytest.raises(InputError, match="gains"):
+                measure(primitive, gains)
+    for groups in ([[2]], [[-1]], [[0.5]], [[]], [0]):
+        with pytest.raises(InputError, match="a group of outputs must be indices among"):
+            residual_gains(primitive.reference, 1.0, groups)
+    with pytest.raises(InputError, match="action_scale"):
+        residual_gains(primitive.reference, -1.0)
     for wrong in (0, 1.5, np.nan, np.inf):
         with pytest.raises(InputError, match="action_repeat"):
             rms_gains(primitive, action_repeat=wrong)
