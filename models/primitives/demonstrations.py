@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_numbers, as_whole
+from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
 
@@ -23,8 +23,9 @@ class Demonstrations:
         names: Different names of the outputs with their units, such as "x [m]"; "y1", "y2", … by default.
 
     Raises:
-        InputError: If there is no demonstration, one has fewer than two points, shapes or dimensions differ, a number
-            is not finite, time does not increase strictly, or `names` are not O different short printable texts.
+        InputError: If there is no demonstration, one has fewer than two points or no output, shapes or dimensions
+            differ, a number is not finite, time does not increase strictly, or `names` are not O different short
+            printable texts.
 
     Attributes:
         times, outputs: M arrays (N_m,) and (N_m, O).
@@ -51,7 +52,11 @@ class Demonstrations:
                 raise InputError(
                     f"demonstration {m} needs times (N,) and outputs (N, O), not shapes {t.shape} and {y.shape}"
                 )
-            if y.shape[1] < 1 or y.shape[1] != self.outputs[0].shape[1]:
+            if y.shape[1] < 1:
+                raise InputError(
+                    f"demonstration {m} has no output: record at least one, not samples of shape {y.shape}"
+                )
+            if y.shape[1] != self.outputs[0].shape[1]:
                 raise InputError(
                     f"demonstration {m} has {y.shape[1]} outputs, the first has {self.outputs[0].shape[1]}: "
                     "record the same outputs in all of them"
@@ -99,10 +104,11 @@ class Demonstrations:
         """Return the first `count` demonstrations, or all if it is None.
 
         Raises:
-            InputError: If `count` is not from 1 to the number of demonstrations.
+            InputError: If `count` is not a whole number from 1 to the number of demonstrations.
         """
         if count is None:
             return self
+        count = as_whole(count, "the number of demonstrations")
         if not 1 <= count <= self.num_demonstrations:
             raise InputError(f"choose from 1 to all {self.num_demonstrations} demonstrations, not {count}")
         return Demonstrations(self.times[:count], self.outputs[:count], self.names)
@@ -200,7 +206,7 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
     Raises:
         InputError: If the band is out of range, or a demonstration has more than `MAX_ALIGNED_SAMPLES` samples.
     """
-    if not 0.0 < band <= 1.0:
+    if not 0.0 < as_number(band, "band") <= 1.0:
         raise InputError(f"the band of an alignment is a share of the duration in (0, 1], not {band}")
     common = demonstrations.resampled()
     if len(common.times[0]) > MAX_ALIGNED_SAMPLES:
@@ -306,9 +312,9 @@ def compute_bounds(
     phases = as_whole(phases, "the number of phases")
     if not 1 <= phases <= steps // 2:
         raise InputError(f"there are from 1 to {steps // 2} phases in {steps} samples, not {phases}")
-    if not (np.isfinite([margin, min_margin]).all() and margin >= 0 and min_margin >= 0):
+    if not all(0.0 <= as_number(value, "a margin") < np.inf for value in (margin, min_margin)):
         raise InputError(f"margins must be finite and not negative, not {margin} and {min_margin}")
-    chosen = range(outputs.shape[2]) if bounded is None else bounded
+    chosen = range(outputs.shape[2]) if bounded is None else _as_list(bounded, "bounded")
     indices = [as_whole(index, "an index of an output") for index in chosen]
     if not indices or not all(0 <= index < outputs.shape[2] for index in indices):
         raise InputError(f"outputs are numbered from 0 to {outputs.shape[2] - 1}, not {indices}")

@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.demonstrations import compute_bounds
+from guiderail.models.primitives.demonstrations import align_demonstrations, compute_bounds
 
 
 def wavy(lengths=(50, 80), outputs=2):
@@ -60,6 +60,7 @@ def test_constructor_drops_repeated_samples():
         ([[0.0, 0.0]], [[[1.0], [2.0]]], "does not increase at sample 1"),
         ([[0.0, 2.0, 1.0]], [[[1.0], [2.0], [3.0]]], "does not increase at sample 2"),
         ([[0.0, 1.0], [0.0, 1.0]], [[[1.0], [2.0]], [[1.0, 1.0], [2.0, 2.0]]], "2 outputs, the first has 1"),
+        ([[0.0, 1.0]], np.zeros((1, 2, 0)), "demonstration 0 has no output: record at least one"),
         ([[0.0, 1.0]], [[1.0, 2.0]], "shapes"),
         ([[0.0, 1.0, 2.0]], [[[1.0], [2.0]]], "shapes"),
         ([[0.0, 1.0]], [[["a"], ["b"]]], "not an array of numbers"),
@@ -158,16 +159,27 @@ def test_max_rates_use_the_clock_of_each_demonstration():
     np.testing.assert_allclose(compute_bounds(make_demonstrations()).max_rates[0], 1.1, rtol=1e-9)
 
 
-@pytest.mark.parametrize("arguments", [{"phases": 0}, {"phases": 99}, {"margin": -1.0}, {"bounded": [2]}])
+@pytest.mark.parametrize(
+    "arguments",
+    [{"phases": 0}, {"phases": 99}, {"margin": -1.0}, {"bounded": [2]}, {"bounded": 3}]
+    + [{"margin": "a"}, {"margin": None}, {"min_margin": [0.1]}],
+)
 def test_compute_bounds_refuses_invalid_arguments(arguments):
     with pytest.raises(InputError):
         compute_bounds(make_demonstrations(), **arguments)
+
+
+@pytest.mark.parametrize("band", [None, "a", [0.2], 0.0, 1.1])
+def test_alignment_refuses_a_band_that_is_no_share(band):
+    with pytest.raises(InputError, match="band"):
+        align_demonstrations(make_demonstrations(), band)
 
 
 @pytest.mark.parametrize("value", [2.5, "3", True])
 def test_numbers_of_steps_and_phases_are_whole(value):
     given = Demonstrations([np.arange(10.0)], [np.zeros((10, 2))])
     for refused in (
+        lambda: given.first(value),
         lambda: given.resampled(value),
         lambda: compute_bounds(given, value),
         lambda: compute_bounds(given, bounded=[value]),
