@@ -11,6 +11,7 @@ long). It neither retries with a second tolerance or a margin, nor checks an ina
 
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache
 
 import numpy as np
 
@@ -144,9 +145,7 @@ def _solve_relaxed(
     return solver(rows, lower - last, upper + last)
 
 
-_identities: dict[int, np.ndarray] = {}
-
-
+@cache
 def _identity(size: int) -> np.ndarray:
     """Return a shared identity matrix: building one for each QP costs as much as solving it."""
-    return _identities.setdefault(size, np.eye(size))
+    return np.eye(size)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import UnsolvableError
-from guiderail.models.primitives.qp import SOLVERS, find_solver, solve_least_norm
+from guiderail.models.primitives.qp import SOLVERS, _identity, find_solver, solve_least_norm
 
 # Largest violation of a bound, and distance of v from the optimum, relative to the problem's size.
 VIOLATION = {"daqp": 1e-12, "piqp": 1e-11, "osqp": 2e-9}
@@ -99,3 +99,9 @@ def test_find_solver_refuses_missing_solvers(monkeypatch):
     monkeypatch.setitem(sys.modules, "piqp", None)
     with pytest.raises(InputError, match="not installed"):
         solve_least_norm(np.eye(1), np.ones(1), np.full(1, 2.0), SOLVERS["piqp"])
+
+
+def test_identity_is_made_once_for_each_size(monkeypatch):
+    expected = _identity(3)
+    monkeypatch.delattr(np, "eye")
+    assert _identity(3) is expected
