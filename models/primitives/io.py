@@ -334,6 +334,10 @@ def _read_folder(folder: Path) -> Recording:
     names: Sequence[str] | None = None
     remaining_size, num_samples = MAX_FILE_SIZE, 0
     for file in _list_csv_files(folder):
+        if file.is_file() and file.stat().st_size > remaining_size:
+            raise InputError(
+                f"the files of the folder '{folder}' have more than {MAX_FILE_SIZE} bytes: thin the samples out"
+            )
         recording = _read_file(file, remaining_size)
         remaining_size -= file.stat().st_size
         num_samples += sum(len(t) for t in recording.times)

@@ -307,3 +307,10 @@ def test_import_of_primitives_does_not_import_scikit_learn():
         "import sys, guiderail.models.primitives; sys.exit('sklearn' in sys.modules or 'scipy.optimize' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_folder_of_too_large_files_is_named_as_a_whole(tmp_path, monkeypatch):
+    for name in ("a", "b"):
+        (tmp_path / f"{name}.csv").write_text("time,x\n0,0\n1,1\n")
+    monkeypatch.setattr("guiderail.models.primitives.io.MAX_FILE_SIZE", 25)
+    assert refused(tmp_path) == f"the files of the folder '{tmp_path}' have more than 25 bytes: thin the samples out"
