@@ -142,7 +142,9 @@ def create_task(
     shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,
     friction: Annotated[float, option("Friction coefficient of all surfaces.")] = 0.2,
-    scenario: Annotated[list[Path] | None, option("Drake model directives of the surroundings; repeatable.")] = None,
+    scenario: Annotated[
+        list[Path] | None, option("Drake model directives (.dmd.yaml) of the surroundings; repeatable.")
+    ] = None,
     hard_episodes: Annotated[
         int, option("Episodes of each baseline policy per setting to calibrate difficulty=hard; 0: no calibration.")
     ] = 10,

@@ -140,7 +140,7 @@ def create_task(
         shrink: Distance by which the plug's surface is moved inwards [m].
         force_limit: Contact force that ends an episode as a collision [N].
         friction: Friction coefficient of all surfaces.
-        scenario: Files of Drake model directives of the surroundings.
+        scenario: Files of Drake model directives (.dmd.yaml) of the surroundings.
         hard_episodes: Number of episodes of each baseline policy for each setting in the calibration of
             `difficulty=hard`; 0: no calibration.
         only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
@@ -264,15 +264,15 @@ def _check_arguments(
     if not 0 <= hard_episodes <= MAX_EPISODES:
         raise InputError(f"--hard-episodes is from 0 to {MAX_EPISODES}, not {hard_episodes}")
     from guiderail.diagrams.envs.options import validate_options
-    from guiderail.diagrams.tasks.part.file import FILE_NAME, Piece
+    from guiderail.diagrams.tasks.part.file import Piece
 
     validate_options(Piece, {"file": "plug.obj", "friction": friction}, "a part")
     names = [file.name for file in scenario]
     for file in scenario:
         if not file.is_file():
             raise InputError(f"there is no scenario {file}")
-        if file.suffix.lower() not in (".yaml", ".yml") or file.name == FILE_NAME:
-            raise InputError(f"{file} is not a scenario: name a .yaml file of Drake model directives, not {FILE_NAME}")
+        if not file.name.endswith(".dmd.yaml"):
+            raise InputError(f"{file} is not a scenario: name a .dmd.yaml file of Drake model directives")
         if "," in file.name:
             raise InputError(f"{file} has a comma in its name, which separates scenarios: rename it")
         if names.count(file.name) > 1:

@@ -100,6 +100,14 @@ class MotionNumbers(Options):
         2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
     )
 
+    @field_validator("rim")
+    @classmethod
+    def _is_below_the_start(cls, value: float, info: ValidationInfo) -> float:
+        travel = info.data.get("travel", np.inf)
+        if travel - value - TOUCH < 0.0:
+            raise ValueError(f"rim must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m")
+        return value
+
     @field_validator("advance")
     @classmethod
     def _is_within_the_socket(cls, value: float, info: ValidationInfo) -> float:
@@ -260,7 +268,7 @@ class PartTaskFile(Options):
     place: Numbers = Field(
         (0.55, 0.0, 0.15), min_length=3, max_length=3, description="position of the target in the world [m]"
     )
-    scenario: tuple[str, ...] = Field((), description="Drake model directives (.yaml) of further objects")
+    scenario: tuple[str, ...] = Field((), description="Drake model directives (.dmd.yaml) of further objects")
     motion: MotionNumbers
     tolerance: Tolerance = Tolerance.model_validate({})
     bounds: Bounds = Bounds.model_validate({"lower": (-2e-3, -2e-3, *[None] * 4), "upper": (2e-3, 2e-3, *[None] * 4)})

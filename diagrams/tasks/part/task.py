@@ -66,7 +66,7 @@ class PartWorkcell(MovableWorkcell):
     folder: Path  # folder with the SDF files of plug and socket
     place: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the target in the world, (3,) [m]
     stiction_tolerance: float = 1e-5  # largest creep of a sticking contact [m/s]
-    scenario: Sequence[str] = ()  # paths of Drake model directives of further objects
+    scenario: Sequence[str] = ()  # paths of Drake model directives (.dmd.yaml) of further objects
     # Names of the files of the convex pieces of plug and socket, for MuJoCo.
     convex: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
     friction: float = 0.2  # friction coefficient of the convex pieces

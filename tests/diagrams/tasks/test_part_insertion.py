@@ -7,13 +7,14 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
-from guiderail.diagrams.tasks.part.file import Bounds, read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.file import Bounds, MotionNumbers, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.task import load_task_folder, write_workcell
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
@@ -170,9 +171,29 @@ def test_convex_pieces_of_both_parts_offer_mujoco(tmp_path):
         assert np.ptp(plug.shape.vertices, axis=0)[2] == pytest.approx(0.02)
         with nullcontext() if is_offered else pytest.raises(InputError, match=r"the socket .* has no convex pieces"):
             workcell.fixture_surfaces()
-    folder = write(tmp_path / "crowded", **both, scenario=["table.yaml"])
-    (folder / "table.yaml").write_text("directives: []")
+    folder = write(tmp_path / "crowded", **both, scenario=["table.dmd.yaml"])
+    (folder / "table.dmd.yaml").write_text("directives: []")
     assert "mujoco" not in load_task_folder(folder).stations()
+
+
+def test_scenario_adds_its_models_to_the_plant(tmp_path):
+    folder = write(tmp_path / "on_a_table", scenario=["table.dmd.yaml"])
+    (folder / "table.sdf").write_text("<sdf version='1.9'><model name='table'><link name='top'/></model></sdf>")
+    (folder / "package.xml").write_text("<package><name>surroundings</name></package>")
+    model = "{name: table, file: 'package://surroundings/table.sdf'}"
+    (folder / "table.dmd.yaml").write_text(f"directives:\n- add_model: {model}\n")
+    workcell = EnvConfig.resolve(str(folder), {}).make_task().workcell()
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
+    workcell.add_fixture(plant)
+    assert plant.HasModelInstanceNamed("table")
+
+
+@pytest.mark.parametrize(("travel", "is_accepted"), [(0.01, False), (0.0504, False), (0.0505, True)])
+def test_plug_starts_above_the_rim(travel, is_accepted):
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="rim must be at least"):
+        motion = validate_options(MotionNumbers, {"travel": travel, "rim": 0.05}, "here")
+        for times, _ in (motion.plan_search(), motion.plan_straight_insertion()):
+            assert np.diff(times).min() >= 0.0
 
 
 def test_missing_part_folder_is_named(tmp_path):

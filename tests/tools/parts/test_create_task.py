@@ -57,14 +57,14 @@ def test_measured_properties_are_those_of_the_drawing(folder):
 
 def test_scenarios_with_conflicting_names_are_refused(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
-    for name in ("a/table.yaml", "b/table.yaml", "a/task.yaml", "a/plug.obj", "a/b,c.yaml"):
+    for name in ("a/table.dmd.yaml", "b/table.dmd.yaml", "a/table.yaml", "a/plug.obj", "a/b,c.dmd.yaml"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("directives: []\n")
     for names, words in (
-        (("a/table.yaml", "b/table.yaml"), "two scenarios are called table.yaml"),
-        (("a/task.yaml",), "not task.yaml"),
+        (("a/table.dmd.yaml", "b/table.dmd.yaml"), "two scenarios are called table.dmd.yaml"),
+        (("a/table.yaml",), "is not a scenario: name a .dmd.yaml file"),
         (("a/plug.obj",), "is not a scenario"),
-        (("a/b,c.yaml",), "has a comma in its name"),
+        (("a/b,c.dmd.yaml",), "has a comma in its name"),
     ):
         with pytest.raises(InputError, match=words):
             create_task(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
