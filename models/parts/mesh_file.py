@@ -73,21 +73,27 @@ def find_unit(path: Path, unit: str | None) -> str | None:
     Raises:
         InputError: If `unit` is unknown, or contradicts the format.
     """
-    if unit is not None and unit not in UNITS:
-        raise InputError(f"there is no unit {unit!r}: choose one of {', '.join(UNITS)}")
+    if unit is not None:
+        _check_unit(unit)
     known = _KNOWN.get(path.suffix.lower())
     if known and unit not in (None, known):
         raise InputError(f"{path.name} is read in meters, as its format defines: remove --unit {unit}")
     return known or unit
 
 
+def _check_unit(unit: str) -> None:
+    if unit not in UNITS:
+        raise InputError(f"there is no unit {unit!r}: choose one of {', '.join(UNITS)}")
+
+
 def load_part(path: Path, unit: str) -> Part:
     """Read a mesh file (STL, OBJ, PLY, GLB or STEP) whose coordinates are in `unit`, one of `UNITS`.
 
     Raises:
-        InputError: If the file can't be read or has too many triangles, the part can't be made a solid, its size is out
-            of bounds, or software for the format is not installed.
+        InputError: If the unit is unknown, the file can't be read or has too many triangles, the part can't be made a
+            solid, its size is out of bounds, or software for the format is not installed.
     """
+    _check_unit(unit)
     if path.suffix.lower() not in ENDINGS:
         raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
     import_extra("trimesh")

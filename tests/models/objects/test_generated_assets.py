@@ -77,3 +77,13 @@ def test_mesh_is_refused_when_a_face_has_no_such_vertex(face, tmp_path):
     path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n{face}\n")
     with pytest.raises(InputError, match=r"part\.obj has a vertex outside 1 … 3"):
         TriangleMesh.from_obj(path)
+
+
+@pytest.mark.parametrize(
+    "lines", ["f 1 2 3 4", "f 1 2 3\nf 1 2 3 4", "f a b c", f"f 1 2 {2**70}", "", "v 0 0\nf 1 2 3"]
+)
+def test_mesh_is_refused_unless_it_has_triangles_only(lines, tmp_path):
+    path = tmp_path / "part.obj"
+    path.write_text(f"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{lines}\n")
+    with pytest.raises(InputError, match=r"part\.obj must hold vertices of three numbers, and triangles only"):
+        TriangleMesh.from_obj(path)

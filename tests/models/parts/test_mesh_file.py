@@ -232,6 +232,12 @@ def test_load_part_refuses_files_without_a_mesh(tmp_path):
             load_part(tmp_path / name, "mm")
 
 
+def test_load_part_refuses_an_unknown_unit(tmp_path):
+    box().export(tmp_path / "part.stl")
+    with pytest.raises(InputError, match="there is no unit 'foot': choose one of mm, cm, m, inch"):
+        load_part(tmp_path / "part.stl", "foot")
+
+
 def test_load_part_refuses_a_name_that_no_file_system_takes():
     with pytest.raises(InputError, match="check the path"):
         load_part(Path("n" * 300 + ".stl"), "mm")
