@@ -8,12 +8,12 @@ A robot of this package consists of a Python file and a model file. The Python f
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from pathlib import Path
 
-import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry
 
 
@@ -22,7 +22,7 @@ class JointDrives:
     """Position control of joints by springs and dampers.
 
     Raises:
-        InputError: If the numbers of values differ, or a value is not positive and finite.
+        InputError: If the numbers of values differ, or a value is not a positive and finite number.
     """
 
     stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one
@@ -32,8 +32,9 @@ class JointDrives:
     def __post_init__(self) -> None:
         if len(self.stiffness) != len(self.inertia):
             raise InputError("joint drives need as many inertias as stiffnesses")
-        if not all(0.0 < value < math.inf for value in (*self.stiffness, *self.inertia)):
-            raise InputError("the stiffness and the inertia of a joint's drive must be positive")
+        values = (*self.stiffness, *self.inertia)
+        if not _are_numbers(values, len(values)) or not all(value > 0.0 for value in values):
+            raise InputError(f"the stiffness and the inertia of a joint's drive must be positive, not {brief(values)}")
 
     @property
     def damping(self) -> tuple[float, ...]:
@@ -67,7 +68,8 @@ class Robot:
 
     Raises:
         InputError: If there are fewer than six joints, a joint occurs twice, the number of joint positions or drives
-            differs from that of joints, a position is not finite, or `apparent_rotor_inertia` is not in (0, 1].
+            differs from that of joints, a position or `tool_turn` is not a finite number, or `apparent_rotor_inertia`
+            is not in (0, 1].
     """
 
     name: str
@@ -89,7 +91,9 @@ class Robot:
         for what, values in (("home", self.home), ("level_posture", self.level_posture)):
             if values is not None and not _are_numbers(values, self.num_joints):
                 raise InputError(f"robot {self.name!r}: {what} must be {self.num_joints} joint positions, not {values}")
-        if not 0.0 < self.apparent_rotor_inertia <= 1.0:
+        if not _are_numbers((self.tool_turn,), 1):
+            raise InputError(f"robot {self.name!r}: tool_turn must be a finite angle, not {brief(self.tool_turn)}")
+        if not (_are_numbers((self.apparent_rotor_inertia,), 1) and 0.0 < self.apparent_rotor_inertia <= 1.0):
             raise InputError(f"robot {self.name!r}: apparent_rotor_inertia must be more than 0 and at most 1")
         if self.drives is not None and len(self.drives.stiffness) != self.num_joints:
             raise InputError(f"robot {self.name!r}: it has {self.num_joints} joints, so it needs as many drives")
@@ -186,4 +190,4 @@ def find_end_effector(name: str | EndEffector) -> EndEffector:
 
 
 def _are_numbers(values: Sequence[float], count: int) -> bool:
-    return len(values) == count and bool(np.isfinite(np.asarray(values, dtype=float)).all())
+    return len(values) == count and all(isinstance(value, Real) and math.isfinite(value) for value in values)

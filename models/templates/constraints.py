@@ -28,7 +28,7 @@ from guiderail.models.templates.geometry import (
     pose_in,
     with_position_in,
 )
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, require, require_three
+from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, require, require_finite, require_three
 
 UNBOUNDED = 1e3  # radius beyond the reach of any robot [m]
 
@@ -136,6 +136,7 @@ class HalfSpace(PositionConstraint):
     def __post_init__(self) -> None:
         require_three(self.normal, "normal")
         require(np.linalg.norm(self.normal) > 1e-6, f"normal must not be zero: {self.normal}.")
+        require_finite(self.offset_m, "offset_m")
 
     @cached_property
     def _unit(self) -> np.ndarray:
@@ -237,6 +238,8 @@ class KeepAbove(FrameConstraint):
 
     def __post_init__(self) -> None:
         require(len(self.points_m) > 0 and all(len(p) == 3 for p in self.points_m), "points_m are (x, y, z) each.")
+        for value, name in ((self.height_m, "height_m"), *((value, "points_m") for p in self.points_m for value in p)):
+            require_finite(value, name)
 
     @cached_property
     def _points(self) -> np.ndarray:
@@ -260,6 +263,8 @@ class Funnel(PositionConstraint):
 
     def __post_init__(self) -> None:
         require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
+        for name in ("radius_m", "height_m", "slope"):
+            require_finite(getattr(self, name), name)
 
     @override
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
@@ -397,6 +402,8 @@ class Arc(FrameConstraint):
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
+        for name in ("radius_m", "height_m"):
+            require_finite(getattr(self, name), name)
         require_three(self.rpy_deg, "rpy_deg")
         require(-180 <= self.min_deg <= self.max_deg <= 180, "angles must satisfy −180 ≤ min_deg ≤ max_deg ≤ 180.")
 

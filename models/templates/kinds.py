@@ -8,7 +8,9 @@ unit contains the unit. A kind is registered under the name that the file uses:
     class HalfSpace(ActiveConstraint): ...
 """
 
+import math
 from collections.abc import Callable
+from numbers import Real
 from typing import Any, TypeVar
 
 from guiderail.models.common.errors import InputError, brief
@@ -40,6 +42,11 @@ def require(condition: Any, sentence: str) -> None:
     """Raise an `InputError` with `sentence` unless `condition` holds; for a kind's `__post_init__`."""
     if not condition:
         raise InputError(sentence)
+
+
+def require_finite(value: float, name: str) -> None:
+    """Raise an `InputError` unless a number is finite."""
+    require(isinstance(value, Real) and math.isfinite(value), f"{name} must be finite, not {brief(value)}.")
 
 
 def require_three(values: tuple[float, ...], name: str) -> None:

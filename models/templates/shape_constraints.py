@@ -15,6 +15,14 @@ from guiderail.models.templates.geometry import WORLD, Frames, position_in
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, require, require_three
 
 
+class _Tangent(HalfSpace):
+    """Half-space at a shape's surface; its offset, and thus the command, is not finite if an object's pose is not."""
+
+    @override
+    def __post_init__(self) -> None:
+        """Check nothing: callers check the command."""
+
+
 class Outside(PositionConstraint):
     """Base class of constraints to stay outside of a convex shape in F.
 
@@ -36,7 +44,7 @@ class Outside(PositionConstraint):
     def at(self, X_WLast: RigidTransform, frames: Frames) -> HalfSpace:
         """Return the half-space to which the command after X_WLast is constrained."""
         normal, offset = self.shape.half_space(position_in(self.frame, X_WLast, frames))
-        return HalfSpace(tuple(normal), offset + shapes.CLEARANCE, self.frame)
+        return _Tangent(tuple(normal), offset + shapes.CLEARANCE, self.frame)
 
 
 @register(ACTIVE_CONSTRAINTS, "outside_sphere")

@@ -87,6 +87,10 @@ def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
     [
         ({"home": (0.0,) * 5}, "home must be 6 joint positions"),
         ({"home": (np.nan,) * 6}, "home must be 6 joint positions"),
+        ({"home": ("a",) * 6}, "home must be 6 joint positions"),
+        ({"tool_turn": np.nan}, "tool_turn must be a finite angle, not nan"),
+        ({"tool_turn": "a"}, "tool_turn must be a finite angle, not 'a'"),
+        ({"apparent_rotor_inertia": "a"}, "apparent_rotor_inertia"),
         ({"level_posture": (0.0,) * 7}, "level_posture must be 6"),
         ({"joints": ("a", "b")}, "six joints or more"),
         ({"joints": ("a",) * 6}, "each once"),
@@ -114,7 +118,7 @@ def test_end_effector_refuses_invalid_data(wrong, sentence):
         dataclasses.replace(find_end_effector("parallel_gripper"), **wrong)
 
 
-@pytest.mark.parametrize("wrong", [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,))])
+@pytest.mark.parametrize("wrong", [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,)), (("a",), (1.0,))])
 def test_drives_refuse_invalid_data(wrong):
     with pytest.raises(InputError):
         JointDrives(*wrong)

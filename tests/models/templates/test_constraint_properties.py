@@ -276,6 +276,14 @@ def test_nearest_turn_is_within_half_a_turn(center):
         (lambda: ac.Arc(F, 1.0, min_deg=-181.0), "angles"),
         (lambda: ac.Arc(F, 1.0, min_deg=10.0, max_deg=9.0), "angles"),
         (lambda: ac.Arc(F, 1.0, max_deg=181.0), "angles"),
+        (lambda: ac.Arc(F, 1.0, math.nan), "height_m must be finite, not nan"),
+        (lambda: ac.Arc(F, math.inf), "radius_m must be finite"),
+        (lambda: ac.HalfSpace((0.0, 0.0, 1.0), math.nan), "offset_m must be finite, not nan"),
+        (lambda: ac.HalfSpace((0.0, 0.0, 1.0), "a"), "offset_m must be finite, not 'a'"),
+        (lambda: ac.KeepAbove(math.nan), "height_m must be finite"),
+        (lambda: ac.KeepAbove(0.0, points_m=((0.0, math.nan, 0.0),)), "points_m must be finite"),
+        (lambda: ac.Funnel(F, 0.1, math.nan, 1.0), "height_m must be finite"),
+        (lambda: ac.Funnel(F, 0.1, 0.0, math.inf), "slope must be finite"),
     ],
 )
 def test_constraint_refuses_an_empty_set(make, message):

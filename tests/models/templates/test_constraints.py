@@ -162,6 +162,14 @@ def test_nan_pose_is_never_inside(constraint):
             assert not constraint.violation(X_WE, frames) <= 1e-9
 
 
+def test_half_space_at_a_shape_of_unknown_pose_is_not_finite():
+    lost = RigidTransform([0.0, np.nan, 0.0])
+    for outside in (sc.OutsideSphere(0.1), sc.OutsideCylinder(F, 0.1, 0.0, 1.0), sc.OutsideBox((0.0,) * 3, (1.0,) * 3)):
+        assert np.isnan(
+            outside.at(lost, {F: RigidTransform()}).project(lost, {F: RigidTransform()}).translation()
+        ).any()
+
+
 def test_largest_is_nan_when_a_violation_is_nan():
     assert np.isnan(largest([0.1, np.nan, 0.2]))
     assert np.isnan(largest([np.nan, 0.2]))
