@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
 from guiderail.models.primitives.qp import UnsolvableError, find_solver, solve_least_norm
@@ -136,10 +136,10 @@ class ChunkGuard:
 
         Raises:
             InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite, or
-                `num_executed` is out of range.
+                `num_executed` is not a whole number in its range.
         """
         result = self.limit(chunk, self._past, self._plan)
-        number = len(result.outputs) if num_executed is None else num_executed
+        number = len(result.outputs) if num_executed is None else as_whole(num_executed, "num_executed")
         if number not in range(len(result.outputs) + 1):
             raise InputError(f"{brief(num_executed)} steps of a chunk of {len(result.outputs)} can't be executed")
         self._past = np.concatenate([self._past, result.outputs[:number]])[-3:]

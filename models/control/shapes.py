@@ -18,7 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_number, as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import LinearConstraints
 
@@ -77,10 +77,11 @@ def _finite(values: ArrayLike, what: str) -> np.ndarray:
 
 
 def _length(value: float, what: str, *, can_be_zero: bool = False) -> float:
-    if not (0.0 < value < math.inf or (can_be_zero and value == 0.0)):
+    length = as_number(value, what)
+    if not (0.0 < length < math.inf or (can_be_zero and length == 0.0)):
         bound = "not negative" if can_be_zero else "positive"
         raise InputError(f"{what} must be finite and {bound}, not {brief(value)}")
-    return float(value)
+    return length
 
 
 class Sphere(ConvexShape):

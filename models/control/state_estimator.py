@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
 from guiderail.models.control.message_sequence import RESOLUTION
@@ -155,8 +156,8 @@ class StateEstimator:
 
     def __init__(self, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float):
         self._limits, self._period, n = limits, period, len(limits.velocity)
-        self._torque_tolerance = np.array(torque_tolerance, dtype=float)
-        if len(self._torque_tolerance) != n:
+        self._torque_tolerance = as_numbers(torque_tolerance, "torque_tolerance")
+        if self._torque_tolerance.shape != (n,):
             raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
         if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
             raise InputError("the torque tolerances of a robot must be positive and finite")

@@ -12,8 +12,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from guiderail.models.common.arrays import cross, norm
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import cross, is_finite, norm
+from guiderail.models.common.errors import InputError, brief
 
 POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench, and vice versa
 
@@ -57,6 +57,9 @@ class WrenchBound:
         """Return the element-wise minimum of this bound and another (8,), whose negative or NaN numbers count as 0.
 
         A bound that arrives at run time can therefore only lower the configured one.
+
+        Raises:
+            InputError: If the other bound is not eight numbers.
         """
         return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
 
@@ -64,6 +67,8 @@ class WrenchBound:
 @lru_cache(maxsize=16)  # several systems request the same bound at every plant step
 def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
     requested = np.frombuffer(max_wrench)
+    if requested.shape != (MAX_WRENCH_SIZE,):
+        raise InputError(f"max_wrench must be {MAX_WRENCH_SIZE} numbers, not {len(requested)}")
     lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
     lowest.setflags(write=False)
     return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
@@ -74,7 +79,12 @@ def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray
 
     If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line. Both bounds
     are finite signals (8,), and `max_change` (8,) is positive.
+
+    Raises:
+        InputError: If a number of a bound is not finite.
     """
+    if not (is_finite(bound) and is_finite(target)):
+        raise InputError(f"the bounds of an approach must be finite, not {brief(bound)} and {brief(target)}")
     change = target - bound
     excess = float(np.max(np.abs(change) / max_change))
     return target.copy() if excess <= 1.0 else bound + change / excess

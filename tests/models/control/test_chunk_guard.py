@@ -70,9 +70,10 @@ def test_guard_is_refused_when_an_argument_is_out_of_range():
             make().guard(chunk)
     make().guard(np.zeros((4, 2)))
     refusing, plain = make(), make()
-    for number in (-1, 5, 1.5):
+    for number in (-1, 5, 1.5, "a", np.array([1, 2])):
         with pytest.raises(InputError, match="executed"):
             refusing.guard(np.full((4, 2), 0.01), number)
+    assert len(make().guard(np.zeros((4, 2)), 2.0).outputs) == 4
     outputs = [one.guard(np.full((4, 2), 0.01)).outputs for one in (refusing, plain)]
     np.testing.assert_array_equal(*outputs)
 

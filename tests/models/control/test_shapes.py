@@ -129,6 +129,8 @@ def test_linearized_constraints_without_shapes_are_the_given_ones():
         (lambda: Sphere([0.0, np.nan], 0.1), "center"),
         (lambda: Sphere([0.0, 0.0], 0.0), "the radius of a sphere must be finite and positive, not 0.0"),
         (lambda: Sphere([0.0, 0.0], 0.1, -1e-3), "a margin must be finite and not negative, not -0.001"),
+        (lambda: Sphere([0.0, 0.0], "a"), "the radius of a sphere must be one number, not 'a'"),
+        (lambda: Sphere([0.0, 0.0], 0.1, [0.1]), "a margin must be one number"),
         (lambda: Box([0.0, 0.0], [1.0, 0.0]), "lower corner"),
         (lambda: Box([0.0], [1.0, 1.0]), "lower corner"),
         (lambda: Box([], []), "lower corner"),

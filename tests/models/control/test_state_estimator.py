@@ -963,7 +963,10 @@ def test_estimator_is_finite_when_its_state_is_not(wrong):
     np.testing.assert_array_equal(estimate.state.velocity, 0.0)
 
 
-@pytest.mark.parametrize("tolerance", [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)])
+@pytest.mark.parametrize(
+    "tolerance",
+    [(1.0,), (1.0,) * 3, (0.0, 1.0), (np.inf, 1.0), (np.nan, 1.0), (-1.0, 1.0)] + [1.0, ("a", 1.0), ((1.0, 1.0),) * 2],
+)
 def test_constructor_refuses_torque_tolerances_out_of_range(tolerance):
     with pytest.raises(InputError):
         StateEstimator(LIMITS, tolerance, period=PERIOD)

@@ -9,6 +9,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import (
     WrenchBound,
     admissible_change,
+    approach_bound,
     approach_impedance,
     bounded_wrench,
     clip_wrench,
@@ -93,6 +94,20 @@ def test_lowering_a_bound_never_raises_it():
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
     assert lower.contact_stiffness == BOUND.contact_stiffness
     np.testing.assert_array_equal(BOUND.lowered_to(np.full(8, np.inf)).numbers, BOUND.numbers)
+
+
+@pytest.mark.parametrize("numbers", [np.ones(6), np.ones(9), 1.0])
+def test_bound_is_lowered_to_eight_numbers_only(numbers):
+    with pytest.raises(InputError, match="max_wrench must be 8 numbers, not"):
+        BOUND.lowered_to(numbers)
+
+
+@pytest.mark.parametrize("wrong", [np.inf, np.nan])
+def test_bound_that_is_not_finite_is_not_approached(wrong):
+    finite, infinite = np.ones(8), np.r_[np.ones(7), wrong]
+    for bounds in ((infinite, infinite), (finite, infinite), (infinite, finite)):
+        with pytest.raises(InputError, match="the bounds of an approach must be finite"):
+            approach_bound(*bounds, np.ones(8))
 
 
 @pytest.mark.parametrize("numbers", [(AXES[:5], 1.0, 1.0), (-AXES, 1.0, 1.0), (AXES, np.nan, 1.0), (AXES, 1.0, -1.0)])
