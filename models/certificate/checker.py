@@ -1,6 +1,6 @@
 """Check a certificate with NumPy alone: `python checker.py FOLDER [KEY_FILE]`.
 
-Exit codes: 0 valid, 1 rejected, 2 unreadable.
+Exit codes: 0 valid, 1 rejected, 2 unreadable or wrong arguments.
 
 The checker bounds the commands y of a window of steps for all actions a. Given the history h, the prior has the mean
 W h and the kernel C; μ, Σ, λ and β are the primitive's means, covariances and parameters, G its rows of constraints:
@@ -442,6 +442,9 @@ def check(folder: Path, key: bytes | None = None) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) not in (2, 3):
+        print("usage: python checker.py FOLDER [KEY_FILE]")
+        sys.exit(2)
     try:
         check(Path(sys.argv[1]), Path(sys.argv[2]).read_bytes() if len(sys.argv) > 2 else None)
         print("yes")

@@ -566,6 +566,14 @@ def run_checker(folder, capsys, monkeypatch):
     return 0, capsys.readouterr().out
 
 
+@pytest.mark.parametrize("arguments", [[], ["folder", "key", "more"]])
+def test_checker_prints_its_usage_for_a_wrong_number_of_arguments(arguments, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["checker.py", *arguments])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(checker.__file__, run_name="__main__")
+    assert capsys.readouterr().out == "usage: python checker.py FOLDER [KEY_FILE]\n"
+
+
 NONE = {
     "half of it": lambda c: {**c, CERTIFICATE: c[CERTIFICATE][:100]},
     "no text": lambda c: {**c, CERTIFICATE: bytes(range(256))},
