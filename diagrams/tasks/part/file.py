@@ -172,6 +172,8 @@ class Bounds(Options):
         lower, upper = _filled(info.data["lower"], -np.inf), _filled(info.data["upper"], np.inf)
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("without phases, lower and upper are one list each; with phases, one list for each phase")
+        if (lower > upper).any():
+            raise ValueError("no lower bound may exceed its upper bound")
         if phases is not None and (phases[0] != 0.0 or any(np.diff([*phases, 1.0]) <= 0.0)):
             raise ValueError("phases begin at 0, increase, and are below 1")
         for bound in (np.isfinite(lower), np.isfinite(upper)):
@@ -318,7 +320,7 @@ class PartTaskFile(Options):
     def clearance(self) -> float:
         """Measured clearance between the parts [m]; 0 if it was not measured."""
         value = self.measured.get("clearance_mm")
-        return MM * float(value) if isinstance(value, int | float) and 0.0 < value < np.inf else 0.0
+        return MM * float(value) if isinstance(value, int | float) and 0.0 < value <= _LARGEST else 0.0
 
     @cached_property
     def turn(self) -> float:
@@ -341,7 +343,10 @@ def read_task_file(folder: Path) -> PartTaskFile:
     data = load_yaml(path, "task")
     if not isinstance(data, dict) or data.get("format") != FILE_FORMAT:
         raise InputError(f"{path} is no task: it must contain the line 'format: {FILE_FORMAT}'")
-    file = validate_options(PartTaskFile, data, str(path))
+    try:
+        file = validate_options(PartTaskFile, data, "it")
+    except InputError as error:
+        raise InputError(f"{path} is invalid: {error}") from None
     for name in file.files:
         if not _FILE_NAME.fullmatch(name) or ".." in name.split("/"):
             raise InputError(f"{path} names {brief(name)}, which is not a plain path inside {folder}: rename the file")

@@ -272,13 +272,19 @@ class PartInsertion(DemonstratedInsertion):
         Raises:
             InputError: If `bound` is given, and the bounds of `task.yaml` change between phases.
         """
+        return self._bounds().constraints(self.reference().num_steps)
+
+    def _bounds(self) -> Bounds:
         bounds, limit = self.file.bounds, self.options.bound
-        if limit is not None:
-            if bounds.phases is not None:
-                raise InputError("bound replaces constant bounds, and those of task.yaml change between phases")
-            both = (-limit, -limit, *bounds.lower[2:]), (limit, limit, *bounds.upper[2:])
-            bounds = Bounds(lower=both[0], upper=both[1], phases=None)
-        return bounds.constraints(self.reference().num_steps)
+        if limit is None:
+            return bounds
+        if bounds.phases is not None:
+            difficulty = self.config.difficulty
+            is_set = self.difficulties[difficulty].get("bound") == limit
+            remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
+            raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
+        both = (-limit, -limit, *bounds.lower[2:]), (limit, limit, *bounds.upper[2:])
+        return Bounds(lower=both[0], upper=both[1], phases=None)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
@@ -351,10 +357,10 @@ class PartInsertion(DemonstratedInsertion):
         return front_camera(target, distance=6 * size, height=3 * size)
 
     def scene(self) -> Scene:
-        """Return the demonstrations and the box of the bounds of each phase in `task.yaml`."""
+        """Return the demonstrations and the box of the bounds of each phase in `task.yaml`, or of `bound`."""
         to_world, size = in_frame(self.workcell().X_WT), self.file.motion.travel
         near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
-        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self.file.bounds.arrays())
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self._bounds().arrays())
         lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
         boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
         return Scene(

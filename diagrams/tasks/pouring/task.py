@@ -100,6 +100,7 @@ POURED_STEPS = 10  # consecutive steps of the default control period that count 
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
+START_TOLERANCE = 1e-6  # largest distance of a given start from the workspace, along an axis [m]
 MAX_START_SAMPLES = 20  # number of samples, all unreachable, after which the reset fails
 
 
@@ -291,12 +292,13 @@ class Pouring(Task):
     ) -> dict[str, Any]:
         """Place the mug, the upright thermos and the balls at sampled poses; an unreachable start is sampled again.
 
-        Values that a reset option replaces are sampled nevertheless. The start is projected onto the constraints of the
+        Values that a reset option replaces are sampled nevertheless. The start is inside the constraints of the
         template's first state. The returned `mug_position` is that of the actual mug, unlike the reset option of this
         name.
 
         Raises:
-            InputError: If a reset option is too large, or the arm reaches no sampled start.
+            InputError: If a reset option is too large, the option `start` is outside the constraints, or the arm
+                reaches no sampled start.
         """
         assert isinstance(station, PouringStation)
         episode = episode_stream(rng, options.held_out)
@@ -315,6 +317,12 @@ class Pouring(Task):
             frames = frames_of(self._template, estimated)
             # The thermos is turned as in the template's first state, so that all kinds of guidance start at one pose.
             X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
+            nearest = estimated.inverse() @ X_TP.translation()
+            if np.abs(nearest - p_MP).max() > START_TOLERANCE:
+                raise InputError(
+                    "the reset option 'start' must be inside the workspace of the template's first state, not "
+                    f"{p_MP.tolist()}: the nearest start is {nearest.round(4).tolist()}"
+                )
             try:
                 station.set_pose(context, transform_to_pose(X_TP))
                 break

@@ -100,11 +100,33 @@ def with_row(changed):
         (with_row([True, -0.001, *[None] * 4]), "six finite numbers"),
         (with_row(3), "six finite numbers"),
         (BY_PHASE | {"lower": 3}, "tuple"),
+        ({"lower": [0.002, *[None] * 5], "upper": [0.001, *[None] * 5]}, "no lower bound may exceed its upper bound"),
     ],
 )
 def test_invalid_bounds_are_refused(bounds, says):
     with pytest.raises(InputError, match=says):
         validate_options(Bounds, bounds, "here")
+
+
+def test_invalid_task_is_refused_by_the_name_of_its_file(tmp_path):
+    folder = write(tmp_path / "crossed", bounds={"lower": [0.002, *[None] * 5], "upper": [0.001, *[None] * 5]})
+    with pytest.raises(InputError, match=r"crossed/task\.yaml is invalid: bounds cannot be .*: no lower bound may"):
+        read_task_file(folder)
+
+
+@pytest.mark.parametrize(
+    ("options", "remedy"),
+    [
+        ({"bound": 0.003}, "between phases: leave it out"),
+        ({"difficulty": "hard"}, "give bound=None .* with difficulty='hard'"),
+        ({"difficulty": "automate"}, "give bound=None .* with difficulty='automate'"),
+    ],
+)
+def test_remedy_for_a_bound_with_phases_names_what_sets_it(options, remedy, tmp_path):
+    folder = str(write(tmp_path / "by_phase", bounds=BY_PHASE))
+    with pytest.raises(InputError, match=remedy):
+        EnvConfig.resolve(folder, options).make_task().constraints()
+    EnvConfig.resolve(folder, options | {"bound": None}).make_task().constraints()
 
 
 def test_a_bound_is_that_of_its_phase():
@@ -272,6 +294,8 @@ def test_scene_has_the_box_of_each_phase(tmp_path):
         str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}
     ).make_task()
     assert task.scene().constraint == ()
+    task = EnvConfig.resolve(str(write(tmp_path / "replaced")), {"bound": 0.0035}).make_task()
+    assert np.ptp(np.array(task.scene().constraint)[..., 0]) == pytest.approx(0.007)
 
 
 def test_success_on_hardware_is_estimated_from_height_and_turn(tmp_path):
@@ -288,6 +312,7 @@ def test_success_on_hardware_is_estimated_from_height_and_turn(tmp_path):
         (1.0, 0.1, [(-3.0, 0.0), (0.0, 2.0), (0.0, -2.0)]),  # +x is 1 mm from the bound
         (1.0, 0.3, [(-3.0, 0.0)]),
         (0.0, 50.0, []),
+        pytest.param(0.0, 10**400, [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)], id="huge"),
         (0.0, "unknown", [(2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)]),
     ],
 )

@@ -213,7 +213,15 @@ def test_refuses_what_makes_no_sense(arguments, said):
 
 
 @pytest.mark.parametrize(
-    "options", [{"strat": (0, 0, 0)}, {"start": (0, 0)}, {"start": (np.nan, 0, 0)}, {"mug_position": (0.5, 0.0)}]
+    "options",
+    [
+        {"strat": (0, 0, 0)},
+        {"start": (0, 0)},
+        {"start": (np.nan, 0, 0)},
+        {"start": (5, 5, 5)},
+        {"start": (0.1, -0.25, 0.25)},
+        {"mug_position": (0.5, 0.0)},
+    ],
 )
 def test_refuses_reset_options_that_make_no_sense(env, options):
     with pytest.raises(InputError):
