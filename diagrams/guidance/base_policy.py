@@ -32,8 +32,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
             only one limit is given; () gives all outputs the default.
 
     Raises:
-        InputError: If the motion has constraints other than linear bounds and speed limits, or `max_jerk` has another
-            number of entries.
+        InputError: If the motion has constraints other than linear bounds and speed limits, `max_jerk` has another
+            number of entries, or outputs that the demonstrations do not move have no given limits.
     """
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
     if motion is not None and (
@@ -55,6 +55,11 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     if max_jerk:
         given = limits_per_output("max_jerk", max_jerk, outputs)
         jerk = np.where(np.isfinite(given), given, jerk)
+    if still := np.flatnonzero((velocity == 0.0) | (jerk == 0.0)).tolist():
+        raise InputError(
+            f"the demonstrations do not move the outputs {', '.join(map(str, still))} and so give no limits for them: "
+            "give max_speed and max_jerk for all outputs"
+        )
     return velocity, jerk
 
 

@@ -21,6 +21,7 @@ from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task, terminal_reward
 from guiderail.diagrams.wiring import add_system
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
@@ -152,9 +153,18 @@ class InsertionTask(Task):
         return [HoldTest((0.0, 0.0, HOLD_DISTANCE), MAX_HOLD_MOTION)]
 
     def impedance(self) -> Impedance | None:
-        """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
+        """Return an impedance with a force below the force limit; None if the option `bounded_force` is false.
+
+        Raises:
+            InputError: If the subclass sets no positive force limit, `collision`.
+        """
         if not getattr(self.options, "bounded_force", True):
             return None
+        if not self.collision.above > 0.0:
+            raise InputError(
+                f"the force limit of {self.name} must be positive, not {brief(self.collision.above)}: let its "
+                'constructor set collision to Threshold("contact_force", limit)'
+            )
         return Impedance().with_max_force(self.collision.above)
 
     def privileged_terms(self) -> Sequence[ObservationTerm]:

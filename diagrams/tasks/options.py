@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, ValidationInfo, field_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, Pair, increases, satisfies
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
@@ -28,6 +28,7 @@ REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE
 OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
 REWARDS = ("sparse", "shaped", "aligned")
 
+KNOWN_OFFSET = 0.3 * MM  # largest fixture offset with fixture_offset=none [m]
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # [m], [rad]; larger values are probably in mm or degrees
 FORCE_LIMITS = (1.0, 60.0)  # smallest and largest force limit [N]
@@ -61,6 +62,15 @@ class FixtureOffsetOptions(Options):
     offset_range: OffsetRange | None = Field(
         None, description="smallest and largest offset of the fixture [m]; default: that of fixture_offset"
     )
+
+    @field_validator("offset_range")
+    @classmethod
+    def _is_none_within_its_range(cls, value: OffsetRange | None, info: ValidationInfo) -> OffsetRange | None:
+        if value is not None and value[1] > KNOWN_OFFSET and info.data.get("fixture_offset") == "none":
+            raise ValueError(
+                f"fixture_offset=none is an offset of at most {KNOWN_OFFSET:g} m: choose fixture_offset=per_episode"
+            )
+        return value
 
 
 class ReferenceOptions(Options):

@@ -77,11 +77,15 @@ def _clearance(environment: Environment, value: float) -> dict[str, Any]:
 
 def _offsets(environment: Environment, value: float) -> dict[str, Any]:
     from guiderail.diagrams.tasks.bnc_connector.options import OFFSET_RANGES
+    from guiderail.diagrams.tasks.options import KNOWN_OFFSET
 
     if "offset_range" not in environment:
         raise InputError("the task has no range of offsets")
     default = environment["offset_range"] or OFFSET_RANGES[environment["fixture_offset"]]
-    return {"offset_range": tuple(value * distance for distance in default)}
+    low, high = (value * distance for distance in default)
+    # "none" refuses larger offsets, which "per_episode" samples in the same way.
+    is_refused = environment["fixture_offset"] == "none" and high > KNOWN_OFFSET
+    return {"offset_range": (low, high)} | ({"fixture_offset": "per_episode"} if is_refused else {})
 
 
 def _period(environment: Environment, value: float) -> dict[str, Any]:

@@ -1,11 +1,16 @@
 """Guidance around a base policy: reference, constraints, and equality with plain guidance by default."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import _base_policy_key, make_env
+from guiderail.diagrams.guidance.base_policy import guard_limits
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.policy import BASE_POLICIES
+from guiderail.models.primitives import LinearConstraints
 
 KINDS = ("kgrl_base_policy", "residual_base_policy")
 
@@ -141,6 +146,15 @@ def test_demonstrations_pass_the_default_guard_unchanged():
         for guard in ("projection", "none")
     )
     np.testing.assert_allclose(guarded.commanded[15:], plain.commanded[15:], atol=1e-6)
+
+
+def test_outputs_that_demonstrations_do_not_move_need_limits():
+    means = np.pad(np.random.default_rng(0).normal(size=(9, 3)), ((0, 0), (0, 3)))
+    motion = MotionConstraints(LinearConstraints.none(6), max_speed=[0.3] * 3 + [1.0] * 3)
+    config = SimpleNamespace(num_outputs=6, motion=motion, control_period=0.02, reference=SimpleNamespace(means=means))
+    with pytest.raises(InputError, match=r"do not move the outputs 3, 4, 5 .* give max_speed and max_jerk"):
+        guard_limits(config, (40.0,))
+    assert (np.array(guard_limits(config, (40.0, 300.0))) > 0.0).all()
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.disturbances import Disturbances, disturbed
 from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.errors import InputError
 
 # Pushing down and sideways ends these by force if the impedance is not bounded.
@@ -98,6 +99,13 @@ def test_symmetries_leave_observed_limit_unchanged():
 def test_range_of_limits_is_refused_when_invalid(given):
     with pytest.raises(InputError, match="two forces from 1 to 60 N"):
         EnvConfig.resolve("GridClamp", {"force_limit_range": given})
+
+
+def test_task_without_a_force_limit_is_refused():
+    task = EnvConfig.resolve("BncConnector", {}).make_task()
+    task.collision = Threshold()
+    with pytest.raises(InputError, match="force limit of BncConnector must be positive, not 0"):
+        task.impedance()
 
 
 def test_station_raises_when_it_takes_no_impedance():

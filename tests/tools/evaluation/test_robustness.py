@@ -201,7 +201,9 @@ def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monk
     assert before not in kept
 
 
-def test_offsets_reach_twice_the_trained_ones():
+@pytest.mark.parametrize(("kind", "trained"), [("per_episode", 1.5e-3), ("none", 0.3e-3)])
+def test_offsets_reach_twice_the_trained_ones(kind, trained):
     (offsets,) = select_axes("offsets")
-    result, _ = points("BncConnector", {"fixture_offset": "per_episode"}, [offsets])
-    assert result[-1].environment["offset_range"] == (0.0, 2.0 * 1.5e-3)
+    result, _ = points("BncConnector", {"fixture_offset": kind}, [offsets])
+    assert result[-1].environment["offset_range"] == (0.0, 2.0 * trained)
+    assert result[-1].environment["fixture_offset"] == "per_episode"
