@@ -82,10 +82,11 @@ class FciDriver(PoseDriver):
         `recover` configures the robot.
 
         Raises:
-            InputError: If the robot refuses the configuration.
+            InputError: If the robot refuses the configuration, or has not been read.
         """
         if self._motion is not None:
             return
+        self._check_connected()
         self._impedance = impedance
         if self._is_lost:
             return
@@ -139,9 +140,10 @@ class FciDriver(PoseDriver):
         Raises:
             InputError: If the driver is not configured.
         """
-        impedance, state = self._impedance, self._read_state()
+        impedance = self._impedance
         if impedance is None:
             raise InputError("the driver fci is used before it is configured")
+        state = self._read_state()
         if state is None:
             return [Check("connection", f"the robot at {self.url} does not answer", passed=False)]
         mode = str(state.robot_mode).rpartition(".")[2]
@@ -226,8 +228,9 @@ class FciDriver(PoseDriver):
         """Clear the error of a reflex, or connect again after the connection was lost; the arm does not move.
 
         Raises:
-            InputError: If the error persists, or the robot does not answer.
+            InputError: If the error persists, or the robot does not answer or has not been read.
         """
+        self._check_connected()
         self._motion = None
         if self._robot is not None:
             with suppress(self._franky.Exception, RuntimeError):
@@ -240,6 +243,11 @@ class FciDriver(PoseDriver):
             is_recovered = self._clear_errors()
         if not is_recovered:
             raise InputError(f"the robot at {self.url} cannot recover: {self.error or 'the connection is lost'}")
+
+    def _check_connected(self) -> None:
+        """Raise an `InputError` before `read` has connected to the robot."""
+        if self._robot is None and not self._is_lost:
+            raise InputError("the driver fci is used before it has read a status")
 
     def _clear_errors(self) -> bool:
         """Clear the robot's errors; return False if they persist or the connection is lost."""

@@ -9,14 +9,20 @@ robot's clock has advanced by h [s]; during a motion the robot then waits for th
 from __future__ import annotations
 
 import json
+import logging
 import socket
 from typing import Any
 
 import numpy as np
 
 from guiderail.diagrams.hardware.clock import Clock
+from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.errors import brief
+
+logger = logging.getLogger(__name__)
 
 LOCKSTEP_PORT = 1339  # the robot's own ports are 1337 and 1338
+MAX_WAIT = 3600.0  # longest wait for an answer [s]; a socket refuses timeouts of centuries
 
 
 class FciLockstepClock(Clock):
@@ -31,10 +37,10 @@ class FciLockstepClock(Clock):
 
         Args:
             host: Address of the simulated robot.
-            timeout: Longest wait for an answer [s of wall clock time].
+            timeout: Longest wait for an answer [s of wall clock time], at most `MAX_WAIT`.
             period: Status period of the station [s].
         """
-        self._address, self._timeout, self._period = (host, LOCKSTEP_PORT), timeout, period
+        self._address, self._timeout, self._period = (host, LOCKSTEP_PORT), min(timeout, MAX_WAIT), period
         self._socket: socket.socket | None = None
         self._time, self._robot_time, self._has_timed_out = 0.0, np.inf, False
 
@@ -102,7 +108,10 @@ class LockstepServer:
         return self._client or self._listener
 
     def receive(self) -> dict[str, Any] | None:
-        """Return the next request, or None if there is none; accept a station that connects."""
+        """Return the next request, or None if there is none; accept a station that connects.
+
+        A station that sends a malformed request is disconnected.
+        """
         try:
             if self._client is None:
                 self._client, _ = self._listener.accept()
@@ -122,7 +131,12 @@ class LockstepServer:
         if not separator:
             return None
         self._buffer = rest
-        return dict(json.loads(line))
+        try:
+            return _parse_request(line)
+        except (TypeError, ValueError, RecursionError):
+            logger.warning("a station in lockstep is disconnected: %s is no request", brief(line))
+            self._disconnect()
+            return None
 
     def answer(self, time: float) -> None:
         """Answer a request with the robot's time [s]."""
@@ -141,3 +155,20 @@ class LockstepServer:
         """Close both sockets."""
         self._disconnect()
         self._listener.close()
+
+
+def _parse_request(line: bytes) -> dict[str, Any]:
+    """Return the request of a line.
+
+    Raises:
+        TypeError, ValueError or RecursionError: If it is malformed.
+    """
+    request = json.loads(line)
+    if not isinstance(request, dict):
+        raise TypeError
+    fixture, workpiece = request.get("parts", [[0.0, 0.0]] * 2)
+    for values, sizes in (([request.get("advance", 0.0)], (1,)), (fixture, (2, 3)), (workpiece, (2, 4))):
+        numbers = as_numbers(values, "a request")
+        if numbers.ndim != 1 or len(numbers) not in sizes or not is_finite(numbers):
+            raise ValueError
+    return request

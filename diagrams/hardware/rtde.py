@@ -102,9 +102,10 @@ class RtdeDriver(PoseDriver):
         Call it after `read` has returned a status. While poses are commanded, only the impedance is replaced.
 
         Raises:
-            InputError: If the robot cannot be connected or refuses a setting, or if its force sensor measures more than
-                `MAX_ZEROED_FORCE`.
+            InputError: If the robot cannot be connected, has not been read or refuses a setting, or if its force sensor
+                measures more than `MAX_ZEROED_FORCE`.
         """
+        self._check_connected()
         self._impedance, self._X_FlangeTool = impedance, impedance.X_FlangeTool
         if self._is_active:
             return
@@ -172,7 +173,14 @@ class RtdeDriver(PoseDriver):
         return ""
 
     def check_setup(self) -> list[Check]:
-        """Check state, program and kinematics of the robot, after `read` has returned a status."""
+        """Check state, program and kinematics of the robot; only the state if it has sent no status that is readable.
+
+        Raises:
+            InputError: If the robot has not been read.
+        """
+        self._check_connected()
+        if self._status is None:
+            return [Check("state", self.error or f"the robot at {self.url} sends no readable status", passed=False)]
         distance = self._kinematic_distance()
         speed, acceleration, jerk = self.motion_limits.linear
         return [
@@ -243,11 +251,12 @@ class RtdeDriver(PoseDriver):
         """End a protective stop, and start the controller's program again; the arm does not move.
 
         Raises:
-            InputError: If the connection is lost, or the robot still accepts no commands.
+            InputError: If the connection is lost, or the robot has not been read or still accepts no commands.
         """
         self._is_active = False
         if self._is_lost:
             raise InputError(f"the connection to the robot at {self.url} is lost: restart guiderail")
+        self._check_connected()
         self._finish_stop()
         try:
             self._end_protective_stop()
@@ -281,6 +290,11 @@ class RtdeDriver(PoseDriver):
         if self._stopping is not None:
             self._stopping.join()
             self._stopping = None
+
+    def _check_connected(self) -> None:
+        """Raise an `InputError` before `read` has connected to the robot."""
+        if self._receiver is None:
+            raise InputError("the driver rtde is used before it has read a status")
 
     def _check(self, accepted: bool, what: str) -> None:
         if not accepted:

@@ -369,6 +369,15 @@ def test_pose_before_configuration_is_refused(robot):
         driver.write_pose(RigidTransform(), 0.0)
 
 
+def test_use_before_the_first_status_is_refused(robot, model):
+    driver = FciDriver("192.0.2.1", client=client(robot))
+    with pytest.raises(InputError, match="before it is configured"):
+        driver.check_setup()
+    for use in (lambda: driver.configure(make_robot_impedance(model, IMPEDANCE)), driver.recover):
+        with pytest.raises(InputError, match="the driver fci is used before it has read a status"):
+            use()
+
+
 def test_torques_are_refused(driver):
     with pytest.raises(InputError, match="poses, not torques"):
         driver.write(np.zeros(7), 0.0)

@@ -2,7 +2,7 @@
 
 import socket
 import threading
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 from pydrake.systems.analysis import Simulator
@@ -66,6 +66,19 @@ def test_offsets_of_parts_arrive_at_the_robot():
     with robot() as requests:
         FciLockstepClock(HOST, 5.0, PERIOD).move_parts([[1e-3, 2e-3], [0.0, 0.0]])
     assert requests == [{"parts": [[1e-3, 2e-3], [0.0, 0.0]]}]
+
+
+@pytest.mark.parametrize(
+    "line", [b"{", b"[1]", b"\xff", 5000 * b"[", b'{"advance": "1"}', b'{"advance": NaN}', b'{"parts": [[0.1, 0.0]]}']
+)
+def test_station_with_a_malformed_request_is_disconnected(line, caplog):
+    with robot() as requests:
+        with socket.create_connection((HOST, fci_lockstep.LOCKSTEP_PORT), 5.0) as station:
+            station.sendall(line + b"\n")
+            with suppress(ConnectionResetError):
+                assert station.recv(1) == b""
+        FciLockstepClock(HOST, 1e10, PERIOD).move_parts([[1e-3, 2e-3], [0.0, 0.0]])
+    assert len(requests) == len(caplog.records) == 1
 
 
 def test_time_base_advances_without_a_robot_and_follows_a_new_one():

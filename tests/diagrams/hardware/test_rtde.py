@@ -219,6 +219,21 @@ def test_pose_before_configuration_is_refused():
         RtdeDriver("192.0.2.1", client=SimpleNamespace()).write_pose(RigidTransform(), 0.0)
 
 
+def test_use_before_the_first_status_is_refused(impedance):
+    driver = RtdeDriver("192.0.2.1", client=SimpleNamespace())
+    for use in (lambda: driver.configure(impedance), driver.check_setup, driver.recover):
+        with pytest.raises(InputError, match="the driver rtde is used before it has read a status"):
+            use()
+
+
+def test_check_names_a_stop_from_before_the_first_status(robot, monkeypatch):
+    driver = RtdeDriver(robot.host, client=DirectClient(robot))
+    monkeypatch.setattr(RtdeDriver, "error", "protective stop")
+    assert not driver.read().is_readable
+    (check,) = driver.check_setup()
+    assert (check.description, check.passed) == ("protective stop", False)
+
+
 def test_station_presses_with_the_bounded_force_and_stops(robot):
     station = HardwareStation(WORKCELL, RtdeDriver(robot.host, client=DirectClient(robot)), IMPEDANCE, robot="ur5e")
     simulator = Simulator(station)
