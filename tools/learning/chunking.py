@@ -41,8 +41,11 @@ class ChunkLearner(BcLearner):
             InputError: If the environment is not built from a task's diagram, or `pipelined` or `num_envs` is set.
         """
         super().__init__(config, env, **arguments)
-        if config.pipelined or config.num_envs or not hasattr(env.unwrapped, "trace"):
-            raise InputError("chunk needs a task's environment in this process: leave pipelined and num_envs out")
+        for name in ("pipelined", "num_envs"):
+            if getattr(config, name):
+                raise InputError(f"{config.algorithm} needs the environment in this process: leave {name} out")
+        if not hasattr(env.unwrapped, "trace"):
+            raise InputError(f"{config.algorithm} needs an environment that is built from a task's diagram")
         self._env = cast(Any, env.unwrapped)
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)

@@ -1,5 +1,6 @@
 """Chunk cloning: a base policy from demonstrations, its export as one network, and runs that are resumed."""
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -8,7 +9,8 @@ from guiderail.models.policy import chunk_samples, find_base_policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.learning.chunking import ChunkLearner
-from guiderail.tools.learning.config import ChunkConfig
+from guiderail.tools.learning.config import ChunkConfig, DistillationConfig
+from guiderail.tools.learning.distillation import DistillationLearner
 from guiderail.tools.learning.train import train
 
 SETTINGS = {"demonstration_episodes": 4, "gradient_steps": 400, "members": 3, "chunk_steps": 4, "net_arch": (16,)}
@@ -60,7 +62,21 @@ def test_state_before_the_first_demonstration_is_restored():
     assert values["episodes"] == 0
 
 
-def test_learner_is_refused_when_the_commands_are_in_another_process():
+@pytest.mark.parametrize(
+    ("learner", "config", "words"),
+    [
+        (ChunkLearner, ChunkConfig(pipelined=True), "^chunk needs .* in this process: leave pipelined out$"),
+        (ChunkLearner, ChunkConfig(num_envs=2), "^chunk needs .* in this process: leave num_envs out$"),
+        (DistillationLearner, DistillationConfig(num_envs=2), "^distillation needs .*: leave num_envs out$"),
+    ],
+)
+def test_learner_is_refused_when_the_commands_are_in_another_process(learner, config, words):
     env = make_environment("NarrowPassage", {"guidance": "kgrl"})
-    with pytest.raises(InputError, match="pipelined"):
-        ChunkLearner(ChunkConfig(pipelined=True), env, action_repeat=1, seed=0, max_transitions=10)
+    with pytest.raises(InputError, match=words):
+        learner(config, env, action_repeat=1, seed=0, max_transitions=10)
+
+
+def test_learner_is_refused_when_the_environment_is_not_of_a_diagram():
+    env = gymnasium.make("CartPole-v1")
+    with pytest.raises(InputError, match="chunk needs an environment that is built"):
+        ChunkLearner(ChunkConfig(), env, action_repeat=1, seed=0, max_transitions=10)
