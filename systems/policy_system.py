@@ -4,9 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, State
+from pydrake.systems.framework import Context, LeafSystem, State, System
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
@@ -47,7 +47,7 @@ class PolicySystem(LeafSystem):
         period: Action period [s], positive, an integer multiple of the control period.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range, or `policy` is not a function.
         PolicyError: At an update, if the policy does not return A finite numbers.
     """
 
@@ -60,6 +60,8 @@ class PolicySystem(LeafSystem):
     ):
         super().__init__()
         check_period(period)
+        if not callable(policy):
+            raise InputError(f"a policy is a function from an observation to an action, not {brief(policy)}")
         if action_size < 1:
             raise InputError(f"a policy's action has at least one number, not {action_size}")
         self._policy = policy
@@ -94,3 +96,22 @@ class PolicySystem(LeafSystem):
         if self._is_image:
             return observation.data[:, :, :3].copy()
         return observation.astype(np.float32)
+
+
+def check_policy_ports(policy: System, observation_size: int, action_size: int, task_name: str) -> None:
+    """Check that the ports of a policy fit the observation (N,) and the action (A,) of a task.
+
+    Raises:
+        InputError: If the input `observation` or the output `action` is missing or has another size.
+    """
+    if not (policy.HasInputPort("observation") and policy.HasOutputPort("action")):
+        raise InputError(
+            f"a policy of {task_name} that is a system has an input 'observation' and an output 'action', unlike "
+            f"{type(policy).__name__}: rename or export its ports"
+        )
+    observation, action = policy.GetInputPort("observation"), policy.GetOutputPort("action")
+    if observation.size() != observation_size or action.size() != action_size:
+        raise InputError(
+            f"a policy of {task_name} takes {observation_size} numbers and returns {action_size}, "
+            f"this one {observation.size()} and {action.size()}: it was trained with other options"
+        )

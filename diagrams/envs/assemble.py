@@ -197,7 +197,7 @@ class Loop:
 
     Raises:
         InputError: If a signal that the task names does not exist, a port has the wrong size, or the station or the
-            guidance does not support the task's observation or the template's wrench limits.
+            guidance does not support the task's observation, its signal `max_wrench` or the template's wrench limits.
 
     Attributes:
         builder: Builder of the root diagram.
@@ -239,6 +239,11 @@ class Loop:
             bound = limit.get_phase_max_wrench_output_port()
             self.signals.add({"max_wrench": bound})
         if bound is not None:
+            if not self.station.HasInputPort("max_wrench"):
+                raise InputError(
+                    f"station={task.config.station!r} has no input for the signal 'max_wrench' of {task.name}: leave "
+                    "the signal out, or choose a station with a bounded impedance"
+                )
             self.builder.Connect(bound, self.station.GetInputPort("max_wrench"))
 
     def _add_reference(self, task: Task) -> None:
@@ -401,24 +406,20 @@ def build_skill_diagram(
         render_mode: None, "human" (browser view) or "rgb_array" (exports the image of the task's camera).
 
     Raises:
-        InputError: As `build_task_diagram`, or if the sizes of the policy's ports do not match.
+        InputError: As `build_task_diagram`, or if the policy is neither a function nor a system with these ports, or
+            the sizes of the ports do not match.
     """
     loop = Loop(task, station, guidance)
     builder, action = loop.builder, guidance.GetInputPort("action")
+    from guiderail.systems.policy_system import PolicySystem, check_policy_ports
+
     if not isinstance(policy, System):
         port = loop.observation
         model = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
-        from guiderail.systems.policy_system import PolicySystem
-
         policy = PolicySystem(policy, model, action.size(), task.config.action_repeat * station.control_period)
-    observation, acts = policy.GetInputPort("observation"), policy.GetOutputPort("action")
-    if observation.size() != loop.observation.size() or acts.size() != action.size():
-        raise InputError(
-            f"a policy of {task.name} takes {loop.observation.size()} numbers and returns {action.size()}, "
-            f"this one {observation.size()} and {acts.size()}: it was trained with other options"
-        )
+    check_policy_ports(policy, loop.observation.size(), action.size(), task.name)
     add_system(builder, "policy", policy, observation=loop.observation)
-    builder.Connect(acts, action)
+    builder.Connect(policy.GetOutputPort("action"), action)
     for name in ("pose", "wrench", "contact_force"):
         builder.ExportOutput(station.GetOutputPort(name), name)
     for name in OUTPUTS:

@@ -207,7 +207,7 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
 
 
 def _check_given_options(task: type[Task], stations: list[str], options: Mapping[str, Any], known: set[str]) -> None:
-    unknown = sorted(set(options) - known)
+    unknown = sorted(set(options) - known, key=str)
     if not unknown:
         return
     elsewhere = [name for name in stations if unknown[0] in (STATIONS.get(name).options or Options).model_fields]

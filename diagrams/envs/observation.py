@@ -14,6 +14,7 @@ from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
 from guiderail.diagrams.wiring import add_system
+from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 
 CLOCKS = ("time", "phase")
@@ -175,9 +176,9 @@ def _add_clock(
 def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the matrix (n, size) that selects a term's entries, and their centers (n,) and scales (n,)."""
     try:
-        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
-        if selection.ndim != 2:
+        if term.entries is not None and not all(is_whole(entry, -size) for entry in term.entries):
             raise ValueError
+        selection = np.eye(size) if term.entries is None else np.eye(size)[list(term.entries)]
     except (IndexError, TypeError, ValueError):
         raise InputError(
             f"the entries of the observed signal {term.signal!r}{of_task} are whole numbers from {-size} to "

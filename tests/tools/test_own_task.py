@@ -177,6 +177,7 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
         ),
         ((ObservationTerm("pose", entries=1),), "the entries .* are whole numbers from -2 to 1, not 1"),
         ((ObservationTerm("pose", entries=((0, 1),)),), "the entries .* are whole numbers from -2 to 1, not"),
+        ((ObservationTerm("pose", entries=(True, False)),), "the entries .* are whole numbers from -2 to 1, not"),
     ],
 )
 def test_invalid_observation_term_is_refused(observed, says):

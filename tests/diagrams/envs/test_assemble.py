@@ -4,13 +4,17 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail import make_env
-from guiderail.diagrams.envs.assemble import build_prior_knowledge
+from guiderail.diagrams.envs.assemble import Loop, build_prior_knowledge
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE
 from guiderail.models.primitives import ReferenceTrajectory
 
 PERIOD = 0.02
@@ -54,6 +58,18 @@ def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
         with pytest.raises(InputError, match="angles jump by a full turn at 180°"):
             make_prior(turn, station)
         assert make_prior(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
+
+
+def test_signal_that_the_station_has_no_input_for_is_refused():
+    class Bounded(type(EnvConfig.resolve("NarrowPassage").make_task())):
+        def signals(self, builder, station):
+            bound = builder.AddSystem(ConstantVectorSource(np.ones(MAX_WRENCH_SIZE)))
+            return {**super().signals(builder, station), "max_wrench": bound.get_output_port()}
+
+    task = Bounded(EnvConfig.resolve("NarrowPassage"))
+    station = make_station(task)
+    with pytest.raises(InputError, match="station='plane' has no input for the signal 'max_wrench' of NarrowPassage"):
+        Loop(task, station, make_guidance(task, station))
 
 
 def test_making_an_environment_logs_nothing_of_drake(forks, tmp_path):

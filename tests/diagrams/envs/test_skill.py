@@ -75,6 +75,18 @@ def test_a_system_of_another_size_is_refused():
 
 
 @pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (PassThrough(3), "has an input 'observation' and an output 'action', unlike PassThrough"),
+        (3, "a policy is a function from an observation to an action, not 3"),
+    ],
+)
+def test_a_policy_of_another_kind_is_refused(given, message):
+    with pytest.raises(InputError, match=message):
+        make_skill("NarrowPassage", given, guidance="kgrl")
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"render_mode": "ascii"}, "no render mode 'ascii'"),

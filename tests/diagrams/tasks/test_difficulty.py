@@ -82,6 +82,7 @@ WRONG = [
     ("BncConnector", {"start_offset_max": 0.01}, "start_offset_max must be at most"),
     ("BncConnector", {"demonstrations": "none"}, "demonstrations cannot be 'none'"),
     ("BncConnector", {"difficulty": "harder"}, "did you mean hard"),
+    ("NarrowPassage", {1: 2, "a": 3}, "NarrowPassage has no option 1 here"),
     ("GridClamp", {"force_limit": 100.0}, "force_limit must be at most 60"),
     ("GridClamp", {"start_height": (0.03, 0.02)}, "the lower one first"),
     ("GridClamp", {"start_height": (0.0, 0.02)}, "two heights from 0.013"),
