@@ -206,14 +206,15 @@ def disturbed(
         disturbances: Disturbances of the station; for a robot only `sensing` and `tare`, of which the tare applies.
         is_simulated: False for a robot.
         name: Name of the station, for messages.
-        impedance: Impedance of the task; the station's own by default, or `Impedance()` with a stiffness factor.
+        impedance: Impedance of the task; the builder's own by default, or `Impedance()` if it declares none and there
+            is a stiffness factor.
 
     Raises:
         InputError: If the station does not support a disturbance, has no impedance to set, or is a robot and there are
             other disturbances than `sensing` and `tare`.
     """
-    has_impedance = "impedance" in inspect.signature(build).parameters
-    if impedance is not None and not has_impedance:
+    own_impedance = inspect.signature(build).parameters.get("impedance")
+    if impedance is not None and own_impedance is None:
         raise InputError(
             f"station={name!r} takes no impedance, so its force cannot be bounded: give its builder the parameter "
             "impedance, or choose bounded_force=False"
@@ -228,9 +229,10 @@ def disturbed(
     if not is_simulated:
         raise InputError(f"station={name!r} is a real robot, which has disturbances of its own: leave them out")
     if disturbances.stiffness_factor != 1.0:
-        if not has_impedance:
+        if own_impedance is None:
             raise InputError(f"station={name!r} has no impedance: leave stiffness_factor out")
-        nominal = impedance or Impedance()
+        default = own_impedance.default
+        nominal = impedance or (default if isinstance(default, Impedance) else Impedance())
         stiffness = tuple(disturbances.stiffness_factor * value for value in nominal.stiffness)
         arguments["impedance"] = replace(nominal, stiffness=stiffness)
     errors = disturbances.errors
@@ -249,10 +251,11 @@ def _disturbed_period(d: Disturbances, station: Station) -> float:
     if d.clock_factor == 1.0:
         return station.control_period
     period = d.clock_factor * station.control_period
+    step = station.plant.time_step() or PLANT_PERIOD  # the plant is continuous if another engine simulates
     try:
-        return whole_multiple(period, PLANT_PERIOD)
+        return whole_multiple(period, step)
     except InputError:
         raise InputError(
             f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
-            f"plant's {PLANT_PERIOD:g} s"
+            f"plant's {step:g} s"
         ) from None

@@ -1,12 +1,14 @@
 """Effects of the disturbances, all of which are off by default."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from guiderail import InputError, make_env
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
+from guiderail.diagrams.stations.disturbances import Disturbances, DisturbedStation, disturbed
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD, Impedance
 from guiderail.models.common.transforms import MM
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -82,6 +84,27 @@ def test_control_period_is_that_of_the_disturbed_clock():
     env, _, _ = descended(1, clock_factor=1.5)
     assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
     assert env.task.control_period != CONTROL_PERIOD
+
+
+def test_disturbed_clock_is_a_multiple_of_the_plant_s_own_step():
+    fine = {"impedance_control": "cartesian", "bounded_force": False}  # steps of a quarter of a control period
+    env = make_env("GridClamp", clock_factor=1.25, **fine)
+    assert env.task.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
+    for factor, options in ((1.3, fine), (1.5, {"time_step": CONTROL_PERIOD})):
+        with pytest.raises(InputError, match="whole number of the plant's"):
+            make_env("GridClamp", clock_factor=factor, **options)
+
+
+def test_stiffness_factor_scales_the_builder_s_own_impedance():
+    built, own = [], Impedance(stiffness=(800.0,) * 3 + (20.0,) * 3, damping_ratio=0.7)
+
+    def build(impedance=own):
+        built.append(impedance)
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        disturbed(build, Disturbances(stiffness_factor=0.5), True, "bench")
+    assert built == [replace(own, stiffness=(400.0,) * 3 + (10.0,) * 3)]
 
 
 def test_lost_and_late_commands_delay_the_tool(plain):
