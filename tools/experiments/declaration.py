@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 import string
@@ -15,7 +16,7 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
-    ValidationInfo,
+    ValidatorFunctionWrapHandler,
     field_validator,
     model_validator,
 )
@@ -24,7 +25,6 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import task_named
-from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 
 Integer = Annotated[int, Field(strict=True)]  # without `strict`, YAML's `true` would be 1
@@ -66,6 +66,7 @@ def _are_distinct(seeds: tuple[int, ...]) -> tuple[int, ...]:
 
 
 Seed = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
+SweepValue = Annotated[float, Field(allow_inf_nan=False)]
 Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_are_distinct)]
 
 
@@ -112,7 +113,7 @@ class EvalSet(_Strict):
     every: Integer = Field(default=4, ge=1)  # number of consecutive episodes with the same sample
     options: dict[str, Any] = {}  # options of each reset
     episodes: Integer = Field(default=100, ge=1)  # number of episodes
-    first_seed: Integer = Field(default=HELD_OUT_SEED, ge=0)  # seed of the first episode; episode i has first_seed + i
+    first_seed: Seed = HELD_OUT_SEED  # seed of the first episode; episode i has first_seed + i
     file: EvaluatedFile = "{name}-{after_episodes}-{digest}.csv"  # file of the episodes in the run's folder
 
     @field_validator("sampled")
@@ -128,9 +129,18 @@ class Sweep(_Strict):
     """Quantity of the environment that makes the task harder; results of the policies are plotted over its values."""
 
     quantity: str  # name and unit, the label of the axis
-    at: dict[float, dict[str, Any]] = Field(min_length=1)  # options of the environment by value, the easiest first
+    at: dict[SweepValue, dict[str, Any]] = Field(min_length=1)  # options of the environment by value, easiest first
     options: dict[str, Any] = {}  # options of each reset
     episodes: Integer = Field(default=40, ge=1)  # number of episodes at each value
+
+    @field_validator("at", mode="wrap")
+    @classmethod
+    def _are_distinct(cls, given: Any, validate: ValidatorFunctionWrapHandler) -> dict[float, dict[str, Any]]:
+        values: dict[float, dict[str, Any]] = validate(given)
+        if len(values) < len(given):
+            equal = next(keys for keys in itertools.combinations(given, 2) if float(keys[0]) == float(keys[1]))
+            raise ValueError(f"{equal[0]!r} and {equal[1]!r} are one value of the sweep: give it once")
+        return values
 
     def eval_set(self, value: float) -> EvalSet:
         """Return the evaluation set of one value."""
@@ -166,15 +176,6 @@ class Study(_Strict):
     ratios: tuple[Ratio, ...] = ()  # ratios reported next to the table
     folder: RunName = "{method}-{seed}"  # folder of a run
     imports: tuple[str, ...] = ()  # modules, files (.py) or task folders that register the task, the learner, …
-
-    @field_validator("statistics")
-    @classmethod
-    def _check_statistics(cls, names: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        known = statistics_of(info.data.get("task", ""))
-        for name in names:
-            if name not in known:
-                raise ValueError(f"there is no statistic {name!r}: {did_you_mean(name, known)}")
-        return names
 
     @property
     def eval_sets(self) -> tuple[EvalSet, ...]:

@@ -43,6 +43,7 @@ from guiderail.tools.learning.train import configure, with_defaults
 
 BEST_CONSTANT = "best_constant"
 BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
+RUN_FILES = ("config.yaml", "episodes.csv", "policy.json", "policy.safetensors", "checkpoint", "steps", "logs")
 SELECTION_EPISODES = 10  # training episodes of each constant action, to select the best action
 
 # Statistics of the training episodes in the table; their columns begin with `training_`.
@@ -132,12 +133,21 @@ def check_job(job: Job) -> None:
             sampled = {name: ends[end] for name, ends in eval_set.sampled.items()}
             configure(job.study.task, environment | sampled, episodes=1)
         check_reset(job.study.task, eval_set.options)
+    contents: dict[Path, str] = {}
     for episodes, eval_set in itertools.product(job.after_episodes, job.study.eval_sets):
-        _refuse_other_rows(job, episodes, eval_set)
+        file, content = _evaluated_file(job, episodes, eval_set)
+        if (part := file.relative_to(job.folder.path).parts[0]) in RUN_FILES:
+            raise InputError(f"the evaluation set {eval_set.name!r} has a file of the run, {part}: name another one")
+        if contents.setdefault(file, content) != content:
+            raise InputError(
+                f"the evaluation set {eval_set.name!r} has the file {file.name} of other evaluated episodes: write "
+                "{name}, {after_episodes} and {digest} into the file's name"
+            )
+        _refuse_other_rows(file, content, eval_set)
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for episodes in job.after_episodes:
-            if not all(_evaluated_file(job, episodes, eval_set).exists() for eval_set in job.study.eval_sets):
+            if not all(_evaluated_file(job, episodes, eval_set)[0].exists() for eval_set in job.study.eval_sets):
                 _refuse_lost_policy(job, episodes)
     elif job.learns:
         job.folder.refuse_existing()
@@ -146,7 +156,7 @@ def check_job(job: Job) -> None:
 def is_done(job: Job) -> bool:
     """Return True if a job is trained and evaluated, so that its rows only have to be read."""
     pairs = itertools.product(job.after_episodes, job.study.eval_sets)
-    is_evaluated = all(_evaluated_file(job, *pair).exists() for pair in pairs)
+    is_evaluated = all(_evaluated_file(job, *pair)[0].exists() for pair in pairs)
     return is_evaluated and not any(_needs_training(job, episodes) for episodes in job.after_episodes)
 
 
@@ -235,23 +245,24 @@ def digest(job: Job, eval_set: EvalSet | None = None, episodes: int = 0) -> str:
 
 def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
     """Return the rows of held-out episodes from their file, or evaluate and write them."""
-    file = _evaluated_file(job, episodes, eval_set)
-    _refuse_other_rows(job, episodes, eval_set)
+    file, content = _evaluated_file(job, episodes, eval_set)
+    _refuse_other_rows(file, content, eval_set)
 
     def evaluate() -> pd.DataFrame:
         rows = _evaluate(job, episodes, eval_set)
         if "{digest}" not in eval_set.file:
-            write_atomically(_digest_file(file), digest(job, eval_set, episodes).encode())
+            write_atomically(_digest_file(file), content.encode())
         return rows
 
     return load_or_compute(file, evaluate)
 
 
-def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> Path:
-    """Return the file of the evaluated episodes of a policy after a number of training episodes."""
+def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> tuple[Path, str]:
+    """Return the file of the evaluated episodes of a policy after a number of training episodes, and their digest."""
     name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # one path component, inside the run's folder
     values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
-    return job.folder.path / eval_set.file.format(**values, digest=digest(job, eval_set, episodes))
+    content = digest(job, eval_set, episodes)
+    return job.folder.path / eval_set.file.format(**values, digest=content), content
 
 
 def _digest_file(file: Path) -> Path:
@@ -259,11 +270,10 @@ def _digest_file(file: Path) -> Path:
     return file.with_name(f".{file.name}.digest")
 
 
-def _refuse_other_rows(job: Job, episodes: int, eval_set: EvalSet) -> None:
-    """Raise an InputError if the file of evaluated episodes belongs to another study."""
-    file = _evaluated_file(job, episodes, eval_set)
+def _refuse_other_rows(file: Path, content: str, eval_set: EvalSet) -> None:
+    """Raise an InputError if a file of evaluated episodes with the digest `content` belongs to another study."""
     stored = _digest_file(file)
-    if "{digest}" not in eval_set.file and stored.exists() and stored.read_text() != digest(job, eval_set, episodes):
+    if "{digest}" not in eval_set.file and stored.exists() and stored.read_text() != content:
         raise InputError(
             f"{file} holds episodes of another study, of other settings or after other training: name another folder "
             "with --out, or write {after_episodes} and {digest} into the file's name"

@@ -18,7 +18,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.evaluation.metrics import wilson_of_each
+from guiderail.tools.evaluation.metrics import statistics_of, wilson_of_each
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, is_done, run_job
@@ -60,7 +60,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataF
     jobs = [
         Job(study, name, seed, out) for name, method in study.methods.items() for seed in method.seeds or study.seeds
     ]
-    _check_ratios(study)
+    _check_columns(study)
     for job in jobs:
         check_job(job)
     _refuse_shared_folders(jobs)
@@ -142,24 +142,36 @@ def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
 
 
 def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
-    """Return the ratio of a column between two methods, of each row and of the sums, as text by label.
+    """Return the ratio of a column between two methods, of each seed and of the sums, as text by label.
 
-    With several evaluation sets or numbers of training episodes, a seed has several rows. The result is empty if the
-    rows of the two methods do not have the same seeds in the same order.
+    With several evaluation sets or numbers of training episodes, a seed has several rows: each of them has labels of
+    its own, which name the first method's. The result is empty if the rows of the two methods do not have the same
+    seeds in the same order.
     """
     of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
     numerator, denominator = (one[wanted.of].to_numpy(float) for one in (of, against))
     label = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a fraction of {wanted.against}'s"
-    return {
-        f"{label}, each seed": ", ".join(f"{value:.2f}" for value in numerator / denominator),
-        f"{label}, all seeds together": f"{numerator.sum() / denominator.sum():.2f}",
-    }
+    texts, place = {}, of.groupby("seed").cumcount().to_numpy()
+    for k in range(place.max() + 1):
+        above, below, where = numerator[place == k], denominator[place == k], ""
+        if place.max() > 0:
+            first = of[place == k].iloc[0]
+            where = f" after {first['after_episodes']} episodes" if first["after_episodes"] else ""
+            if not wanted.of.startswith("training_"):  # training is the same for all evaluation sets
+                where += f", {first['eval_set']}"
+        texts[f"{label}{where}, each seed"] = ", ".join(f"{value:.2f}" for value in above / below)
+        texts[f"{label}{where}, all seeds together"] = f"{above.sum() / below.sum():.2f}"
+    return texts
 
 
-def _check_ratios(study: Study) -> None:
-    """Raise an InputError if a ratio is of a column that the table does not have."""
+def _check_columns(study: Study) -> None:
+    """Raise an InputError if a statistic is unknown, or a ratio is of a column that the table does not have."""
+    statistics = statistics_of(study.task)
+    for name in study.statistics:
+        if name not in statistics:
+            raise InputError(f"there is no statistic {name!r}: {did_you_mean(name, statistics)}")
     known = {*EVALUATED, *(f"training_{name}" for name in (*TRAINING, *study.statistics))}
     for one in study.ratios:
         if one.of not in known:

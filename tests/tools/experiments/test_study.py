@@ -277,6 +277,45 @@ def test_ratio_is_per_seed_and_of_sums():
     assert each(rows[:2].astype(object), "after") == "3.0, never"
 
 
+def test_ratio_lists_each_seed_once_with_several_evaluation_sets():
+    rows = pd.DataFrame(
+        [
+            {
+                "method": method,
+                "seed": seed,
+                "after_episodes": 4,
+                "eval_set": name,
+                "force": force,
+                "training_force": 1.0,
+            }
+            for method, scale in (("a", 1.0), ("b", 2.0))
+            for seed in (5, 6)
+            for name, force in (("near", scale), ("far", scale**2))
+        ]
+    )
+    label = "force of a as a fraction of b's after 4 episodes"
+    expected = {f"{label}, {name}, each seed": f"{r}, {r}" for name, r in (("near", "0.50"), ("far", "0.25"))}
+    actual = ratio(rows, Ratio(of="force", method="a", against="b"))
+    assert {name: text for name, text in actual.items() if name.endswith("each seed")} == expected
+    training = ratio(rows, Ratio(of="training_force", method="a", against="b"))
+    assert training[f"training {label}, each seed"] == "1.00, 1.00"
+    assert len(training) == 2
+
+
+def test_statistics_of_an_imported_task_are_known(tmp_path):
+    (tmp_path / "shiny.py").write_text(
+        "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n"
+        "from guiderail.diagrams.tasks.registry import register_task\n"
+        "from guiderail.tools.evaluation.metrics import Metric\n\n\n"
+        "@register_task('shiny/Passage')\n"
+        "class Shiny(NarrowPassage):\n"
+        "    statistics = (Metric('shine', '', 'shine', len),)\n"
+    )
+    changed = {"task": "shiny/Passage", "imports": [str(tmp_path / "shiny.py")], "statistics": ["shine"]}
+    one = study(**changed, methods={"nothing": {"policy": "zero"}}, learner={}, eval_set=[])
+    assert "training_shine" in run(one, tmp_path / "out")
+
+
 WRONG = [
     ({"methods": {}}, "methods"),
     ({"seeds": []}, "seeds"),
@@ -326,6 +365,18 @@ WRONG = [
         {"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]},
         "the placeholders are {name}, {after_episodes}, {episodes}, {digest}",
     ),
+    ({"eval_set": [{"file": "./episodes.csv"}]}, "has a file of the run, episodes.csv"),
+    ({"eval_set": [{"file": "held_out.csv"}]}, "write {name}, {after_episodes} and {digest} into the file's name"),
+    (
+        {
+            "after_episodes": [2],
+            "eval_set": [{"name": name, "episodes": k, "file": "a.csv"} for k, name in [(1, "a"), (2, "b")]],
+        },
+        "the evaluation set 'b' has the file a.csv of other evaluated episodes",
+    ),
+    ({"eval_set": [{"first_seed": 2**31}]}, "less than 2147483648"),
+    ({"sweeps": [{"quantity": "wall", "at": {"nan": {}}}]}, "finite number"),
+    ({"sweeps": [{"quantity": "wall", "at": {"1": {}, "1.0": {}}}]}, "'1' and '1.0' are one value of the sweep"),
     ({"statistics": ["sucess_rate"]}, "did you mean success_rate"),
     ({"eval_set": [{"episodes": 2}, {"episodes": 3}]}, "called 'held out'"),
     ({"ratios": [{"of": "mean_force", "method": "learnt", "against": "learner"}]}, "did you mean learner"),
