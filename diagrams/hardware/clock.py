@@ -8,13 +8,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
+from numbers import Real
 from typing import TYPE_CHECKING
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.driver import Driver
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 
 if TYPE_CHECKING:
     from guiderail.diagrams.hardware.station import HardwareStation
@@ -55,10 +56,10 @@ def check_rate(rate: float) -> None:
     """Check the rate of the robot's clock relative to the wall clock.
 
     Raises:
-        InputError: If `rate` is not positive, or above 1.
+        InputError: If `rate` is not a number, not positive, or above 1.
     """
-    if not 0.0 < rate <= 1.0:
-        raise InputError(f"the rate of a simulated robot's clock is positive and at most 1, not {rate:g}")
+    if not isinstance(rate, Real) or not 0.0 < rate <= 1.0:
+        raise InputError(f"the rate of a simulated robot's clock is positive and at most 1, not {brief(rate)}")
 
 
 class IntervalHistogram:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -9,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +20,7 @@ from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
 from guiderail.diagrams.hardware.station import HardwareStation
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.tools.hardware.scenario import load_scenario
 
@@ -53,6 +55,18 @@ def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
         process.stdin.close()
 
 
+def check_simulation(driver: str, scenario: Path | None, joint_friction: float | None) -> None:
+    """Check the options of a simulated robot.
+
+    Raises:
+        InputError: If the joint friction is negative or not a finite number, or the driver fci has a scenario.
+    """
+    if joint_friction is not None and not (isinstance(joint_friction, Real) and 0.0 <= joint_friction < math.inf):
+        raise InputError(f"joint_friction must be at least 0 and finite, not {brief(joint_friction)}")
+    if driver == FCI and scenario is not None:
+        raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
+
+
 def exit_with_parent() -> None:
     """Exit this process when its standard input is closed."""
 
@@ -70,7 +84,7 @@ class RobotConnection:
 
     Raises:
         InputError: If the options contradict each other, the driver is unknown or has no simulated robot, or the rate
-            is out of range.
+            or the joint friction is out of range.
     """
 
     robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has a bus of its own
@@ -113,6 +127,7 @@ class RobotConnection:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and (driver := self.driver or self.robot) not in SIMULATED:
             raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}, not {driver}")
+        check_simulation(self.driver if self.sim else "", self.scenario, self.joint_friction)
         if self.sim and self.robot_url:
             raise InputError(
                 "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "

@@ -61,6 +61,26 @@ class Scenario:
         return self.station == SIMULATION
 
 
+# Required kinds of YAML nodes, for which Drake's reader has no messages of its own, with their names.
+_KINDS = {
+    "model_drivers": (yaml.MappingNode, "a mapping"),
+    "lcm_buses": (yaml.MappingNode, "a mapping"),
+    "directives": (yaml.SequenceNode, "a list"),
+}
+
+
+def _check_kinds(text: str) -> None:
+    """Raise a ValueError if the root of a document, or one of its collections, is of another kind."""
+    root = yaml.compose(text, Loader=yaml.SafeLoader)
+    if not isinstance(root, yaml.MappingNode):
+        raise ValueError("it must be a mapping with model_drivers")
+    for key, node in root.value:
+        kind, name = _KINDS.get(key.value, (yaml.Node, ""))
+        if not isinstance(node, kind):
+            given = brief(node.value) if isinstance(node, yaml.ScalarNode) else f"a {node.id}"
+            raise ValueError(f"{key.value} must be {name}, not {given}")
+
+
 def load_scenario(path: Path) -> Scenario:
     """Read a scenario file.
 
@@ -70,6 +90,7 @@ def load_scenario(path: Path) -> Scenario:
     text = read_bytes(path, "scenario", MAX_SIZE).decode("utf-8", errors="replace")
     check_yaml(text, str(path), _TAGS)  # Drake's reader has no limits
     try:
+        _check_kinds(text)
         scenario = yaml_load_typed(schema=Scenario, data=text, defaults=Scenario())
     except (yaml.YAMLError, RuntimeError, LookupError, ValueError, TypeError, AttributeError, AssertionError) as error:
         reason = " ".join(str(error).split())

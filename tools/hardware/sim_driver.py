@@ -22,7 +22,7 @@ from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask, part_poses
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.connection import SIMULATED
+from guiderail.tools.hardware.connection import FCI, SIMULATED, check_simulation
 from guiderail.tools.hardware.scenario import load_scenario
 
 DEFAULT_TASK = "BncConnector"
@@ -76,8 +76,7 @@ def run_sim_driver(
     for name, value in {"seconds": seconds, "command_timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
-    if joint_friction is not None and not 0.0 <= joint_friction < np.inf:
-        raise InputError(f"joint_friction must be at least 0 and finite, not {joint_friction:g}")
+    check_simulation(driver, scenario, joint_friction)
     if rate is not None:
         check_rate(rate)
     if driver and driver not in SIMULATED:
@@ -87,9 +86,7 @@ def run_sim_driver(
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
     reset = None if offset is None else validate_options(insertion.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == DEFAULT_TASK else insertion.start_pose(np.random.default_rng(0)) + START_OFFSET
-    if driver == "fci":
-        if scenario is not None:
-            raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
+    if driver == FCI:
         from guiderail.diagrams.hardware import fci_simulated  # needs franky-sim
 
         parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)

@@ -13,6 +13,7 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware.connection import SIMULATED, RobotConnection, _loopback_address, subprocess_tied_to_parent
 from guiderail.tools.hardware.executor import recordings_folder
@@ -73,6 +74,20 @@ def test_simulated_franka_is_in_lockstep():
     assert robots == {"fci": "panda", "rtde": "ur5e", "": "iiwa14"}
     assert not RobotConnection(robot="panda", driver="fci", robot_url="192.0.2.1").synchronous
     assert not RobotConnection(sim=True).synchronous
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "no other surroundings than the task's"),
+        ({"driver": "fci", "joint_friction": -0.1}, "joint_friction must be at least 0 and finite, not -0.1"),
+        ({"joint_friction": "0.1"}, "joint_friction must be at least 0 and finite, not '0.1'"),
+        ({"rate": "0.2"}, "the rate .* is positive and at most 1, not '0.2'"),
+    ],
+)
+def test_connection_refuses_what_the_simulated_driver_would_refuse(options, words):
+    with pytest.raises(InputError, match=words):
+        RobotConnection(sim=True, **options)
 
 
 @pytest.mark.parametrize(("run", "folder"), [("runs/peg", "runs/peg/hardware"), ("pretrained:clamp", "clamp/hardware")])
