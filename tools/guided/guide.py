@@ -162,7 +162,11 @@ class _FittedSegment:
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """Settings of guidance by demonstrations."""
+    """Settings of guidance by demonstrations.
+
+    Raises:
+        InputError: If `history` is not a whole number of at least 1; `PrimitiveGuide` checks the other settings.
+    """
 
     # κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
@@ -172,6 +176,11 @@ class GuideSettings:
     horizon: int = 20  # H, number of future points at which the constraints are satisfied
     # Meaning of the last three of six outputs; None for that of the demonstrations' names, or else "rotation_vector".
     orientation: Orientation | None = None
+
+    def __post_init__(self) -> None:
+        if not is_whole(self.history, 1):
+            raise InputError(f"history is a number of outputs, at least 1, not {brief(self.history)}")
+        object.__setattr__(self, "history", int(self.history))
 
 
 class PrimitiveGuide(Guide):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -147,6 +149,10 @@ class Segment:
         for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
             if value is not None and not is_whole(value, least):
                 raise InputError(f"{what} of a segment is a whole number of at least {least}, not {brief(value)}")
+        if not isinstance(self.demonstrations, Demonstrations | str | PathLike):
+            raise InputError(
+                f"demonstrations of a segment are Demonstrations or their file, not {brief(self.demonstrations)}"
+            )
         for what, function, returned in (("frame", self.frame, "Frame or origin"), ("until", self.until, "bool")):
             if function is not None and not callable(function):
                 raise InputError(
@@ -170,7 +176,7 @@ class Segment:
         """
         if self.num_steps is not None:
             return int(self.num_steps)
-        if period is None or not 0.0 < period < np.inf:
+        if not isinstance(period, Real) or not 0.0 < period < np.inf:
             raise InputError("give the period of the environment [s], or num_steps of every segment")
         duration = float(np.mean([t[-1] - t[0] for t in self.recorded.times]))
         if round(duration / period) < MIN_PERIODS:
@@ -184,13 +190,17 @@ class Segment:
         """Return the most frequent discrete output of the demonstrations for each control step, or None.
 
         Raises:
-            InputError: If there is not one discrete output for each sample of each demonstration.
+            InputError: If there is not one discrete output, a scalar or (D,), for each sample of each demonstration.
         """
         if self.discrete is None:
             return None
         times = self.recorded.times
-        arrays = [np.asarray(values) for values in self.discrete]
-        if [len(values) for values in arrays] != [len(t) for t in times]:
+        try:
+            arrays = [np.asarray(values) for values in self.discrete]
+        except (TypeError, ValueError):  # not a list, or ragged
+            arrays = []
+        sizes, widths = [values.shape[:1] for values in arrays], {values.shape[1:] for values in arrays}
+        if sizes != [t.shape for t in times] or len(widths) > 1:
             raise InputError("discrete outputs must have a value for each sample of each demonstration")
         values = []
         for phase in np.linspace(0.0, 1.0, num_steps):

@@ -8,6 +8,7 @@ import pytest
 from guiderail import Demonstrations, Frame, Segment, align_demonstrations, cut_demonstrations, find_events
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import MAX_ALIGNED_SAMPLES, _warping_path
+from guiderail.tools.guided.guide import GuideSettings
 
 
 def recordings():
@@ -75,8 +76,10 @@ def test_discrete_output_is_the_most_frequent_at_each_phase():
     grips = [np.where(np.arange(40) < k, -1, 1) for k in (10, 20, 30)]
     values = Segment(recordings(), discrete=grips).discrete_values(20)
     assert [int(v) for v in values] == [-1] * 10 + [1] * 10
-    with pytest.raises(InputError, match="a value for each sample"):
-        Segment(recordings(), discrete=grips[:2]).discrete_values(20)
+    uneven = [np.zeros((40, width)) for width in (1, 1, 2)]
+    for wrong in (grips[:2], [1, 2, 3], 5, [[[1], [1, 2]]] * 3, uneven):
+        with pytest.raises(InputError, match="a value for each sample"):
+            Segment(recordings(), discrete=wrong).discrete_values(20)
     with pytest.raises(InputError, match="not both"):
         Segment(recordings(), discrete=grips, extra=1.0)
 
@@ -97,6 +100,18 @@ def test_wrong_argument_of_a_segment_is_refused(keywords, message):
         Segment(recordings(), **keywords)
 
 
+def test_demonstrations_of_another_type_are_refused():
+    with pytest.raises(InputError, match=r"Demonstrations or their file, not \[1, 2\]"):
+        Segment([1, 2])
+
+
+@pytest.mark.parametrize("history", [0, 1.5, np.inf, "4"])
+def test_history_without_an_output_is_refused(history):
+    with pytest.raises(InputError, match="history is a number of outputs, at least 1, not"):
+        GuideSettings(history=history)
+    assert type(GuideSettings(history=2.0).history) is int
+
+
 def test_number_of_steps_follows_from_the_period():
     segment = Segment(recordings())
     assert segment.steps_of(0.1) == 40
@@ -104,6 +119,8 @@ def test_number_of_steps_follows_from_the_period():
     assert segment.steps_of(0.9) == 12
     with pytest.raises(InputError, match=r"shorter than 4 periods of 1\.2 s"):
         segment.steps_of(1.2)
+    with pytest.raises(InputError, match="give the period of the environment"):
+        segment.steps_of("0.1")
     assert Segment(recordings(), num_steps=20).steps_of(None) == 20
 
 
