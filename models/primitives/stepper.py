@@ -40,8 +40,8 @@ class PrimitiveStepper:
 
     Args:
         primitive: Primitive with O outputs.
-        pose: Measured output (O,) that fills the history, or the last P outputs (P, O), oldest first; the first mean of
-            the reference by default.
+        pose: Measured output (O,) that fills the history, or the last outputs, oldest first: (P, O), or (2, O) for a
+            motion filter if P < 2. The first mean of the reference by default.
         gain: Raw null-space action per unit of the action (O,); ones by default.
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
@@ -71,14 +71,12 @@ class PrimitiveStepper:
         self.gain = np.ones(primitive.num_outputs) if gain is None else self._checked(gain, "gain")
         first = primitive.reference.means[0]
         self._is_measured = history_source == "measured"
-        if pose is not None and np.asarray(pose).shape == (primitive.history, primitive.num_outputs):
-            self._history = np.array([self._checked(each, "pose") for each in np.asarray(pose)])
-        else:
-            self._history = np.tile(first if pose is None else self._checked(pose, "pose"), (primitive.history, 1))
+        recent = self._recent(first if pose is None else pose, has_filter=motion is not None)
+        has_past = len(recent) == primitive.history
+        self._history = recent if has_past else np.tile(recent[-1], (primitive.history, 1))
         self._last = primitive.constraints.nearest(first)
         self._motion = motion
         if motion is not None:
-            recent = np.atleast_2d(first if pose is None else np.asarray(pose, dtype=float))
             self._state = motion.start(recent[-1])
             if len(recent) > 1:
                 self._state[primitive.num_outputs :] = recent[-1] - recent[-2]
@@ -129,6 +127,12 @@ class PrimitiveStepper:
             self._append(self._last)
         self.num_steps += 1
         return command
+
+    def _recent(self, pose: ArrayLike, *, has_filter: bool) -> np.ndarray:
+        """Return the outputs of `pose`, oldest first: (1, O), (P, O), or (2, O) for a motion filter if P < 2."""
+        given, history = as_numbers(pose, "pose"), self.primitive.history
+        is_several = given.ndim == 2 and len(given) in ({history or 2, max(history, 2)} if has_filter else {history})
+        return np.array([self._checked(each, "pose") for each in (given if is_several else [pose])])
 
     def _append(self, output: np.ndarray) -> None:
         if self.primitive.history:

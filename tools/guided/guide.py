@@ -253,11 +253,13 @@ class PrimitiveGuide(Guide):
         primitive, gains = fitted.primitive_for(
             self.constraints if is_enforced else LinearConstraints.none(self.num_outputs)
         )
-        near = fitted.reference.means[0]
-        recent = self._recent[-max(primitive.history, 1) :]
-        recent = [recent[0]] * (max(primitive.history, 1) - len(recent)) + recent
-        past = [self.frame.to_frame(output, self._orientation, near) for output in recent]
-        start = np.array(past) if primitive.history else past[-1]
+        length = max(primitive.history, 1 if motion_filter is None else 2)  # a filter continues the last velocity
+        recent = self._recent[-length:]
+        past = [self.frame.to_frame(recent[-1], self._orientation, fitted.reference.means[0])]
+        for output in recent[-2::-1]:  # each orientation is near the next one, so that none jumps by a full turn
+            past.insert(0, self.frame.to_frame(output, self._orientation, past[0]))
+        past = [past[0]] * (length - len(past)) + past
+        start = past[-1] if primitive.history == 0 and motion_filter is None else np.array(past)
         self._stepper: PrimitiveStepper = primitive.start(start, gains, motion=motion_filter)
         self._last = past[-1]
 
@@ -289,7 +291,7 @@ class PrimitiveGuide(Guide):
         command = self._stepper.finish(output)
         self._last = command.output
         world = self.frame.to_world(command.output, self._orientation)
-        self._recent = [*self._recent, world][-max(self.settings.history, 1) :]
+        self._recent = [*self._recent, world][-max(self.settings.history, 2) :]
         extra = self._extra(self._step)
         self._step += 1
         violation = (self._motion or self.constraints).violation(command.output, step)

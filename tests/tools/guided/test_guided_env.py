@@ -522,3 +522,40 @@ def test_template_guide_refuses_a_start_that_is_not_finite(x_of_frame, x):
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
     with pytest.raises(InputError, match="must be finite at a reset"):
         template_guide.reset(None, None, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize(("guidance", "history"), [("kgrl", 4), ("kmp", 4), ("skgrl", 1), ("skgrl", 4)])
+def test_acceleration_limit_holds_from_segment_to_segment(guidance, history):
+    limits = MotionConstraints(LinearConstraints.none(3), max_speed=np.full(3, 0.8), max_acceleration=np.full(3, 4.0))
+    parts = [replace(part, frame=None, constraints=limits, until=None, dwell=0) for part in two_segments()]
+    env = guided(guidance, demonstrations=parts, constraints=None, frame=None, history=history, action_repeat=1)
+    infos = episode(env, lambda k: np.array([1.0, 0.3, 0.0]))
+    commands = np.array([info["command"] for info in infos[1:]])
+    at = next(k for k, info in enumerate(infos[1:]) if info["segment"] != infos[1]["segment"])
+    assert np.abs(commands[at - 1] - commands[at - 2]).max() > 1e-3
+    changes = np.abs(np.diff(commands, 2, axis=0)) / PERIOD**2
+    assert changes[at - 2 : at].max() <= 4.0 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("guidance", "last"), [("kgrl", 3.14), ("skgrl", 3.16)])
+def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
+    def turning(first, last):
+        rng, t = np.random.default_rng(0), PERIOD * np.arange(20)
+        angles = np.linspace(first, last, 20) + rng.normal(scale=0.02, size=(5, 1)) * np.sin(np.pi * t / t[-1])
+        return Demonstrations([t] * 5, [np.column_stack([np.zeros((20, 3)), a, np.zeros((20, 2))]) for a in angles])
+
+    limits = MotionConstraints(LinearConstraints.none(6), max_speed=np.full(6, 3.0), max_acceleration=np.full(6, 20.0))
+    env = GuidedEnv(
+        PointEnv(),
+        demonstrations=[Segment(turning(*ends), constraints=limits) for ends in ((2.0, last), (0.0, 0.1))],
+        pose=lambda env, observation: np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]),
+        to_action=lambda env, observation, command, extra: np.zeros(4),
+        orientation="euler_zyx",
+        guidance=guidance,
+        period=PERIOD,
+        action_repeat=1,
+    )
+    turn = np.unwrap([info["command"][3] for info in episode(env, lambda k: np.zeros(6))[1:]])
+    assert np.ptp(turn[:20]) > 1.0
+    assert np.abs(np.diff(turn)).max() <= 3.0 * PERIOD * (1 + 1e-6)
+    assert np.abs(np.diff(turn, 2)).max() <= 20.0 * PERIOD**2 * (1 + 1e-6)
