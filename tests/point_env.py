@@ -16,6 +16,8 @@ class PointEnv(gymnasium.Env):
         spaces = gymnasium.spaces
         self.kind, box = kind, spaces.Box(-np.inf, np.inf, (6,), np.float64)
         self.observation_space = spaces.Dict({"state": box}) if kind == "dict" else box
+        if kind == "dict_with_phase":
+            self.observation_space = spaces.Dict({"state": box, "phase": spaces.Discrete(2)})
         if kind == "image":
             self.observation_space = spaces.Box(0, 255, (4, 4, 3), np.uint8)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)

@@ -103,6 +103,18 @@ class LinearConstraints:
         """Number of steps N if constraints differ from step to step, else None."""
         return self.G.shape[0] if self.G.ndim == 3 else None
 
+    def check_sizes(self, num_outputs: int, num_steps: int) -> None:
+        """Check that the constraints fit a reference trajectory.
+
+        Raises:
+            InputError: If it has another number of outputs, or the constraints differ from step to step and it has
+                another number of steps.
+        """
+        if self.num_outputs != num_outputs:
+            raise InputError(f"constraints are on {self.num_outputs} outputs, the reference has {num_outputs}")
+        if self.num_steps not in (None, num_steps):
+            raise InputError(f"constraints are given for {self.num_steps} steps, the reference has {num_steps}")
+
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return G (n, F, O) and c (n, F) at steps (n,); a step outside of the motion counts as the nearest one."""
         steps = np.asarray(steps)

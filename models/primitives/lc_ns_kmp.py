@@ -90,14 +90,7 @@ class LcNsKmp:
         if history and not (np.isfinite(history_variance) and history_variance > 0):
             raise InputError(f"history_variance must be positive, not {history_variance}")
         constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)
-        if constraints.num_outputs != reference.num_outputs:
-            raise InputError(
-                f"constraints are on {constraints.num_outputs} outputs, the reference has {reference.num_outputs}"
-            )
-        if constraints.num_steps not in (None, reference.num_steps):
-            raise InputError(
-                f"constraints are given for {constraints.num_steps} steps, the reference has {reference.num_steps}"
-            )
+        constraints.check_sizes(reference.num_outputs, reference.num_steps)
         self.reference = reference
         self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
         self.lambda_, self.beta = float(lambda_), float(beta)

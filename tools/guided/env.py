@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from numbers import Real
 from pathlib import Path
@@ -119,12 +119,18 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         for what, function in (("pose", pose), ("to_action", to_action), ("template_frames", template_frames)):
             if not callable(function) and not (what == "template_frames" and function is None):
                 raise InputError(f"{what} is a function of the environment and its observation, not {brief(function)}")
-        unknown = [name for name in observe if name not in OBSERVED]
-        if unknown or isinstance(observe, str):
+        observed = tuple(observe) if isinstance(observe, Iterable) and not isinstance(observe, str) else (observe,)
+        if not all(name in OBSERVED for name in observed):
             raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
         if orientation is not None:
             check_orientation(orientation)
         if isinstance(guidance, Guide):
+            others = {
+                "demonstrations": demonstrations, "constraints": constraints, "frame": frame, "template": template,
+                "template_frames": template_frames, "action_dims": action_dims, "orientation": orientation,
+            }  # fmt: skip
+            if superfluous := [name for name, value in others.items() if value is not None]:
+                raise InputError(f"a guide does not use {superfluous[0]}: leave it out, or give the guide's name")
             self.guide = guidance
         elif guidance == "template":
             if template is None or template_frames is None:
@@ -142,10 +148,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         else:
             settings = GuideSettings(action_scale, action_dims, int(history), history_variance, horizon, orientation)
             self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
-        self.action_repeat, self._observe = int(action_repeat), tuple(observe)
+        self.action_repeat, self._observe = int(action_repeat), observed
         self._pose, self._to_action = pose, to_action
         self._command: GuideCommand | None = None
         self._observation: Any = None
+        self._has_begun = False
         self._terminated = self._truncated = False
         self.action_space = Box(-1.0, 1.0, (self.guide.num_actions,), np.float32)
         self.observation_space = self._extended_space(env.observation_space)
@@ -156,10 +163,12 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             InputError: If the measured pose is not (O,) finite numbers, or a frame or constraints are invalid.
         """
+        self._has_begun = False  # an error leaves no episode to continue
         self._observation, info = self.env.reset(seed=seed, options=options)
         self._terminated = self._truncated = False
         measured = self._measured()
         self.guide.reset(self.env, self._observation, measured)
+        self._has_begun = True
         return self._extended(), {**info, "phase": self.guide.phase, "segment": self.guide.segment_name}
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -182,7 +191,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             InputError: If the action is not (A,) finite numbers; one outside [−1, 1] is clipped.
             ResetNeeded: If no episode has begun, or the episode has ended.
         """
-        if self._observation is None:
+        if not self._has_begun:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
         if self._terminated or self._truncated:
             raise gymnasium.error.ResetNeeded("the episode has ended: call reset() first")
@@ -246,6 +255,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             high = np.concatenate([space.high, *(one.high for one in extra.values())])
             return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         if isinstance(space, Dict):
+            if taken := sorted(extra.keys() & space.spaces.keys()):
+                raise InputError(
+                    f"the environment's observation has an entry {taken[0]!r} already: rename it, or leave {taken[0]} "
+                    "out of observe"
+                )
             return Dict({**space.spaces, **extra})
         return Dict({"observation": space, **extra})
 
@@ -268,7 +282,7 @@ def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment
         raise InputError("guidance by demonstrations needs demonstrations=")
     if isinstance(demonstrations, Demonstrations | str | Path):
         return [Segment(demonstrations, frame=frame, constraints=constraints)]
-    segments = list(demonstrations)
+    segments: list[Any] = list(demonstrations) if isinstance(demonstrations, Iterable) else [None]
     if not all(isinstance(segment, Segment) for segment in segments):
         raise InputError("demonstrations are Demonstrations, a file, or a list of Segment")
     if constraints is not None or frame is not None:
@@ -291,14 +305,16 @@ class GuidedVectorEnv(SyncVectorEnv):
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
+        env_fns = list(env_fns) if isinstance(env_fns, Iterable) else [env_fns]
         if not env_fns:
             raise InputError("a vector environment needs at least one environment")
         if not all(map(callable, env_fns)):
             raise InputError("env_fns are functions that return an environment, such as lambda: env")
         first = GuidedEnv(env_fns[0](), **keywords)
+        own = {name: keywords[name] for name in ("pose", "to_action", "action_repeat", "observe") if name in keywords}
 
         def wrap(make: Callable[[], gymnasium.Env[Any, Any]]) -> Callable[[], gymnasium.Env[Any, Any]]:
-            return lambda: GuidedEnv(make(), **{**keywords, "guidance": first.guide.copy()})
+            return lambda: GuidedEnv(make(), guidance=first.guide.copy(), **own)
 
         super().__init__([lambda: first, *map(wrap, env_fns[1:])], autoreset_mode=AutoresetMode.NEXT_STEP)
 
@@ -313,6 +329,8 @@ class GuidedVectorEnv(SyncVectorEnv):
         actions = as_numbers(actions, "actions")
         if actions.shape != self.action_space.shape:
             raise InputError(f"actions must be of shape {self.action_space.shape}, not {actions.shape}")
+        if not np.isfinite(actions).all():
+            raise InputError(f"actions must be finite, not {brief(actions)}")
         stepped = [i for i in range(self.num_envs) if not self._autoreset_envs[i]]
         guided: list[Any] = [self.envs[i] for i in stepped]
         for env, i in zip(guided, stepped, strict=True):

@@ -121,16 +121,23 @@ class _FittedSegment:
             self.primitive_for(self.as_constraints(given))  # refuses invalid constraints before an episode
 
     def as_constraints(self, given: Any) -> LinearConstraints:
-        """Return the linear constraints in `given`; demonstrated bounds become a box for each step."""
+        """Return the linear constraints in `given`; demonstrated bounds become a box for each step.
+
+        Raises:
+            InputError: If they are no constraints, do not fit the reference, or have limits that a residual exceeds.
+        """
         if given is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(given, DemonstratedBounds):
             phase = phases_of_steps(given.phases, self.num_steps) if len(given.phases) > 1 else 0
-            return LinearConstraints.box(given.lower[phase], given.upper[phase])
+            given = LinearConstraints.box(given.lower[phase], given.upper[phase])
         if isinstance(given, MotionConstraints):
-            return given.linear
+            if "residual" in self.guidance:
+                _refuse_limits(given)
+            given = given.linear
         if not isinstance(given, LinearConstraints):
             raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(given)}")
+        given.check_sizes(self.num_outputs, self.num_steps)
         return given
 
     def primitive_for(self, constraints: LinearConstraints) -> tuple[LcNsKmp, np.ndarray]:
@@ -328,6 +335,13 @@ class PrimitiveGuide(Guide):
         """Return the last command (O,) in the segment's frame, scaled to ±1 over the range of its demonstrations."""
         fitted = self.segments[self._index]
         return (self._last - fitted.center) / fitted.half_range
+
+
+def _refuse_limits(motion: MotionConstraints) -> None:
+    """Raise an InputError if limits are given, for guidance that does not enforce them."""
+    limits = [name for name in ("max_speed", "max_acceleration") if np.isfinite(getattr(motion, name)).any()]
+    if names := " and ".join([*limits, *(["state"] if motion.state else [])]):
+        raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
 def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[int]:

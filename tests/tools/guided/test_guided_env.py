@@ -342,6 +342,11 @@ def test_action_beyond_the_range_is_clipped():
         ({"template": "pouring"}, "guidance='kgrl' does not use a template"),
         ({"guidance": "template", "template": "pouring", "template_frames": pose}, "does not use demonstrations"),
         ({"demonstrations": two_segments()}, "each Segment"),
+        ({"demonstrations": two_segments()[0], "constraints": None, "frame": None}, "a list of Segment"),
+        ({"demonstrations": 5}, "a list of Segment"),
+        ({"observe": None}, "observe has some of phase, command, not None"),
+        ({"kind": "dict_with_phase"}, "has an entry 'phase' already"),
+        ({"guidance": "residual", "constraints": MotionConstraints(LIMIT, max_speed=np.ones(3))}, "enforce max_speed"),
     ],
 )
 def test_wrong_argument_is_refused(keywords, message):
@@ -559,3 +564,60 @@ def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
     assert np.ptp(turn[:20]) > 1.0
     assert np.abs(np.diff(turn)).max() <= 3.0 * PERIOD * (1 + 1e-6)
     assert np.abs(np.diff(turn, 2)).max() <= 20.0 * PERIOD**2 * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("guidance", ["residual", "clipped_residual", "kgrl"])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (LinearConstraints.none(2), "on 2 outputs, the reference has 3"),
+        (LinearConstraints.box(-np.ones((10, 3)), np.ones((10, 3))), "for 10 steps, the reference has 25"),
+    ],
+)
+def test_constraints_of_another_size_are_refused_at_reset(guidance, wrong, message):
+    env = guided(guidance, constraints=lambda env, observation: wrong)
+    with pytest.raises(InputError, match=message):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("limit", ["max_speed", "max_acceleration"])
+def test_residual_refuses_limits_that_a_function_returns(limit):
+    motion = MotionConstraints(LIMIT, **{limit: [1.0, np.inf, np.inf]})
+    env = guided("clipped_residual", constraints=lambda env, observation: motion)
+    with pytest.raises(InputError, match=f"only kgrl, skgrl and kmp enforce {limit}"):
+        env.reset(seed=0)
+    episode(guided("clipped_residual", constraints=MotionConstraints(LIMIT)), lambda k: np.zeros(3))
+
+
+def test_failed_reset_leaves_no_episode():
+    measured = [np.zeros(3), np.full(3, np.nan)]
+    env = guided(pose=lambda env, observation: measured[0])
+    env.reset(seed=0)
+    env.step(np.zeros(3))
+    measured.reverse()
+    with pytest.raises(InputError, match="pose must return"):
+        env.reset(seed=1)
+    measured.reverse()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
+        env.step(np.zeros(3))
+
+
+@pytest.mark.parametrize("name", ["demonstrations", "constraints", "frame", "action_dims"])
+def test_argument_that_a_guide_does_not_use_is_refused(name):
+    given = {"demonstrations": SHOWN, "constraints": LIMIT, "frame": at_target, "action_dims": [0]}
+    functions = {"pose": pose, "to_action": to_action, "guidance": guided().guide}
+    with pytest.raises(InputError, match=f"a guide does not use {name}"):
+        GuidedEnv(PointEnv(), **functions, **{name: given[name]})
+    GuidedEnv(PointEnv(), **functions).reset(seed=0)
+
+
+def test_vector_environment_refuses_nan_in_the_row_of_a_reset():
+    vector = GuidedVectorEnv(
+        (make for make in [PointEnv] * 2),
+        demonstrations=SHOWN, frame=at_target, pose=pose, to_action=to_action, period=PERIOD, action_repeat=100,
+    )  # fmt: skip
+    vector.reset(seed=0)
+    *_, truncated, _ = vector.step(np.zeros((2, 3)))
+    assert truncated.all()
+    with pytest.raises(InputError, match="finite"):
+        vector.step(np.full((2, 3), np.nan))
