@@ -34,9 +34,10 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
         name: Name of the task; it may have a namespace of its own, as in "lab/Peg".
 
     Raises:
-        InputError: When the decorator is applied, if another task has that name, a required method is missing, or a
-            declaration has the wrong type.
+        InputError: If the name is no word. When the decorator is applied, if another task has that name, a required
+            method is missing, or a declaration has the wrong type.
     """
+    TASKS.check_name(name)
 
     def add(task: TaskClass) -> TaskClass:
         _check(name, task)

@@ -54,9 +54,10 @@ class Registry(Generic[Entry]):
         """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
-            InputError: If an object that is defined elsewhere has this name already, or a module of the package that
-                is not imported yet declares it.
+            InputError: If the name is no word, as for a decorator without parentheses, if an object that is defined
+                elsewhere has this name already, or a module of the package that is not imported yet declares it.
         """
+        self.check_name(name)
         if value is None:
             return lambda decorated: self.register(name, decorated)
         origin = _origin(value)
@@ -70,6 +71,11 @@ class Registry(Generic[Entry]):
             raise InputError(f"there is a {self.noun} {name!r} already, from {place}: choose another name")
         self._entries[name], self._origins[name] = value, origin
         return value
+
+    def check_name(self, name: object) -> None:
+        """Raise an InputError unless `name` is a text that is not empty."""
+        if not (isinstance(name, str) and name):
+            raise InputError(f'a {self.noun} is registered by a name, as in @register_...("name"), not {brief(name)}')
 
     def get(self, name: str) -> Entry:
         """Return the entry of a name.

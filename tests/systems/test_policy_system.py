@@ -196,3 +196,9 @@ def test_simulator_gives_bitwise_the_results_of_the_environment(action_repeat):
         np.testing.assert_array_equal(diagram.GetOutputPort("desired_pose").Eval(own), commanded[n])
         np.testing.assert_array_equal(diagram.GetOutputPort("pose").Eval(own), measured[n])
     assert np.abs(np.diff(commanded, axis=0)).max() > 0.0
+
+
+@pytest.mark.parametrize("policy", [None, 5, "connector"])
+def test_constructor_refuses_a_policy_that_is_no_function(policy):
+    with pytest.raises(InputError, match="a policy is a function from an observation to an action, not"):
+        PolicySystem(policy, 1, 1, PERIOD)

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from guiderail.diagrams.tasks.registry import register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 
@@ -17,6 +18,16 @@ def test_name_must_be_a_string(name):
     shapes.register("sphere", object())
     with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
         shapes.get(name)
+
+
+@pytest.mark.parametrize("name", [object, "", 3, None])
+def test_register_needs_a_name(name):
+    shapes = Registry("shape")
+    with pytest.raises(InputError, match=r"a shape is registered by a name, as in @register_\.\.\.\("):
+        shapes.register(name)
+    with pytest.raises(InputError, match="a task is registered by a name"):
+        register_task(name)
+    assert shapes.names() == []
 
 
 def test_unknown_name_is_refused_with_the_closest_name():
