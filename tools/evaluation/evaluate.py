@@ -211,7 +211,7 @@ def evaluate(
     processes: int | None = None,
     trust_policy: bool = False,
     resample_offsets: bool = False,
-    save: Path | None = None,
+    save: Path | str | None = None,
     signal: str = "commanded",
     describe_differences: Callable[[RunConfig], Sequence[str]] | None = None,
 ) -> Evaluation:
@@ -256,6 +256,7 @@ def evaluate(
             guidance does not match the environment, or `save` cannot be written. With `resample_offsets`, also if the
             task has no hidden offset, or an episode has the seed of the run and so its offset.
     """
+    save = None if save is None else Path(save)
     _check_saved(save, signal)
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
     given, env = env, find_environment(env)

@@ -134,6 +134,8 @@ def as_policy(given: Any) -> PolicyFn:
     Raises:
         InputError: If `given` is neither.
     """
+    if isinstance(given, type) and (hasattr(given, "predict") or "__call__" in vars(given)):
+        raise InputError(f"{given.__name__} is a class: give a policy, such as {given.__name__}()")
     if isinstance(given, Policy | Callback) and callable(given):
         return given
     if callable(getattr(given, "predict", None)):

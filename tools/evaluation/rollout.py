@@ -118,7 +118,8 @@ def rollout(
         options: Options of the reset.
 
     Raises:
-        InputError: If the reset or an action is refused, or a callback returns wrong columns (`new_columns`).
+        InputError: If the reset is refused, an action is refused or does not have the shape of the environment's
+            actions, or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
@@ -137,6 +138,8 @@ def rollout(
     is_over = False
     while not is_over:
         action, privileged = act(observation), getattr(base, "privileged", None)
+        if not is_own:
+            _check_shape(action, env)
         following, reward, terminated, truncated, info = env.step(action)
         transition = Transition(
             observation, action, float(reward), following, terminated, truncated, info,
@@ -157,6 +160,19 @@ def rollout(
     for callback in callbacks:
         row |= new_columns(callback, row)
     return row
+
+
+def _check_shape(action: Any, env: gymnasium.Env) -> None:
+    """Raise an InputError if an action does not have the shape of an environment's actions, if these have one."""
+    expected = env.action_space.shape
+    try:
+        shape = np.shape(action)
+    except ValueError:  # ragged
+        shape = None
+    if expected is not None and (shape != expected or action is None):
+        raise InputError(
+            f"the policy returned {brief(action)}, and the actions of this environment have the shape {expected}"
+        )
 
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -200,8 +216,13 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
 
     It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
     others have certain values.
+
+    Raises:
+        InputError: If `make_policy` returns no function.
     """
     act, shape = make_policy(env), env.observation_space.shape or ()
+    if not callable(act):
+        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
     try:
         shapes = {np.shape(act(np.full(shape, value, np.float32))) for value in np.linspace(-1.0, 1.0, 21)}
     except (IndexError, ValueError):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -184,7 +184,7 @@ def find_subject(
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
         unknown = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
-        if act is policy:
+        if act is policy and not isinstance(act, Policy):
             return Subject("policy", config, lambda env: act, digest=unknown)
         return Subject("policy", config, partial(check_compatible, act), digest=unknown)
     source = find_run(policy)
@@ -216,10 +216,15 @@ def make_baselines(
         baselines: Names of baseline policies, or the functions themselves by name; None for the default set.
 
     Raises:
-        InputError: If a name is unknown.
+        InputError: If a name is unknown, or `baselines` are neither functions by name nor names.
     """
     if isinstance(baselines, Mapping):
+        for name, make in baselines.items():
+            if not callable(make):
+                raise InputError(f"baseline {name} is a function from an environment to a policy, not {brief(make)}")
         return baselines
+    if isinstance(baselines, str) or not (baselines is None or isinstance(baselines, Iterable)):
+        raise InputError(f"baselines are a list of names, or functions by name, not {brief(baselines)}")
     if config is not None:
         names = default_baselines(config.task, environment) if baselines is None else baselines
         return {name: make_baseline(config.task, name, config.seed) for name in names}

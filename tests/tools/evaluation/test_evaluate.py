@@ -127,7 +127,7 @@ def test_evaluate_takes_a_policy_without_a_run(bead_run, tmp_path):
 
 def test_evaluate_saves_successful_episodes(tmp_path):
     file = tmp_path / "saved.npz"
-    result = evaluate("zero", "NarrowPassage", environment={"guidance": "kmp"}, episodes=1, save=file)
+    result = evaluate("zero", "NarrowPassage", environment={"guidance": "kmp"}, episodes=1, save=str(file))
     assert result["success_rate"] == 1.0
     assert result["saved"] == Demonstrations.load(file).num_demonstrations == 1
     for wrong, message in (({"save": file}, "already exists"), ({"save": tmp_path / "x.yaml"}, r"\.npz or \.csv")):

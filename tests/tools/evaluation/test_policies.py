@@ -351,6 +351,44 @@ def test_evaluation_in_something_else_is_refused(arguments, message):
         evaluate(*arguments, episodes=1)
 
 
+@pytest.mark.parametrize("returned", [0.0, np.zeros(3), None, np.zeros((1, 2)), [0.0, [0.0]]])
+def test_action_of_a_function_with_another_shape_is_refused(returned):
+    with pytest.raises(InputError, match=r"the policy returned .*, and the actions .* have the shape \(2,\)"):
+        evaluate(lambda point: returned, Pointer(), 1, baselines=(), processes=1)
+
+
+class Constant:
+    """Model of another package."""
+
+    def predict(self, observation):
+        return np.zeros(2)
+
+
+@pytest.mark.parametrize(
+    ("baselines", "message"),
+    [
+        ("constant", "baselines are a list of names"),
+        (5, "baselines are a list of names"),
+        ({"still": 5}, "baseline still is a function from an environment to a policy, not 5"),
+        ({"still": lambda point: np.zeros(2)}, "must return a policy, not array"),
+    ],
+)
+def test_baselines_of_another_type_are_refused(baselines, message):
+    with pytest.raises(InputError, match=message):
+        evaluate(Constant(), Pointer(), 1, baselines=baselines, processes=1)
+
+
+def test_class_is_no_policy():
+    with pytest.raises(InputError, match=r"Constant is a class: give a policy, such as Constant\(\)"):
+        evaluate(Constant, Pointer(), 1)
+
+
+def test_policy_of_another_environment_is_refused():
+    policy = Policy.load(find_run("pretrained:passage"))
+    with pytest.raises(InputError, match=r"the policy takes observations \(\d+,\)"):
+        evaluate(policy, Pointer(), 1, baselines=(), processes=1)
+
+
 def test_environment_that_cannot_be_made_is_refused():
     gymnasium.register("Broken-v0", entry_point="package_that_does_not_exist:Broken")
     try:
