@@ -47,6 +47,31 @@ def as_whole(value: object, what: str) -> int:
     return int(cast(SupportsInt, value))
 
 
+def as_number(value: object, what: str) -> float:
+    """Return a real number of Python or NumPy as a float; `what` is its name for the message.
+
+    NaN and infinity are numbers.
+
+    Raises:
+        InputError: If it is not one real number, such as "3", None and [1.0, 2.0], or it is beyond the range of a
+            double.
+    """
+    scalar = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
+    try:
+        if isinstance(scalar, Real):
+            return float(scalar)
+    except OverflowError:
+        pass
+    raise InputError(f"{what} must be a number, not {brief(value)}")
+
+
+def as_doubles(values: ArrayLike, what: str) -> np.ndarray:
+    """Return an array of doubles itself; convert other values with `as_numbers`, whose errors this function raises."""
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return values
+    return as_numbers(values, what)
+
+
 _EXACT = 2**53  # a double represents smaller whole numbers exactly
 
 
@@ -80,18 +105,6 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
     if is_rounded or any(isinstance(value, int | np.integer) and abs(int(value)) >= _EXACT for value in _objects(raw)):
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
-
-
-def as_number(value: object, what: str) -> float:
-    """Return one number as a float; `what` is its name for the message.
-
-    Raises:
-        InputError: If it is not one number: "3", None and [3.0] are refused, NaN and infinity are not.
-    """
-    number = np.empty(0) if value is None or isinstance(value, str) else as_numbers(cast(ArrayLike, value), what)
-    if number.ndim:
-        raise InputError(f"{what} must be one number, not {brief(value)}")
-    return float(number)
 
 
 def find_asymmetric(matrices: np.ndarray) -> int | None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from guiderail.models.common.arrays import as_numbers, find_asymmetric
+from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.features import KernelBasis
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
@@ -63,7 +63,7 @@ class Kmp:
         if not (np.isfinite(inputs).all() and np.isfinite(means).all()):
             raise InputError("a primitive's inputs and means must be finite: cut those samples out")
         for name, value in (("lambda_", lambda_), ("covariance_lambda", covariance_lambda)):
-            if value is not None and not (np.isfinite(value) and value > 0):
+            if value is not None and not 0.0 < as_number(value, name) < np.inf:
                 raise InputError(f"{name} must be positive, not {value}")
         self.num_inputs, self.num_outputs = inputs.shape[1], means.shape[1]
         self._reference = [

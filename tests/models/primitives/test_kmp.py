@@ -137,3 +137,28 @@ def test_kmp_accepts_lists():
     t, means, covariances = data(20, 2)
     expected = Kmp(t, means, covariances).mean([1.0])
     np.testing.assert_array_equal(Kmp(t.tolist(), means.tolist(), covariances.tolist()).mean([1.0]), expected)
+
+
+def test_arrays_that_change_later_do_not_change_the_primitive():
+    t, means, covariances = data(60, 2)
+    expected = Kmp(t, means, covariances)
+    target, covariance = np.array([0.4, -0.3]), 1e-4 * np.eye(2)
+    given = t.copy(), means.copy(), covariances.copy()
+    changed = Kmp(*given)
+    for array in given:
+        array[:] = 1.0
+    expected.add_via_point([3.0], target.copy(), covariance.copy())
+    changed.add_via_point([3.0], target, covariance)
+    target[:], covariance[:] = 5.0, np.eye(2)
+    for primitive in (expected, changed):
+        primitive.add_via_point([20.0], [0.1, 0.2], 1e-4 * np.eye(2))  # far away: the reference is factored again
+    np.testing.assert_array_equal(changed.mean(t), expected.mean(t))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"lambda_": "1"}, {"lambda_": [1.0, 2.0]}, {"means": "text"}, {"inputs": [[0], [1, 2]]}]
+)
+def test_arguments_of_another_type_are_refused(wrong):
+    t, means, covariances = data(20, 2)
+    with pytest.raises(InputError, match=r"must be a number|is not an array of numbers"):
+        Kmp(**({"inputs": t, "means": means, "covariances": covariances} | wrong))
