@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.arrays import as_number, as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.shapes import CLEARANCE, ConvexShape
@@ -124,7 +124,7 @@ class MotionConstraintFilter:
         period: Time between two commands h [s], positive.
 
     Raises:
-        InputError: If the period is not positive and finite.
+        InputError: If the constraints have another type, or the period is not positive and finite.
 
     Attributes:
         num_outputs: Number of outputs O.
@@ -132,7 +132,9 @@ class MotionConstraintFilter:
     """
 
     def __init__(self, constraints: MotionConstraints, period: float):
-        if not 0.0 < period < math.inf:
+        if not isinstance(constraints, MotionConstraints):
+            raise InputError(f"a filter needs MotionConstraints, not {brief(constraints)}")
+        if not 0.0 < as_number(period, "the period of commands") < math.inf:
             raise InputError(f"the period of commands must be positive, not {period} s")
         self.constraints, self.num_outputs = constraints, constraints.num_outputs
         self._max_step = period * np.asarray(constraints.max_speed)

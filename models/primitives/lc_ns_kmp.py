@@ -17,7 +17,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, as_whole, is_whole
+from guiderail.models.common.arrays import as_doubles, as_number, as_numbers, as_whole, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
@@ -61,8 +61,7 @@ class LcNsKmp:
 
     Attributes:
         reference, kernel, lambda_, beta, horizon, history, history_variance, constraints, solver: Arguments.
-        deviation: RMS distance of the motion without actions from the reference mean [standard deviations], see
-            `measure_deviation`.
+        deviation: RMS distance of the motion without actions from the reference mean [standard deviations].
         cached_bytes: Memory of the factored steps [bytes].
     """
 
@@ -81,15 +80,23 @@ class LcNsKmp:
         max_deviation: float = MAX_DEVIATION,
     ):
         for name, value in (("lambda_", lambda_), ("beta", beta)):
-            if not (np.isfinite(value) and value >= 0):
+            if not 0.0 <= as_number(value, name) < math.inf:
                 raise InputError(f"{name} must be finite and not negative, not {value}")
         if not lambda_ + beta > 0:
             raise InputError("lambda_ + beta must be positive: without any regularization problem 4.5 has no solution")
         if not (is_whole(horizon, 0) and is_whole(history, 0)):
             raise InputError(f"horizon and history are numbers of steps, not {brief(horizon)} and {brief(history)}")
-        if history and not (np.isfinite(history_variance) and history_variance > 0):
+        if history and not 0.0 < as_number(history_variance, "history_variance") < math.inf:
             raise InputError(f"history_variance must be positive, not {history_variance}")
+        if not (as_number(cache_bytes, "cache_bytes") >= 0 and as_number(max_deviation, "max_deviation") >= 0.0):
+            raise InputError(f"cache_bytes and max_deviation must not be negative: {cache_bytes} and {max_deviation}")
+        if not isinstance(reference, ReferenceTrajectory):
+            raise InputError(f"a primitive needs a ReferenceTrajectory (from_demonstrations), not {brief(reference)}")
+        if kernel is not None and (isinstance(kernel, type) or not hasattr(kernel, "stationary")):
+            raise InputError(f"a kernel is an object such as SquaredExponential(0.5), not {brief(kernel)}")
         constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)
+        if not isinstance(constraints, LinearConstraints):
+            raise InputError(f"constraints of a primitive are LinearConstraints, not {brief(constraints)}")
         constraints.check_sizes(reference.num_outputs, reference.num_steps)
         self.reference = reference
         self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
@@ -132,7 +139,7 @@ class LcNsKmp:
             InputError: If an argument has the wrong shape or is not finite, or the step is negative or not whole.
             UnsolvableError: If no window within the constraints was found; repeat the last safe command.
         """
-        factor = self._cache.get(step) or self._factor(step)
+        factor = (self._cache.get(step) if type(step) is int else None) or self._factor(step)
         return self._finish(factor, self._stack(null_space_action, history))
 
     def predict_batch(
@@ -365,7 +372,8 @@ class LcNsKmp:
 
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """Check the arguments and return x = [history, null-space action]."""
-        action = np.zeros(self.num_outputs) if null_space_action is None else np.asarray(null_space_action, dtype=float)
+        zero = np.zeros(self.num_outputs)
+        action = zero if null_space_action is None else as_doubles(null_space_action, "a null-space action")
         if action.shape != (self.num_outputs,):
             raise InputError(f"a null-space action has shape ({self.num_outputs},), not {action.shape}")
         if self.history == 0:
@@ -373,7 +381,7 @@ class LcNsKmp:
                 raise InputError("this primitive has no history (P = 0): pass None")
             x = action.copy()  # copied, because a `Prediction` keeps x
         else:
-            past = np.asarray(history, dtype=float) if history is not None else np.zeros(0)
+            past = as_doubles(history, "the history") if history is not None else np.zeros(0)
             if past.shape != self._history_shape:
                 raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
             x = np.concatenate((past.ravel(), action))
@@ -389,8 +397,8 @@ class LcNsKmp:
         at = as_numbers(steps, "steps")
         if at.ndim > 1 or not (at >= 0).all() or (at % 1 != 0).any():
             raise InputError(f"steps are whole numbers from 0 on, one for each prediction, not {brief(steps)}")
-        actions = None if null_space_actions is None else np.asarray(null_space_actions, dtype=float)
-        past = np.zeros(0) if histories is None else np.asarray(histories, dtype=float)
+        actions = None if null_space_actions is None else as_doubles(null_space_actions, "null-space actions")
+        past = np.zeros(0) if histories is None else as_doubles(histories, "histories")
         batched = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
         size = len(batched[0]) if batched else at.size
         if actions is not None and actions.shape != (size, self.num_outputs):
@@ -413,8 +421,7 @@ class LcNsKmp:
 
     def _checked_step(self, step: int) -> int:
         """Return a step, the last one for a step past the end; raise an `InputError` unless it is a whole number."""
-        number = as_whole(step, "a step")
-        if number < 0:
+        if (number := as_whole(step, "a step")) < 0:
             raise InputError(f"step counts from 0, not {step}")
         return min(number, self.num_steps - 1)
 

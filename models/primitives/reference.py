@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_numbers, as_whole, find_asymmetric
+from guiderail.models.common.arrays import as_number, as_numbers, as_whole, find_asymmetric
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel
@@ -109,7 +109,9 @@ class ReferenceTrajectory:
         """
         if model not in ("gmr", "promp"):
             raise InputError(f"the model of a reference is gmr or promp, not {model!r}")
-        if not 0.0 < gap_scale < np.inf:
+        if not isinstance(demonstrations, Demonstrations):
+            raise InputError(f"a reference is fitted to Demonstrations, not {brief(demonstrations)}")
+        if not 0.0 < as_number(gap_scale, "gap_scale") < np.inf:
             raise InputError(f"gap_scale is a factor of the standard deviation and must be positive, not {gap_scale}")
         recordings, number = demonstrations, demonstrations.num_demonstrations
         if prior_std is None and number == 1:

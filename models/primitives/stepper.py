@@ -49,7 +49,7 @@ class PrimitiveStepper:
             at rest, or with the velocity of the last two outputs if `pose` holds several.
 
     Raises:
-        InputError: If an argument has the wrong shape or is not finite.
+        InputError: If an argument has the wrong shape or is not finite, or `motion` is no filter of O outputs.
 
     Attributes:
         primitive: Primitive.
@@ -67,6 +67,10 @@ class PrimitiveStepper:
     ):
         if history_source not in ("commanded", "measured"):
             raise InputError(f"history_source is commanded or measured, not {brief(history_source)}")
+        if motion is not None and getattr(motion, "num_outputs", None) != primitive.num_outputs:
+            raise InputError(f"motion is a filter of {primitive.num_outputs} outputs, not {brief(motion)}")
+        if motion is not None and not hasattr(motion, "apply"):
+            raise InputError(f"motion is a MotionConstraintFilter, not {brief(motion)}")
         self.primitive, self.num_steps = primitive, 0
         self.gain = np.ones(primitive.num_outputs) if gain is None else self._checked(gain, "gain")
         first = primitive.reference.means[0]

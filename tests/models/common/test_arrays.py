@@ -35,7 +35,7 @@ def test_large_doubles_are_accepted_with_small_whole_numbers():
 
 @pytest.mark.parametrize("value", ["3", None, [3.0], np.ones((1, 1))])
 def test_a_text_and_a_list_are_not_one_number(value):
-    with pytest.raises(InputError, match="the length must be one number, not"):
+    with pytest.raises(InputError, match="the length must be a number, not"):
         as_number(value, "the length")
     assert [as_number(number, "the length") for number in (3, np.float32(0.5), np.array(2.0))] == [3.0, 0.5, 2.0]
 

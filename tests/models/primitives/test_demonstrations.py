@@ -187,3 +187,18 @@ def test_numbers_of_steps_and_phases_are_whole(value):
         with pytest.raises(InputError, match="must be a whole number"):
             refused()
     assert len(given.resampled(np.int64(4)).times[0]) == 4
+
+
+def test_arguments_of_another_type_are_refused():
+    calls = [
+        lambda: wavy().first("all"),
+        lambda: wavy().first(1.5),
+        lambda: align_demonstrations(wavy(), None),
+        lambda: compute_bounds(wavy(), margin="wide"),
+        lambda: compute_bounds(wavy(), min_margin=[0.1, 0.2]),
+        lambda: compute_bounds(wavy(), bounded=0),
+    ]
+    for call in calls:
+        with pytest.raises(InputError, match=r"must be a (whole )?number, not|bounded must be a list, not 0"):
+            call()
+    assert wavy().first(1.0).num_demonstrations == 1

@@ -30,5 +30,5 @@ def test_kernel_refuses_an_invalid_length_scale(kernel, scale):
 @pytest.mark.parametrize("scale", ["a", [1.0], None])
 def test_length_scale_is_one_number(scale):
     for make in (Matern52, lambda scale: make_kernel(length_scale=scale)):
-        with pytest.raises(InputError, match="the kernel's length_scale must be one number"):
+        with pytest.raises(InputError, match="the kernel's length_scale must be a number, not"):
             make(scale)

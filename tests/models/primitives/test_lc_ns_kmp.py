@@ -556,3 +556,45 @@ def test_unused_primitive_is_released():
 def test_invalid_arguments_are_refused():
     with pytest.raises(InputError, match="lambda_"):
         get_shared_primitive(reference(), box(), KERNEL, lambda_=-1.0)
+
+
+def _small_reference():
+    t = np.linspace(0.0, 1.0, 20)
+    return ReferenceTrajectory(t, np.column_stack([t, t]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"lambda_": "6"}, "lambda_ must be a number, not '6'"),
+        ({"beta": [1.0, 2.0]}, "beta must be a number"),
+        ({"history": 2, "history_variance": None}, "history_variance must be a number, not None"),
+        ({"max_deviation": np.nan}, "max_deviation must not be negative: .* nan"),
+        ({"max_deviation": "large"}, "max_deviation must be a number"),
+        ({"cache_bytes": "1 MB"}, "cache_bytes must be a number"),
+        ({"kernel": "matern52"}, "a kernel is an object such as SquaredExponential"),
+        ({"kernel": Matern52}, "a kernel is an object such as SquaredExponential"),
+        ({"constraints": ([0, 0], [1, 1])}, "constraints of a primitive are LinearConstraints"),
+        ({"reference": np.zeros((3, 2))}, "needs a ReferenceTrajectory"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        LcNsKmp(**({"reference": _small_reference()} | wrong))
+
+
+def test_predict_refuses_what_is_no_number():
+    primitive = LcNsKmp(_small_reference(), history=2)
+    past = np.zeros((2, 2))
+    for step in ("1", None, [1], np.array([1, 2]), True):
+        with pytest.raises(InputError, match="a step is a whole number, not"):
+            primitive.predict(step, None, past)
+    for action in ("ab", ["1", "2"], [1.0, [2.0]], [1j, 0.0]):
+        with pytest.raises(InputError, match="a null-space action is not an array of numbers"):
+            primitive.predict(0, action, past)
+        with pytest.raises(InputError, match="null-space actions is not an array of numbers"):
+            primitive.predict_batch([0], [action], past[None])
+    with pytest.raises(InputError, match="the history is not an array of numbers"):
+        primitive.predict(0, None, [[0.0, 0.0], [0.0]])
+    outputs = [primitive.predict(step, [0, 1], past.tolist()).output for step in (3, np.int64(3), 3.0)]
+    np.testing.assert_array_equal(outputs[1:], outputs[:1] * 2)

@@ -188,3 +188,20 @@ def test_constant_output_has_a_spread_independent_of_its_value(height):
     outputs = [np.column_stack([np.sin(t + 0.05 * rng.normal()), np.full(50, height)]) for _ in range(3)]
     reference = ReferenceTrajectory.from_demonstrations(Demonstrations([t] * 3, outputs), 4)
     np.testing.assert_allclose(reference.standard_deviations[:, 1], 1e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"components": 2.5}, "components must be between 1 and half the number of steps, 60: 2.5"),
+        ({"components": "6"}, "components must be between"),
+        ({"seed": -1}, "the seed of a mixture is a whole number from 0"),
+        ({"seed": "a"}, "the seed of a mixture"),
+        ({"gap_scale": None}, "gap_scale must be a number, not None"),
+        ({"demonstrations": "demonstrations.npz"}, "a reference is fitted to Demonstrations, not 'demonstrations.npz'"),
+        ({"demonstrations": hourglass(1), "prior_std": "small"}, "prior_std is not an array of numbers"),
+    ],
+)
+def test_arguments_of_another_type_are_refused(wrong, message):
+    with pytest.raises(InputError, match=message):
+        ReferenceTrajectory.from_demonstrations(**({"demonstrations": hourglass(3), "components": 4} | wrong))

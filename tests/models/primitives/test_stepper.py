@@ -121,3 +121,24 @@ def test_wrong_step_is_refused_and_the_episode_continues():
     with pytest.raises(InputError, match="measured pose at every step"):
         stepper.step([0.0, 0.0])
     assert stepper.num_steps == 1
+
+
+def test_filter_of_another_type_or_size_is_refused():
+    p = primitive()
+    larger = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(3)), PERIOD)
+    for wrong in (5, MotionConstraints(p.constraints), larger):
+        with pytest.raises(InputError, match="motion is a"):
+            p.start(motion=wrong)
+    for arguments in ((p.constraints, PERIOD), (MotionConstraints(p.constraints), "0.02")):
+        with pytest.raises(InputError, match=r"needs MotionConstraints|must be a number, not '0.02'"):
+            MotionConstraintFilter(*arguments)
+
+
+@pytest.mark.parametrize("history", [0, 1])
+def test_filter_starts_with_the_velocity_of_two_outputs(history):
+    p = primitive(history)
+    motion = MotionConstraintFilter(MotionConstraints(p.constraints, max_acceleration=[1.0, 1.0]), PERIOD)
+    first = p.start([[0.0, 0.0], [0.01, 0.0]], motion=motion).step([0.0, 0.0]).output
+    assert abs(first[0] - 0.02) <= PERIOD**2 * (1 + 1e-9)
+    with pytest.raises(InputError, match="pose must be 2 finite numbers"):
+        p.start([[0.0, 0.0], [0.01, 0.0]])

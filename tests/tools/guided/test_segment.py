@@ -202,3 +202,15 @@ def test_alignment_of_too_many_samples_is_refused():
 def test_wrong_band_is_refused(band):
     with pytest.raises(InputError, match="band"):
         align_demonstrations(recordings(), band)
+
+
+@pytest.mark.parametrize("wrong", [None, 5, [recordings()]])
+def test_segment_needs_demonstrations_or_their_file(wrong):
+    with pytest.raises(InputError, match="a segment has Demonstrations or their file, not"):
+        Segment(wrong)
+
+
+@pytest.mark.parametrize("discrete", [5, [1, 1, 1], [None] * 3, [[0.0, [1.0]]] * 3])
+def test_discrete_outputs_that_are_no_lists_are_refused(discrete):
+    with pytest.raises(InputError, match="a value for each sample"):
+        Segment(recordings(), discrete=discrete).discrete_values(12)
