@@ -62,8 +62,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         constraints: Constraints of a single motion without segments; `Segment` has its own.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
-        template_frames: (env, observation) → poses X_WF (`RigidTransform`) of the template's objects by name, called
-            at reset.
+        template_frames: (env, observation) → poses X_WF of the template's objects by name, called at reset; each is a
+            `RigidTransform` of `guiderail.models.common.transforms` or of Drake.
         period: Duration of a step of `env` [s], positive; required for a template, for `MotionConstraints`, and unless
             every segment has `num_steps`.
         action_repeat: Steps of `env` for which an action is applied, at least 1.

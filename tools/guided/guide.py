@@ -13,7 +13,7 @@ import numpy as np
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
@@ -378,7 +378,8 @@ class TemplateGuide(Guide):
 
     Args:
         template: Template.
-        frames: (env, observation) → poses X_WF (`RigidTransform`) of the template's objects by name, called at reset.
+        frames: (env, observation) → poses X_WF of the template's objects by name, called at reset; each is a
+            `RigidTransform` of `guiderail.models.common.transforms` or of Drake.
         period: Control period [s], positive.
         extra: Value for `to_action`, or (name of the state) → value.
 
@@ -404,12 +405,18 @@ class TemplateGuide(Guide):
         """Begin in the template's state at the measured pose.
 
         Raises:
-            InputError: If the pose of an object is missing, or a pose is not finite.
+            InputError: If the pose of an object is missing or no transform, or a pose is not finite.
         """
-        self._frames = self._frames_of(env, observation)
-        missing = [name for name in self.template.frames if name not in self._frames]
+        frames = self._frames_of(env, observation)
+        if not isinstance(frames, Mapping):
+            raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
+        missing = [name for name in self.template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {self.template.name} needs the frame {missing[0]}: give its pose")
+        for name, X_WF in frames.items():
+            if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
+                raise InputError(f"the frame {name} is a RigidTransform, as of Drake, not {brief(X_WF)}")
+        self._frames = {name: RigidTransform(X_WF) for name, X_WF in frames.items()}
         X_WE = pose_to_transform(pose)
         self._state = self.template.state_at(X_WE, self._frames)
         self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE

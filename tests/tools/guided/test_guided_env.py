@@ -621,3 +621,21 @@ def test_vector_environment_refuses_nan_in_the_row_of_a_reset():
     assert truncated.all()
     with pytest.raises(InputError, match="finite"):
         vector.step(np.full((2, 3), np.nan))
+
+
+def test_frames_of_a_template_may_be_transforms_of_drake():
+    drake, scaled = pytest.importorskip("pydrake.math"), []
+    for X_WF in (RigidTransform([0.6, 0.0, 0.3]), drake.RigidTransform([0.6, 0.0, 0.3])):
+        template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, o, X=X_WF: {"mug_tip": X}, 0.02)
+        template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.1, 0.0, 0.0]))
+        template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+        output = template_guide.finish(None).output
+        scaled.append(np.concatenate([output, template_guide.scaled_command()]))
+    np.testing.assert_array_equal(*scaled)
+
+
+@pytest.mark.parametrize("frames", [None, 5, {"mug_tip": np.eye(4)}, {"mug_tip": None}])
+def test_frames_of_a_template_that_are_no_poses_are_refused(frames):
+    template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
+    with pytest.raises(InputError, match=r"poses by name, not|the frame mug_tip is a RigidTransform, as of Drake, not"):
+        template_guide.reset(None, None, np.zeros(6))
