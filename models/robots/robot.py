@@ -157,8 +157,10 @@ def register_robot(robot: Robot) -> Robot:
         robot: Robot with a name that is not registered yet.
 
     Raises:
-        InputError: If the name is taken.
+        InputError: If it is no robot, or the name is taken.
     """
+    if not isinstance(robot, Robot):
+        raise InputError(f"a robot is registered as a Robot object, not {brief(robot)}")
     return _ROBOTS.register(robot.name, robot)
 
 

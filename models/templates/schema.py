@@ -7,6 +7,7 @@ import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -62,6 +63,8 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
     Raises:
         InputError: If the file cannot be read or is not a valid template.
     """
+    if not isinstance(source, str | PathLike):
+        raise InputError(f"a template is read from a file or by its name, not from {brief(source)}")
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         return _read(load_yaml(path, "template"), path.name, parameters)

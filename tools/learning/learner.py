@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -190,6 +190,8 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
 
 def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Return the names of log formats; raise an InputError if one is unknown, or its package is not installed."""
+    if not isinstance(formats, Iterable):
+        raise InputError(f"log is a format or a list of formats, not {brief(formats)}")
     names = (formats,) if isinstance(formats, str) else tuple(formats)
     for name in names:
         if name not in LOG_FORMATS:

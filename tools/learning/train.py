@@ -138,6 +138,10 @@ def train(
             f"training needs the name of a task or its folder, not {brief(task)}: register an environment of your own "
             "with gymnasium.register as guiderail/NAME-v0, and give NAME"
         )
+    if not isinstance(out, str | PathLike):
+        raise InputError(f"out is the path of the run's folder, not {brief(out)}")
+    if not (settings is None or isinstance(settings, Mapping)):
+        raise InputError(f"settings of the learner are values by name, not {brief(settings)}")
     name, imports = task_named(str(task))
     environment = options if guidance is None else {"guidance": guidance, **options}
     _refuse_misspelled(name, environment, options)

@@ -60,6 +60,12 @@ def test_find_end_effector_suggests_the_nearest_name():
         find_end_effector("gripper")
 
 
+@pytest.mark.parametrize("robot", [5, None, type("Arm", (), {"name": "arm"})])
+def test_register_refuses_what_is_no_robot(robot):
+    with pytest.raises(InputError, match="a robot is registered as a Robot object, not"):
+        register_robot(robot)
+
+
 def test_register_refuses_a_second_robot_of_a_name():
     with pytest.raises(InputError, match="panda"):
         register_robot(dataclasses.replace(find_robot("panda"), title="another"))

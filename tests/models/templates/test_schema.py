@@ -237,3 +237,9 @@ def test_parse_refuses_a_parameter_that_depends_on_another():
             "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "
             "max_speed_rad_per_s: 1, states: {}}"
         )
+
+
+@pytest.mark.parametrize("source", [None, 5, ["pouring"]])
+def test_template_is_read_from_a_path_or_a_name(source):
+    with pytest.raises(InputError, match="a template is read from a file or by its name, not from"):
+        load_template(source)

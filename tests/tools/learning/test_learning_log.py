@@ -14,6 +14,7 @@ from guiderail.models.common import errors
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.learner import LearningLog, check_log_formats
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import train
 from guiderail.tools.learning.trainer import run_training
 from oracles.same_runs import differences
 
@@ -110,3 +111,17 @@ def test_metrics_of_a_training_after_the_last_episode_get_an_entry(tmp_path):
     logged = pd.read_csv(tmp_path / "progress.csv")
     assert len(logged) == 2
     assert logged["train/loss"].tolist()[1] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"settings": [("learning_rate", 1e-3)]}, "settings of the learner are values by name, not"),
+        ({"out": None}, "out is the path of the run's folder, not None"),
+        ({"log": 5}, "log is a format or a list of formats, not 5"),
+    ],
+)
+def test_train_refuses_arguments_of_another_type(wrong, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        train("NarrowPassage", **{"guidance": "kgrl", "out": tmp_path / "run", **wrong})
+    assert not (tmp_path / "run").exists()
