@@ -131,7 +131,8 @@ class Learner(Callback, ABC):
         """Return everything that the rest of the run depends on, between two episodes.
 
         Returns:
-            Arrays of any shape by name, and values that JSON can hold.
+            Arrays of numbers by name (one without a dimension is restored with the shape (1,)), and values that JSON
+            can hold.
         """
 
     @abstractmethod

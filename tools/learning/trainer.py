@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -9,6 +10,7 @@ from numbers import Number
 from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
+import numpy as np
 import torch
 
 from guiderail.models.common.errors import InputError, brief
@@ -253,8 +255,22 @@ def _save(
 def write_checkpoint(
     folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, more: Mapping[str, Any] | None = None
 ) -> None:
-    """Write the checkpoint: the episodes' rows, the states of learner and environment, and `more`."""
-    arrays, values = learner.state()
+    """Write the checkpoint: the episodes' rows, the states of learner and environment, and `more`.
+
+    Raises:
+        InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold.
+    """
+    state = learner.state()
+    if not (isinstance(state, tuple) and len(state) == 2 and all(isinstance(part, Mapping) for part in state)):
+        raise InputError(f"{type(learner).__name__}.state must return two dictionaries, not {brief(state)}")
+    arrays, values = state
+    for name, array in arrays.items():
+        if np.asarray(array).dtype.kind not in "fiub":
+            raise InputError(f"the array {name!r} of {type(learner).__name__}.state has no numbers: {brief(array)}")
+    try:
+        json.dumps(values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"the values of {type(learner).__name__}.state must be values of JSON: {error}") from error
     stored = {"rows": rows, "learner": values, "environment": env.unwrapped.np_random.bit_generator.state}
     save_checkpoint(folder.checkpoint, arrays, stored | dict(more or {}))
 

@@ -229,3 +229,25 @@ def test_learner_that_returns_something_else_is_named(columns, policy, words, tm
             run_training(RunFolder(tmp_path / "run"), configure("Bead", {}, algorithm="odd", episodes=2, seed=1))
     finally:
         del LEARNERS._entries["odd"]
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (None, "Odd.state must return two dictionaries, not None"),
+        (([], {}), "Odd.state must return two dictionaries"),
+        (({"words": np.array(["a"])}, {}), "the array 'words' of Odd.state has no numbers"),
+        (({}, {"mean": np.zeros(2)}), "the values of Odd.state must be values of JSON: Object of type ndarray"),
+    ],
+)
+def test_state_that_cannot_be_stored_is_named(state, words, tmp_path):
+    class Odd(ZeroLearner):
+        def state(self):
+            return state
+
+    LEARNERS.register("odd")(Odd)
+    try:
+        with pytest.raises(InputError, match=words):
+            run_training(RunFolder(tmp_path / "run"), configure("Bead", {}, algorithm="odd", episodes=1, seed=1))
+    finally:
+        del LEARNERS._entries["odd"]
