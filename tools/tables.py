@@ -33,11 +33,12 @@ def table_text(rows: Rows) -> str:
 def read_table(path: Path) -> pd.DataFrame:
     """Read a CSV file.
 
-    A column of only numbers and empty cells is numeric; its empty cells are NaN. In a column of text they are "".
+    A column of only numbers and empty cells is numeric; its empty cells are NaN. A column of only True and False is
+    boolean. All other columns are text; their empty cells are "".
 
     Raises:
-        InputError: If the file is missing or larger than `MAX_FILE_SIZE`, a row is not as long as the header, or column
-            names are missing or repeated.
+        InputError: If the file is missing, larger than `MAX_FILE_SIZE` or not CSV in UTF-8, a row is not as long as the
+            header, or column names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
@@ -67,7 +68,8 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
     """Check the sizes that the footers of Parquet files claim, before anything is allocated for their rows.
 
     Raises:
-        InputError: If a file is not a readable Parquet file, or all files together have too many rows or list elements.
+        InputError: If a file is not a readable Parquet file, or all files together have more than `max_rows` rows. Long
+            lists count as several rows.
     """
     import pyarrow as arrow
     import pyarrow.parquet as parquet
@@ -88,7 +90,7 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
 
 
 def write_table(path: Path, rows: Rows) -> Path:
-    """Write rows as `path`.csv and as `path`.md, and return the path of the Markdown file."""
+    """Write rows as CSV and Markdown, with the endings .csv and .md appended to `path`; return the Markdown file."""
     table = pd.DataFrame(rows, dtype=object)
     # Not `with_suffix`, which would replace a part of a name such as "bound-0.5".
     csv_file, markdown_file = path.with_name(f"{path.name}.csv"), path.with_name(f"{path.name}.md")
@@ -100,7 +102,7 @@ def write_table(path: Path, rows: Rows) -> Path:
 
 
 def cell(value: Any) -> str:
-    """Return a value as text of a readable table: four digits, and a dash for a missing value."""
+    """Return a value as text of a readable table: four significant digits, and a dash for a missing value."""
     if isinstance(value, list | tuple):
         return ", ".join(map(str, value))
     if value is None or value is pd.NA or (isinstance(value, float) and value != value):

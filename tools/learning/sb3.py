@@ -1,4 +1,4 @@
-"""Stable-Baselines3 in a run: callbacks, demonstrations in every batch, and its objects as arrays of a checkpoint."""
+"""Stable-Baselines3 in a run: callbacks, a replay buffer with demonstrations, and states as arrays of a checkpoint."""
 
 import random
 from collections.abc import Mapping
@@ -54,7 +54,7 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         if not self.num_demonstrated:
             return super()._get_samples(batch_inds, env)
-        # The row after the last one is a demonstration: a return of several steps ends at the last row.
+        # The buffer is a ring: a demonstration follows its last row, so an n-step return must end there.
         kept = self.timeouts[-1].copy()
         self.timeouts[-1] = np.logical_or(kept, np.logical_not(self.dones[-1]))
         samples = super()._get_samples(batch_inds, env)
@@ -64,8 +64,8 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Return a batch with evenly spaced demonstrated rows.
 
-        Several batches can be sampled at once: if the rows are divided into equal parts, each part has the same
-        fraction of demonstrations.
+        Several batches can be sampled at once and then divided into equal parts: the numbers of demonstrations in the
+        parts differ by at most one.
         """
         size, first = self.size(), self.num_demonstrated
         if not 0 < first < size:
@@ -110,7 +110,7 @@ def restore_modules(
 def load_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
     """Set the parameters and buffers of a module from arrays or tensors by name.
 
-    Files store 0-d arrays, such as counters of steps, as 1-d arrays.
+    Each array is reshaped to the module's shape, because files store 0-d arrays, such as counters of steps, as 1-d.
     """
     shapes = {name: value.shape for name, value in module.state_dict().items()}
     tensors = {name: torch.as_tensor(value) for name, value in arrays.items()}
@@ -118,10 +118,14 @@ def load_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
 
 
 def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the states of the global random generators, which Stable-Baselines3 samples from."""
+    """Return the states of the global random generators, which Stable-Baselines3 samples from.
+
+    Returns:
+        Arrays by name, and values that JSON can hold.
+    """
     kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
-    if torch.cuda.is_initialized():  # so that a resumed run samples as an uninterrupted one
+    if torch.cuda.is_initialized():  # so that a resumed run samples the same numbers
         arrays["random/cuda"] = torch.cuda.get_rng_state().numpy()
     return arrays, {"numpy": [kind, *rest], "python": random.getstate()}
 
@@ -141,8 +145,8 @@ class Sb3Callbacks(Callback):
     """Callback of an episode that calls callbacks of Stable-Baselines3.
 
     The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts the run's
-    transitions, including those before it was resumed, and `locals` has the names `infos`, `rewards`, `dones`,
-    `actions` and `new_obs`, with values of one environment.
+    transitions, including those before it was resumed. `locals` has the names `infos`, `rewards`, `dones`, `actions`
+    and `new_obs`, each of length 1 as for one environment.
 
     Attributes:
         is_stopped: True once a callback returned False from `on_step`; training ends after the episode.
@@ -164,7 +168,7 @@ class Sb3Callbacks(Callback):
             if not isinstance(one, BaseCallback):
                 raise InputError(f"{brief(one)} is no callback: give those of Stable-Baselines3 (BaseCallback)")
         self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
-        self._learner, self._first = learner, getattr(learner, "transitions", 0)  # those of `init_from` do not count
+        self._learner, self._first = learner, getattr(learner, "transitions", 0)  # without those of `init_from`
         self.is_stopped = False
 
     def on_episode_start(self) -> None:

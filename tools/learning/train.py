@@ -47,7 +47,7 @@ class Run:
 
     Attributes:
         path: Folder of the run.
-        pictures: Paths of the pictures drawn after training, by name.
+        pictures: Paths of the pictures drawn after training, by name; for a page that could not be drawn, the reason.
     """
 
     path: Path
@@ -84,7 +84,7 @@ class Run:
 
 
 def _names_code(file: Path) -> bool:
-    """Return True if a new process reads a run's configuration only within `trust_imports`."""
+    """Return True if a run's configuration names code, which a new process loads only within `trust_imports`."""
     config = load_yaml(file, "configuration")
     base_policy = str(config["environment"].get("base_policy", ""))
     has_code = is_policy_file(base_policy) and not base_policy.endswith(".onnx")
@@ -115,15 +115,15 @@ def train(
         out: Folder of the run; with `resume`, that of the run to continue.
         episodes: Total number of episodes; None for 60.
         seed: Seed of all random numbers, in [0, 2³¹); None for 0.
-        algorithm: Registered name of the learner; None for the preset's or the task's.
-        preset: Name of the learner's preset; None for the task's.
-        settings: Settings of the learner by name, in place of the preset's.
+        algorithm: Registered name of the learner; None for the preset's, or without a preset the task's.
+        preset: Name of the learner's preset; None for the algorithm's default, or without an algorithm the task's.
+        settings: Settings of the learner by name; they override those of the preset and of the task.
         log: Formats of a learning log in the folder's `logs/`: tensorboard, wandb, csv, json, log or stdout; none by
             default.
         callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after the
             episode.
-        resume: Continue a run that was stopped; the result is that of an uninterrupted run. With fewer `episodes` than
-            planned, it is that of a run of so many episodes, because nothing in training depends on the planned number.
+        resume: Continue a run that was stopped; the result is that of an uninterrupted run. `episodes` may be any
+            number from that of the finished episodes on: nothing in training depends on the planned number.
         pictures: Draw the learning curve and the replay page after training.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
@@ -131,7 +131,8 @@ def train(
         The run: its path, configuration, table of episodes and policy.
 
     Raises:
-        InputError: If a name is unknown, a value is out of range, or the folder holds another run.
+        InputError: If a name is unknown, a value is out of range, the folder is not empty, an argument contradicts the
+            run to resume, an episode fails, or learning diverges.
     """
     if not isinstance(task, str | PathLike):
         raise InputError(
@@ -153,7 +154,7 @@ def train(
 
 
 def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mapping[str, Any]) -> None:
-    """Raise an InputError for an option that the environment does not have, and whose name is nearly an argument's."""
+    """Raise an InputError if the environment refuses its options, and one has nearly the name of an argument."""
     for name in options:
         if near := get_close_matches(name.lower(), signature(train).parameters.keys() - {"task", "options"}, 1, 0.8):
             try:
@@ -180,19 +181,22 @@ def start_or_resume(
     sb3_callbacks: Any = None,
     make_supervisor: Callable[[], Supervisor] | None = None,
 ) -> Run:
-    """Train with a progress bar and draw the learning curve and the replay page; None stands for a default.
+    """Train with a progress bar, and draw the learning curve and the replay page.
 
-    A resumed run keeps its configuration; only `episodes` may be another number, at least those done. The arguments are
-    those of `train` and:
+    A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes. An
+    argument that is None has its default. The arguments are those of `train` and:
 
     - `task`: name of the task; None with `resume`.
     - `environment`: options of the environment by name.
     - `imports`: modules or files (.py) that register the task, the learner, …
-    - `step_log`: True to write every control step to the step log.
-    - `sb3_callbacks`: callbacks of Stable-Baselines3.
-    - `make_supervisor`: constructs the supervisor of a run with a human in the loop.
+    - `step_log`: True to write every control step to the step log; the default.
+    - `sb3_callbacks`: the `callbacks` of `train`.
+    - `make_supervisor`: function that constructs the supervisor; the run then has a human in the loop.
 
     The task's scripted policy acts in the learner's `demonstration_episodes`.
+
+    Raises:
+        InputError: As `train`, or if `out` is missing, or `task` without `resume`.
     """
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
@@ -241,8 +245,9 @@ def configure(
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
-    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them. By default, the
-    algorithm is the preset's, and the preset is that of `default_preset`; `with_defaults` supplies the task's learner.
+    The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them, and
+    `human_in_the_loop`: True if a supervisor corrects the policy. By default, the algorithm is the preset's, and the
+    preset is that of `default_preset`, not that of the task's learner, which `with_defaults` adds.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.

@@ -56,8 +56,8 @@ def run_training(
 ) -> list[dict[str, Any]]:
     """Train a run to its last episode and write its folder.
 
-    A run that was killed and resumed gives bit for bit the result of an uninterrupted run: a checkpoint is taken at
-    the end of an episode and holds every number and every random generator that the rest of the run depends on. The
+    A run that was killed and resumed gives bit for bit the result of an uninterrupted run: a checkpoint is written at
+    the end of an episode and holds everything that the rest of the run depends on, random generators included. The
     step log is written before the checkpoint; episodes after the last checkpoint are run and logged again.
 
     Args:
@@ -65,8 +65,9 @@ def run_training(
         config: Configuration; with `resume` it must agree with the folder's.
         resume: Continue the run from its checkpoint.
         report: Called with the row of each episode.
-        demonstrator: Function from an environment to the policy of the learner's `demonstration_episodes`. The policy
-            must not depend on earlier episodes. Off-policy learners learn from demonstrations (Vecerik et al., 2017).
+        demonstrator: Function from an environment to the policy that acts in the learner's `demonstration_episodes`.
+            Its actions must not depend on earlier episodes. Off-policy learners also learn from these transitions
+            (Vecerik et al., 2017).
         supervisor: Supervisor of a run that is configured `human_in_the_loop`.
         log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
         sb3_callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after
@@ -76,9 +77,10 @@ def run_training(
         The rows of `episodes.csv`.
 
     Raises:
-        InputError: If the folder holds another run, another process writes into it, or a demonstrator, a supervisor or
-            the package of a log format is missing; or if an episode fails. If the first episode fails, a folder that
-            did not exist before is removed.
+        InputError: If the folder of a new run is not empty, another process writes into it, settings are incompatible,
+            or a demonstrator, a supervisor or the package of a log format is missing; or if an episode fails, learning
+            diverges, or the learner returns no `Policy`. If the first episode fails, a folder that did not exist
+            before is removed, unless learning diverged.
     """
     if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
         raise InputError(
@@ -227,7 +229,7 @@ def _train(
 
 
 def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored: int, folder: RunFolder) -> None:
-    """Raise an `InputError` unless an episode has numbers in the columns of the episodes before it."""
+    """Raise an `InputError` if an episode's columns differ from the first episode's, or a value is not a number."""
     if rows and (changed := sorted(rows[0].keys() ^ row.keys())):
         if len(rows) == num_restored:
             raise InputError(
@@ -279,11 +281,12 @@ def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[l
     """Restore learner and environment from the checkpoint.
 
     Returns:
-        The rows up to the checkpoint, and the number of rows in `episodes.csv`: fewer if the run was killed between
-        writing the two files.
+        The rows up to the checkpoint, and the number of rows in `episodes.csv`, which is smaller if the run was killed
+        between writing the two files. Without both files, there are no rows.
 
     Raises:
-        InputError: If the table differs from the checkpoint's, or the checkpoint is of another learner.
+        InputError: If the checkpoint is missing or damaged, its rows differ from `episodes.csv`, or its state is that
+            of another learner.
     """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():

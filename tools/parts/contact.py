@@ -21,14 +21,14 @@ from guiderail.models.parts.solids import join_surfaces
 
 MODULUS = 2e9  # first modulus of the compliant part [Pa]
 MAX_MODULUS = 5e10  # largest modulus [Pa]
-SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of a body that has to deflect [Pa]
+SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of snapping bodies, in the order of the trials [Pa]
 # Commanded depths below the target [m]: tried in turn if bodies snap, until one seats the plug; otherwise the first.
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)
 MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug [m]
 MIN_SPEED = 2.0  # smallest desired real-time factor
-MAX_TRIALS = 5  # settings tried for each compliant part
-MIN_TIME_STEP = 0.0025  # time step that is not halved further [s]
-TRIAL_SECONDS = 20.0  # CPU time of a part's trials after which no further trial starts [s]
+MAX_TRIALS = 5  # largest number of settings tried for each contact geometry
+MIN_TIME_STEP = 0.0025  # largest time step that is not halved further [s]
+TRIAL_SECONDS = 20.0  # CPU time of a geometry's trials after which no further settings are tried [s]
 CHECK_SECONDS = 20  # largest CPU time for Drake to build the contact geometry [s]
 
 
@@ -74,8 +74,8 @@ class Choice:
     contact: Contact  # contact geometry and settings
     push: float  # commanded depth below the target [m]
     aligned: Any  # trial with the socket in place
-    misaligned: tuple[Any, ...] = ()  # trials at `MISALIGNMENTS`
-    seconds: float = 0.0  # CPU time of cutting, meshing and checking geometry, before any trial [s]
+    misaligned: tuple[Any, ...] = ()  # trials at `MISALIGNMENTS`; empty if the aligned plug does not seat
+    seconds: float = 0.0  # CPU time of cutting, meshing and checking all geometries, without the trials [s]
 
     @property
     def trials(self) -> tuple[Any, ...]:
@@ -109,14 +109,15 @@ def choose_contact(
 
     Args:
         folder: Folder of the task.
-        surfaces: Contact surfaces of plug and socket.
+        surfaces: Contact surfaces of the parts "plug" and "socket".
         make_file: See `MakeFile`.
-        tolerance: Largest deviation of the pieces from the surfaces [m].
-        clearance: Clearance between the walls [m].
+        tolerance: Intended deviation of the pieces from the surfaces [m]. Convex pieces are refused above twice, and
+            tetrahedra above four times this deviation.
+        clearance: Clearance between the walls [m]; infinite if no walls face each other.
         log: Function called with a sentence on each result.
 
     Raises:
-        InputError: If no part can be made compliant, or Drake accepts none of the geometries.
+        InputError: If no part can be made compliant, or Drake refuses or cannot simulate every geometry.
     """
     allowed = 0.5 * clearance if np.isfinite(clearance) and clearance > 0.0 else 5e-5
     snapping = surfaces["plug"].snapping
@@ -193,7 +194,8 @@ def _adapt_settings(
     """Return the choices tried; the settings of each follow from the penetration of the previous one.
 
     Penetration that remains while the resting plug is pushed requires a larger modulus. Transient penetration is an
-    overshoot proportional to the time step. The dissipation stays at its default, because less would eject the plug.
+    overshoot proportional to the time step and requires a smaller one. The dissipation stays at its default, because
+    less would eject the plug.
     """
     choices: list[Choice] = []
     start = cpu_time()
@@ -203,7 +205,7 @@ def _adapt_settings(
         except RuntimeError:
             if not choices:
                 raise
-            break  # the settings before work
+            break  # the previous settings work
         choices.append(choice)
         resting = max(trial.resting_penetration for trial in choice.trials)
         log(

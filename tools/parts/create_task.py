@@ -1,4 +1,4 @@
-"""Insertion task from two mesh files: contact geometry, motion, success criterion and demonstrations, all measured."""
+"""Insertion task from two mesh files: contact geometry, motion, success criterion, demonstrations and measurements."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a gantry has no gravity
-CLEAR = 3.0 * MM  # height of the start above the rim
+CLEAR = 3.0 * MM  # height of the start above the rim [m]
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 180.0  # largest rotation at the bottom, either way [degrees]
 MAX_PITCH = 0.1  # largest advance per turn, either way [m]
 MAX_SEARCH_TURN = 10.0  # largest unknown turn of the socket [degrees]
 COMMANDED_TURN = 1.5  # bound of the commanded turn, as a multiple of the unknown turn of the socket
 MAX_SEATED_TURN = 20.0  # largest turn of a seated plug if the insertion has no turn [degrees]
-MAX_EPISODES = 100  # largest number of episodes of a calibration
+MAX_EPISODES = 100  # largest number of episodes of each policy for each setting of a calibration
 MAX_CENTER = 1.0  # largest distance of the insertion axis from the plug's center of mass [m]
 
 
@@ -63,12 +63,14 @@ def read_parts(
         plug: Mesh file of the part in the tool.
         socket: Mesh file of the part in the world.
         unit: Unit of both files; None if their formats state it.
-        plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the socket's unit, [rx ry rz] in degrees.
-        axis: Direction in which the plug is removed, in the socket's file.
-        center: Point on the axis, in the socket's file; the plug's center of mass by default.
+        plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the socket's unit, and rotations
+            [rx ry rz] about the fixed axes x, y and z, in this order [degrees].
+        axis: Direction in which the plug is removed, in the coordinates of the socket's file; a key of `AXES`.
+        center: Point (3,) on the axis, in the coordinates and unit of the socket's file; None for the plug's center of
+            mass.
 
     Raises:
-        InputError: If a file cannot be used, or an argument is invalid.
+        InputError: If a file cannot be used, an argument is invalid, or the parts are not assembled.
     """
     if axis not in AXES:
         raise InputError(
@@ -141,13 +143,14 @@ def create_task(
         force_limit: Contact force that ends an episode as a collision [N].
         friction: Friction coefficient of all surfaces.
         scenario: Files of Drake model directives (.dmd.yaml) of the surroundings.
-        hard_episodes: Number of episodes of each baseline policy for each setting in the calibration of
+        hard_episodes: Largest number of episodes of each baseline policy for each setting in the calibration of
             `difficulty=hard`; 0: no calibration.
         only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
         log: Function called with a sentence on each intermediate result.
 
     Raises:
-        InputError: If the parts cannot be used; no folder is left then.
+        InputError: If `out` exists, an argument is invalid, the parts cannot be used, or no demonstration seats the
+            plug; no new folder is left then.
     """
     check_new(out, "folder with --out, or remove it")
     _check_arguments(plug_pose, turn, pitch, search_turn, shrink, force_limit, friction, scenario, hard_episodes)
@@ -360,7 +363,7 @@ def _write_task(
     from guiderail.tools.parts.trial import demonstrate, write_preview
 
     duration = float(file.motion.plan_search()[0][-1])
-    factor = max(measured["real_time_factor"], 0.01)  # it is rounded
+    factor = max(measured["real_time_factor"], 0.01)  # rounding may make it 0
     log(f"recording demonstrations: about {NUM_DEMONSTRATIONS * duration / factor:.0f} s")
     succeeded = demonstrate(folder, file)
     if not succeeded:
@@ -427,7 +430,7 @@ def _task_file(
             },
             "a motion",
         ),
-        # Without a turn at the bottom, either the walls fix the turn of a seated plug, or a plug fits at any turn.
+        # Without a turn at the bottom, a wide limit suffices: the walls fix a seated plug's turn, or any turn fits.
         tolerance=Tolerance.model_validate({} if path.turn else {"turn": MAX_SEATED_TURN}),
         force_limit=values["force_limit"],
         time_step=contact.time_step,
@@ -454,7 +457,7 @@ def _size(part: Part) -> str:
 
 
 def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
-    """Return the unit; ask for it on a terminal if neither an argument nor the format states it."""
+    """Return the `given` unit; if it is None and the format of a file defines none, ask for it on a terminal."""
     if given is not None or all(find_unit(path, None) for path in paths) or not sys.stdin.isatty():
         return given
     if any(not path.is_file() for path in paths):

@@ -36,7 +36,7 @@ NAME = "create-task/calibration"  # name of the task in the process that calibra
 
 @dataclass(frozen=True)
 class Setting:
-    """Setting of the difficulty."""
+    """Difficulty that a calibration can choose."""
 
     offset: float  # largest offset of the socket [m]; the smallest offset is 85 % of it
     action_repeat: int = 5  # control steps per action; random actions that change more often move the plug less far
@@ -81,7 +81,7 @@ class Score:
 
     @property
     def is_too_hard(self) -> bool:
-        """True if the scripted search succeeds too seldom."""
+        """True if the scripted search succeeds too seldom; False if it was not run."""
         return self.scripted < MIN_SCRIPTED * self.scripted_episodes
 
     @property
@@ -120,9 +120,10 @@ def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, b
 def count_successes(
     run: Callable[[int], bool], episodes: int, *, most_successes: float = math.inf, most_failures: float = math.inf
 ) -> tuple[int, int]:
-    """Run episodes by index until a limit is exceeded or all have run; return the numbers of successes and of episodes.
+    """Run episodes until a limit is exceeded or all have run; return the numbers of successes and of episodes.
 
-    No further episode is run after more than `most_successes` successes or `most_failures` failures.
+    `run` returns the success of the episode with an index. No further episode is run after more than `most_successes`
+    successes or `most_failures` failures.
     """
     successes = 0
     for index in range(episodes):
@@ -150,7 +151,7 @@ class StopOnRim(gymnasium.Wrapper):
 
 
 def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episodes: int) -> Score:
-    """Return the successes of uniform random actions and of the scripted search in at most `episodes` episodes."""
+    """Return the successes of uniform random actions and of the scripted search in at most `episodes` episodes each."""
     env = StopOnRim(make_environment(task, options), file)
 
     def count(name: str, **limits: float) -> tuple[int, int]:
@@ -174,7 +175,10 @@ def score_setting(task: str, file: PartTaskFile, options: dict[str, Any], episod
 
 
 def force_limit_of(file: PartTaskFile, peak_force: float) -> float:
-    """Return a multiple of an aligned insertion's peak force as the force limit [N], at most the task's limit."""
+    """Return the force limit [N] for the peak force of an aligned insertion [N].
+
+    It is a multiple of the peak force, at least `MIN_FORCE` and at most the task's limit.
+    """
     return float(min(file.force_limit, max(MIN_FORCE, math.ceil(FORCE_RATIO * peak_force))))
 
 
@@ -195,8 +199,9 @@ def calibrate(
 ) -> PartTaskFile:
     """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
-    The task folder already contains `file`. The radius is the largest distance of the plug from the axis [m]. Each
-    policy runs at most `episodes` episodes with each setting. A sentence on the result is logged.
+    If no setting has the required success rates, the options are those of the best one. The task folder must contain
+    `file`. The radius is the largest distance of the plug from the axis [m]. Each policy runs at most `episodes`
+    episodes with each setting. A sentence on the result is logged.
     """
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = file.motion.search_turn or turn_of(file.clearance, radius)

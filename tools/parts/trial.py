@@ -35,8 +35,8 @@ from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
 
 _VERTICES = 8  # number of vertices with the highest pressure at which the depth of a contact surface is measured
-_AT_REST = 1.0  # time at the end of a motion in which the plug does not move [s]
-_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # distance of the command below a blocked plug [m], time until the trial ends [s]
+_AT_REST = 1.0  # time before the end of a motion from which the plug counts as resting [s]
+_BLOCKED, _BLOCKED_TIME = 8e-3, 0.5  # a trial ends if the command is this far below the plug [m] for this time [s]
 _INTERVAL = 4  # simulator steps between two measurements of depth
 
 
@@ -45,15 +45,15 @@ class Trial:
     """Result of a scripted insertion."""
 
     success: bool  # True if the plug reached the target
-    is_blocked: bool  # True if the plug stayed above the height of the target, at any lateral offset
+    is_blocked: bool  # True if the plug always stayed above the target by more than the height tolerance
     pose: np.ndarray  # final pose of the plug in the socket, position and rotation vector (6,) [m, rad]
     lowest: float  # smallest height of the plug above the target [m]
     peak_force: float  # largest contact force [N]
     penetration: float  # largest penetration of the parts [m], without snapping pieces
     resting_penetration: float  # largest penetration at the end of the motion, while the resting plug is pushed [m]
     snap: float  # largest penetration of snapping pieces [m]
-    real_time_factor: float  # simulated time per CPU time; less is simulated than the motion lasts if a plug is blocked
-    recording: Recording  # poses, wrench and force at the control steps
+    real_time_factor: float  # simulated time per CPU time; the simulation of a blocked plug ends early
+    recording: Recording  # the `SIGNALS` of `guiderail.diagrams.envs.recording`
 
 
 class Depths:
@@ -86,7 +86,7 @@ class Depths:
         self.seconds = 0.0
 
     def monitor(self, root_context: Any) -> EventStatus:
-        """Measure the current contacts."""
+        """Measure the current contacts, as the simulator's monitor."""
         start = time.process_time()
         plant = self._station.plant
         context = plant.GetMyContextFromRoot(root_context)
@@ -191,7 +191,7 @@ def _plug_pose(driven: DrivenStation) -> np.ndarray:
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
     """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, otherwise -1.
 
-    Each trial is given by the offset (x, y) of the socket [m] and its recording.
+    `pushed` holds the offset (x, y) of the socket [m] and the recording of each trial.
     """
     towards = 0.0
     for offset, recording in pushed:
@@ -205,7 +205,9 @@ _SCALE = 10.0  # magnification, because the page's camera cannot get close to sm
 
 
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
-    """Write the page of a trial: the parts and, initially hidden, the contact pieces in different colors.
+    """Write a page that animates a trial: the parts and, initially hidden, the contact pieces in different colors.
+
+    Tetrahedra are not shown. The meshes are those of `file` in `folder`.
 
     Raises:
         InputError: If the environment forbids Drake to open a network port.
@@ -241,12 +243,12 @@ def _show(meshcat: Any, path: str, file: Path, color: Any) -> None:
     meshcat.SetObject(path, TriangleSurfaceMesh(triangles, list(corners)), color)
 
 
-DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are no longer checked [s]
+DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are written unchecked [s]
 MAX_SESSIONS = 3  # largest number of attempts at each demonstration; the first that seats the plug is used
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> int:
-    """Write the demonstrations; return how many of them seat the plug."""
+    """Write the demonstrations; return how many of them were checked in time and seat the plug."""
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     press_from = numbers.rim - numbers.press - 1e-3
@@ -290,9 +292,10 @@ def add_convex_pieces(
     tolerance: float,
     log: Callable[[str], None],
 ) -> PartTaskFile:
-    """Write convex pieces of both parts, and return the task file with their names; unchanged if they do not work.
+    """Return the task file with the names of both parts' convex pieces; unchanged if cutting or an insertion fails.
 
-    The pieces deviate from the surfaces by at most `tolerance` [m]. A sentence on the result is logged.
+    A part whose contact geometry is convex pieces keeps them. From the surface of another part, pieces are cut and
+    written; they may exceed the surface by twice the `tolerance` [m]. A sentence on the result is logged.
     """
     written: list[Path] = []
     changes: dict[str, PartModel] = {}
@@ -326,10 +329,10 @@ def add_convex_pieces(
 
 
 def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> tuple[bool, bool]:
-    """Insert the plug straight on `station=mujoco`, offset along x [m], and return two flags.
+    """Insert the plug straight on `station=mujoco`, at an `offset` along x [m]; return if it is seated and if blocked.
 
-    The first is True if the plug is seated at the end, the second if it stayed above the height of the target: a plug
-    beside the target that is not blocked is not seated either. The task file need not be written yet.
+    A seated plug is at the target at the end. A blocked plug always stayed above the target by more than the height
+    tolerance. A plug that was pushed down next to the target is neither. The task file need not be written yet.
     """
     times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset

@@ -1,7 +1,7 @@
-"""Recording of demonstrations: an operator moves the compliant target of a running simulation.
+"""Recording of demonstrations: an operator moves the commanded pose of a simulated robot.
 
-Sliders of the page set the target, each with two keys; a gamepad moves the sliders. The command follows the sliders at
-limited speed, and the robot follows the command by its impedance. To push, the operator commands a pose beyond contact.
+The operator moves the sliders of a page by mouse, keys or gamepad. The command follows the sliders at limited speed,
+and the robot follows the command under impedance control. To push, the operator commands a pose beyond contact.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from guiderail.tools.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS, Meshcat
 PATH = "/guiderail/force"
 # Position (sideways, down), length and thickness of the gauge, relative to the distance of camera and target.
 SIDE_OFFSET, DOWN_OFFSET, LENGTH, THICKNESS = 0.3, 0.05, 0.3, 0.012
-WARNING_SHARE = 0.7  # share of the limit above which the gauge is red
+WARNING_SHARE = 0.7  # fraction of the limit above which the gauge is red
 BLUE, RED, GRAY = (0.1, 0.5, 0.9, 1.0), (0.9, 0.15, 0.1, 1.0), (0.35, 0.35, 0.35, 0.25)
 MIN_FORCE = 1e-6  # smallest force for which a direction is shown [N]
-MIN_LENGTH = 1e-3  # smallest share of the full length, because an arrow of length zero has no direction
+MIN_LENGTH = 1e-3  # smallest fraction of the full length, because an arrow of length zero has no direction
 
 
 class ForceGauge:
@@ -53,7 +53,8 @@ class ForceGauge:
     def __init__(self, meshcat: Any, view: Viewpoint, limit: float):
         """Add the gauge to a page.
 
-        The viewpoint of the camera determines size and position. At the force `limit` [N] bar and arrow are full.
+        The viewpoint of the camera determines size and position. At the force `limit` [N], arrow and bar have full
+        length.
         """
         self._meshcat, self._limit = meshcat, limit
         eye, target = (np.array(point) for point in view)
@@ -138,7 +139,7 @@ class _Recording:
 
     commands: list[np.ndarray] = field(default_factory=list)  # commanded poses of the recorded control steps
     resting: int = 0  # control steps for which the command has not changed
-    # States to which undos return; the oldest are dropped.
+    # States to which undos return; above `MAX_UNDOS`, the oldest are dropped.
     snapshots: deque[_Snapshot] = field(default_factory=lambda: deque(maxlen=MAX_UNDOS))
 
     def add(self, command: np.ndarray, period: float) -> None:
@@ -153,21 +154,26 @@ class DemonstrationRecorder:
     """Session in which an operator moves a station and records demonstrations.
 
     Attributes:
-        demonstrations: Recorded times (N,) and commanded poses (N, 6).
+        demonstrations: Times (N,) [s] and commanded poses (N, 6) [m, rad] of each kept demonstration.
         successes: Success of each demonstration; None if the task does not define it by the pose.
-        start: Pose at the start of a demonstration, (6,).
-        command: Commanded pose, (6,).
-        offset: Offset of the sliders from the start pose, (6,).
+        start: Pose at the start of a demonstration, (6,) [m, rad].
+        command: Commanded pose, (6,) [m, rad].
+        offset: Offset from the start pose to the pose that the sliders set, (6,) [m, rad].
         steps: Control steps since the start of the demonstration.
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any], out: Path, meshcat: Any = None):
-        """Build the simulation and show it on the page `meshcat`, by default on a new page on this machine.
+        """Build the simulation and show it on a new page of this machine.
 
-        The task is a name or a task folder. The file `out` of the demonstrations, .npz or .csv, must not exist.
+        Args:
+            task: Name of the task, or path of a task folder.
+            environment: Options of the environment by name.
+            out: File of the demonstrations, .npz or .csv; it must not exist.
+            meshcat: Page for the controls, in place of a new one. It does not show the simulation.
 
         Raises:
-            InputError: If the task is no insertion, the station is hardware, or the file exists or cannot be written.
+            InputError: If the task is no insertion, the station is hardware, or the file exists, has another ending or
+                cannot be written.
         """
         check_new(out, "file")
         if out.suffix not in (".npz", ".csv"):
@@ -209,7 +215,10 @@ class DemonstrationRecorder:
     def run(self, log: Callable[[str], None], real_time: bool = True, max_steps: int = 10**9) -> None:
         """Run the simulation until the page's end button is pressed; write each demonstration when it is kept.
 
-        With `real_time` it runs in real time, or in slow motion; otherwise as fast as possible.
+        Args:
+            log: Function called with a sentence on each kept, refused or discarded demonstration.
+            real_time: Run in real time, or in slow motion; otherwise as fast as possible.
+            max_steps: Largest number of control steps.
         """
         self.reset()
         for _ in range(max_steps):
@@ -241,9 +250,9 @@ class DemonstrationRecorder:
             self._gauge.show(self._force())
 
     def undo(self) -> None:
-        """Take back the last second of motion: robot, parts, command and sliders.
+        """Take back about the last second of motion: robot, parts, command and sliders.
 
-        A pause before this motion is kept. At most `MAX_UNDOS` seconds can be taken back.
+        A pause before this motion is kept. At most `MAX_UNDOS` states are stored, at least one second apart.
         """
         snapshots = self.recording.snapshots
         if not snapshots:
@@ -253,7 +262,7 @@ class DemonstrationRecorder:
         snapshot = snapshots.pop()
         self.steps, self.command, self.offset = snapshot.steps, snapshot.command, snapshot.offset
         self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(snapshot.context)
-        # Initialization would start the tare, the energy tank and filters again.
+        # Initialization events would reset the tare, the energy tank and the filters.
         self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
         del self.recording.commands[snapshot.samples :]
         self.recording.resting = snapshot.resting
@@ -375,7 +384,8 @@ def record_demonstrations(
 ) -> dict[str, Any]:
     """Open the page, wait for a browser, and record demonstrations until the operator ends the session.
 
-    Returns the file, and statistics of the demonstrations.
+    Returns:
+        The file, and statistics of the demonstrations.
 
     Raises:
         InputError: As `DemonstrationRecorder`, or if no demonstration was kept.
@@ -416,11 +426,11 @@ def teleoperate(
 ) -> dict[str, Any] | None:
     """Let the operator act in place of the policy until Ctrl-C, or record demonstrations and return their statistics.
 
-    The operator gives the action of the task's guidance. With `record`, a file .npz or .csv which must not exist, the
-    operator moves the desired pose instead.
+    The operator gives the action of the task's guidance. With `record`, a new file .npz or .csv, the operator moves the
+    desired pose instead, and the demonstrations are written to that file.
 
     Raises:
-        InputError: If the task cannot be teleoperated, or the demonstrations cannot be written.
+        InputError: If an action has more numbers than the device has inputs. With `record`, as `record_demonstrations`.
     """
     if record is not None:
         return record_demonstrations(task, environment, record, log)

@@ -17,7 +17,7 @@ from guiderail.tools.learning.interventions import Supervisor
 DEAD_ZONE = 0.15  # largest deflection of a gamepad's axis that moves no slider
 CAMERA_NEAR = 1e-3  # near clipping distance of the page's camera [m]
 
-# Keys that lower and raise each input, by JavaScript's codes, and the gamepad axis of each input with its sign.
+# Keys that lower and raise each input, as JavaScript's codes, and the gamepad axis of each input with its sign.
 KEY_PAIRS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
 GAMEPAD_AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
 
@@ -35,7 +35,7 @@ class Slider:
 
     limit: float  # largest magnitude of the value
     step: float  # change by one key press
-    keys: tuple[str, str]  # keys that lower and raise the value, by JavaScript's codes
+    keys: tuple[str, str]  # keys that lower and raise the value, as JavaScript's codes
     scale: float = 1.0  # factor from the slider's unit to that of the input
     speed: float = 0.0  # change of the value per second at full deflection of its gamepad axis; 0: no axis moves it
 
@@ -92,7 +92,7 @@ class MeshcatPanel(Teleoperator):
 
 
 def set_camera(meshcat: Any, task: Any) -> Viewpoint | None:
-    """Set the page's camera to the viewpoint of a task's scene, and return it; None if the scene has none."""
+    """Set the page's camera to the viewpoint of a task's scene, and return the viewpoint; None if there is none."""
     viewpoint = task.scene().viewpoint
     if viewpoint is not None:
         meshcat.SetProperty("/Cameras/default/rotated/<object>", "near", CAMERA_NEAR)
@@ -136,7 +136,11 @@ class MeshcatSupervisor(Supervisor):
             time.sleep(0.1)
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
-        """Show an episode of `env` with all sliders at zero; earlier clicks except a stop are discarded."""
+        """Show an episode of `env` with all sliders at zero; of earlier clicks, only a stop counts.
+
+        Raises:
+            InputError: If an action has more numbers than there are pairs of keys.
+        """
         base = cast(Any, env.unwrapped)
         self._add_sliders(base)
         if base.task.query is not None:
@@ -150,7 +154,7 @@ class MeshcatSupervisor(Supervisor):
         self._is_stop_pending = self.label() == "stop"
 
     def correction(self, observation: np.ndarray) -> np.ndarray | None:
-        """Return the sliders' values, (A,); None while all are zero."""
+        """Return the sliders' values, (A,) in units of a full action; None while all are zero."""
         if self.panel.take_clicks(RELEASE):
             self.panel.reset()
         values = self.panel.read()

@@ -1,4 +1,4 @@
-"""Learning curve of a run: success, return, constraint violation, force and jerk over the episodes."""
+"""Learning curve of a run: success, return and its terms, constraint violation, force and jerk over the episodes."""
 
 from pathlib import Path
 
@@ -15,9 +15,10 @@ from guiderail.tools.visualization.style import color, legend_above, new_figure,
 
 
 def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False) -> None:
-    """Draw the narrow passage: walls, forbidden zone, obstacle and goal, and in gray the demonstrations.
+    """Draw the narrow passage: walls, forbidden zone, obstacle and goal.
 
-    With `named`, the items are labeled for a legend.
+    With `demonstrations`, they are drawn in gray. With `named`, zone, obstacle, goal and demonstrations are labeled for
+    a legend.
     """
     passage = PassageGeometry()
     zone, obstacle, goal, path_label = ("forbidden zone", "obstacle", "goal", "demonstration") if named else 4 * ("",)
@@ -49,7 +50,7 @@ def plot_run(run: Path) -> Path:
     """Draw `learning_curve.png` from the `episodes.csv` of a run.
 
     Raises:
-        InputError: If there is no run, or it has no finished episode.
+        InputError: If there is no run, it has no finished episode, or its table lacks a column of `PLOTTED`.
     """
     folder = RunFolder(run)
     config, rows = folder.config(), folder.episodes()

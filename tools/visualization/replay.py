@@ -75,8 +75,8 @@ class Motion(EnvCallback):
 
         `frames` maps each body's path in Meshcat's tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32 in
         base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the previous
-        sample, so that no peak is lost. `time` is in percent of the longest possible episode. An episode that failed
-        before its first control step has one sample.
+        sample, so that no peak is lost; violations are None without constraints. `time` is in percent of the longest
+        possible episode. An episode that failed before its first control step has one sample.
         """
         trace = self.base.trace
         stride = max(1, -(-len(trace) // POINTS))
@@ -123,7 +123,10 @@ class Motion(EnvCallback):
 
 
 def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple[str, float]:
-    """Return the unit of plotted violations and its factor from m or rad: mm if only positions are constrained."""
+    """Return the unit of plotted violations and its factor from m or rad: mm if only positions are constrained.
+
+    `outputs` is the number of a command's outputs.
+    """
     has_rotations = outputs >= 6 and (constraints is None or bool(np.any(constraints.G[..., 3:])))
     return (VIOLATION, 1.0) if has_rotations else ("mm", 1.0 / MM)
 
@@ -180,12 +183,12 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     uniform random actions.
 
     Args:
-        html: Page, .html.
+        html: File of the page, .html or .htm.
         episode: First episode; the others have the following seeds.
-        episodes: Number of episodes; `EPISODES` by default.
+        episodes: Number of episodes, at least 1; None for `EPISODES`.
 
     Raises:
-        InputError: If the task has no animation, there is no episode, or `html` is not a page.
+        InputError: If the task has no animation, or an argument is invalid.
     """
     episodes = EPISODES if episodes is None else episodes
     if episodes < 1:
@@ -252,7 +255,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         seeds=[episode.seed + index for index in range(episodes)],
         report=find_report(html, episode.run),
         run=episode.run,
-        # The frame of Meshcat's camera has y up.
+        # In the frame of Meshcat's camera, y points up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
         # Escaped, so that the name of a body cannot end the script or open a comment in it.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
@@ -264,7 +267,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
 def find_report(html: Path, run: Path | None) -> str | None:
     """Return the path of a report relative to the page; None without a report.
 
-    It is the report in the page's folder, or else that of the run, or else that of the run's study.
+    It is looked for in the page's folder, the run's folder and the folder of the run's study, in this order.
     """
     folders = [html.parent, *([] if run is None else [run, run.parent])]
     report = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)

@@ -63,11 +63,11 @@ def write_report(
 ) -> Path:
     """Write the report of runs and studies as an HTML file.
 
-    Each run that no study evaluated is evaluated on `episodes` held-out episodes. `describe_differences` returns
-    sentences on how a configuration differs from a reference.
+    Runs are evaluated on `episodes` held-out episodes; see `gather`. `describe_differences` returns sentences on how a
+    configuration differs from a reference.
 
     Raises:
-        InputError: If there is nothing to report on, or `out` is not an HTML file.
+        InputError: As `gather`, or if `episodes` is negative or `out` is not an HTML file that can be written.
     """
     if episodes < 0:
         raise InputError(f"the number of episodes of an evaluation must be 0 or more, not {episodes}")
@@ -205,12 +205,12 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
     if sources == {"step_log"}:
         return "Counted in control steps, from the step logs of the runs."
     if sources == {"table"}:
-        return "From the tables of episodes, because there is no step log: violations are counted in episodes."
-    return "From the step logs; for runs without one, from the tables of episodes, where violations count episodes."
+        return "From the tables of episodes, without complete step logs: violations are counted in episodes."
+    return "From complete step logs; for other runs, from the tables of episodes, where violations count episodes."
 
 
 def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDifferences) -> list[dict[str, Any]]:
-    """Return the differences from the reference: first those of every method, then those of individual methods."""
+    """Return the differences from the reference: first those of all methods, then those of individual ones."""
     of_methods = {
         name: list(dict.fromkeys(text for run in runs for text in describe_differences(run.config)))
         for name, runs in methods.items()

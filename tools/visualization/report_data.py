@@ -108,7 +108,7 @@ class ReportData:
     runs: list[Run] = field(default_factory=list)  # runs with at least one episode
     # Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    is_study: bool = False  # True if one of the folders is that of a study
+    is_study: bool = False  # True if a folder contains a study's table
     folder_names: list[str] = field(default_factory=list)  # unique name of each run's folder
 
     @property
@@ -135,11 +135,12 @@ class ReportData:
 def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
-    Each run outside of studies is evaluated on `episodes` held-out episodes, together with baseline policies; stored
-    episodes are reused.
+    Each run that is given itself, or is in a folder without a study's table, is evaluated on `episodes` held-out
+    episodes, together with baseline policies. If `episodes` is 0, only stored evaluations are read.
 
     Raises:
-        InputError: If a folder contains no run, or a file is damaged.
+        InputError: If a folder contains neither a run nor a study's table, no run has a finished episode, or a file is
+            damaged.
     """
     folders: list[Path] = []
     single_runs: list[Path] = []  # runs that are not part of a study
@@ -187,7 +188,7 @@ def _episodes(folder: RunFolder) -> pd.DataFrame:
 def _study_tables(folder: Path) -> list[pd.DataFrame]:
     """Return the tables of a study, with a row for each method, seed, checkpoint and evaluation set.
 
-    Rows of a partial table that are in the whole table too are left out.
+    Rows of a partial study's table that are also in the table of the whole study are left out.
     """
     tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
@@ -212,7 +213,7 @@ def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
-    """Return the counts of a run's held-out episodes; evaluate it first if fewer than `episodes` are stored."""
+    """Return the counts of a run's held-out episodes; evaluate it first unless exactly `episodes` are stored."""
     if episodes:
         _evaluate(run, episodes)
     counts: dict[str, dict[str, Any]] = {}

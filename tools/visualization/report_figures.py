@@ -59,7 +59,7 @@ def survival_curve(data: ReportData, task: str) -> str:
 
 
 def held_out(data: ReportData) -> str:
-    """Return the held-out success of each seed with its Wilson interval; baseline policies are gray."""
+    """Return the held-out success at each seed's last checkpoint, with Wilson intervals; baseline policies are gray."""
     rows, keys = data.held_out, ["study", "method", "policy", "seed", "eval_set"]
     rows = rows[rows["after_episodes"] == rows.groupby(keys)["after_episodes"].transform("max")]
     groups = list(rows.groupby(["study", "method", "policy", "eval_set"], sort=False))

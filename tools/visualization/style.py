@@ -46,7 +46,11 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a picture in the format of its file ending; equal figures give equal SVG files."""
+    """Write a picture in the format of its file ending, and return its path; equal figures give equal SVG files.
+
+    Raises:
+        InputError: If the ending is none of `guiderail.tools.files.PICTURES`, or the file cannot be written.
+    """
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:].lower()
     with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
@@ -61,7 +65,7 @@ def rolling(values: Sequence[float] | np.ndarray, window: int = WINDOW) -> np.nd
 
 
 def range_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum and maximum over the first axis of (runs, n)."""
+    """Return the minimum and maximum over the first axis of `values` (runs, n)."""
     return values.min(axis=0), values.max(axis=0)
 
 
@@ -79,7 +83,7 @@ def draw_runs(
 
     Args:
         axis: Axes.
-        runs: Values over the episodes of each run; longer runs are cut to the shortest.
+        runs: Values over the episodes of each run, at least one run; longer runs are cut to the shortest.
         color: Color of line and band.
         label: Label for a legend.
         window: Episodes of the moving mean.
