@@ -149,6 +149,12 @@ class Sweep(_Strict):
         return EvalSet(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
 
 
+class _SeedChoice(_Strict):
+    """Seeds that replace those of a study."""
+
+    seeds: Seeds
+
+
 class Ratio(_Strict):
     """Ratio of a table's column for one method to that for another one."""
 
@@ -216,13 +222,17 @@ class Study(_Strict):
         A method that declares seeds of its own keeps them.
 
         Raises:
-            InputError: If a method is unknown.
+            InputError: If a method is unknown, or the seeds are not valid.
         """
         for name in methods or ():
             if name not in self.methods:
                 raise InputError(f"the study {self.name} has no method {name!r}: {did_you_mean(name, self.methods)}")
         chosen = self.methods if methods is None else {name: self.methods[name] for name in methods}
-        return self.model_copy(update={"methods": chosen, "seeds": tuple(self.seeds if seeds is None else seeds)})
+        try:
+            changed_seeds = self.seeds if seeds is None else _SeedChoice(seeds=tuple(seeds)).seeds
+        except ValidationError as error:
+            raise InputError(_sentence(error)) from error
+        return self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
 
 
 def load_study(file: Path | str) -> Study:

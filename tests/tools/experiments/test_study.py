@@ -427,6 +427,22 @@ def test_load_study_refuses_a_missing_file(tmp_path):
         chosen.subset(["kgrll"])
 
 
+@pytest.mark.parametrize(
+    ("seeds", "words"),
+    [
+        ([-1], "seeds, 0: .*not -1"),
+        ([1, 2, 1], "seed 1 is given twice"),
+        ([], "seeds"),
+        ([1.5], "1.5"),
+        ([2**31], "2147"),
+    ],
+)
+def test_subset_refuses_the_seeds_that_a_file_cannot_have(seeds, words):
+    with pytest.raises(InputError, match=words) as refused:
+        load_study(study_path("connector")).subset(None, seeds)
+    assert "\n" not in str(refused.value)
+
+
 @pytest.mark.parametrize("name", study_names())
 def test_study_of_research_is_valid(name, tmp_path):
     declared = load_study(study_path(name))
