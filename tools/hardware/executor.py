@@ -268,7 +268,9 @@ class SkillExecutor:
                 steps = steps.append_column(f"{name}_{joint}", pa.array(column))
         path = step_log_file(folder, number)
         write_step_log(path, steps)
-        write_atomically(path.with_suffix(".json"), json.dumps(dict(metadata), indent=2).encode() + b"\n")
+        # NaN and infinite numbers, such as statistics of no statuses, are null: JSON does not have them.
+        values = json.loads(json.dumps(dict(metadata)), parse_constant=lambda name: None)
+        write_atomically(path.with_suffix(".json"), json.dumps(values, indent=2).encode() + b"\n")
         return path
 
 

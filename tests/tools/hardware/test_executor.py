@@ -66,11 +66,13 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
     context = clock.simulator.get_context()
     velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(context))
     assert np.abs(velocities).max() < 0.01
-    path = executor.write(tmp_path, {"outcome": outcome.description})
+    metadata = {"outcome": outcome.description, "statuses": {"99 %": np.nan, "longest": np.inf}}
+    path = executor.write(tmp_path, metadata)
     step_log = pd.read_parquet(path)
     assert len(step_log) == 20
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(step_log)
-    assert json.loads(path.with_suffix(".json").read_text())["outcome"] == "executed to its end"
+    written = json.loads(path.with_suffix(".json").read_text(), parse_constant=pytest.fail)
+    assert written == {"outcome": "executed to its end", "statuses": {"99 %": None, "longest": None}}
 
 
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
