@@ -263,20 +263,14 @@ def _commands(data: ReportData) -> tuple[list[str], list[str]]:
 
 
 def _study_commands(counts: pd.DataFrame) -> list[str]:
-    """Return the commands that reproduce the studies of a table.
-
-    The table of a partial study is named after the study, then its methods, its seeds or both, joined by dashes.
-    """
+    """Return the commands that reproduce the studies of a table."""
     commands = []
-    names = [str(name) for name in dict.fromkeys(counts["study"])] if len(counts) else []
-    for name in names:
+    for name in dict.fromkeys(counts["study"]) if len(counts) else ():
         rows = counts[counts["study"] == name]
         methods, seeds = ([str(one) for one in dict.fromkeys(rows[column])] for column in ("method", "seed"))
-        suffixes = ("-".join(chosen) for chosen in ([*methods, *seeds], methods, seeds))
-        studies = [one for one in names if name.startswith(f"{one}-")]
-        studies += [name.removesuffix(f"-{suffix}") for suffix in suffixes if name.endswith(f"-{suffix}")]
-        part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if studies else ""
-        commands.append(f"guiderail study {[*studies, name][0]}.yaml{part} --out studies")
+        study = str(rows["part_of"].iloc[0])
+        part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if study else ""
+        commands.append(f"guiderail study {study or name}.yaml{part} --out studies")
     return commands
 
 

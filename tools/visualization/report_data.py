@@ -33,7 +33,7 @@ from guiderail.tools.visualization.style import color, is_demonstrated, label
 
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
-STUDY_COLUMNS = {"method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"}
+STUDY_COLUMNS = ("method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate")
 REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
     "fallback_steps",
@@ -193,20 +193,37 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
     tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
         table = read_table(file)
-        if not set(table.columns) >= STUDY_COLUMNS:
+        if not {*STUDY_COLUMNS} <= {*table.columns}:
             continue
-        rows = _success_counts(table[(table["eval_set"] != "") & table["success_rate"].notna()].assign(study=file.stem))
+        studies = _studies_of(file.stem, table)
+        part_of = next((name for name in studies if name in tables), next(iter(studies), ""))
+        evaluated = table[(table["eval_set"] != "") & table["success_rate"].notna()]
+        rows = _success_counts(evaluated.assign(study=file.stem, part_of=part_of))
         for name, whole in tables.items():
-            if file.stem.startswith(f"{name}-"):
-                same = list(whole.columns.drop("study"))
+            if name in studies:
+                same = list(whole.columns.drop(["study", "part_of"]))
                 rows = rows[~rows[same].apply(tuple, axis=1).isin(set(whole[same].apply(tuple, axis=1)))]
         tables[file.stem] = rows
     return [rows for rows in tables.values() if len(rows)]
 
 
+def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
+    """Return the possible names of the study of which a table is a part; none if its name is that of a whole study.
+
+    The table of a partial study is named after the study, then all its methods, its seeds or both, joined by dashes
+    (`Study.subset_name`). A method's own seeds are not part of the name, so the seeds are those of some method.
+    """
+    seeds = {
+        str(method): [*dict.fromkeys(map(str, rows["seed"]))] for method, rows in table.groupby("method", sort=False)
+    }
+    suffixes = [[*seeds, *chosen] for chosen in seeds.values()] + [[*seeds]] + [*seeds.values()]
+    texts = dict.fromkeys("".join(f"-{word}" for word in words) for words in suffixes)
+    return [name.removesuffix(text) for text in texts if name.endswith(text) and name != text]
+
+
 def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
     """Return the rows of a study's table with the number of successes instead of the success rate."""
-    rows = rows[["study", "method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate"]].copy()
+    rows = rows[["study", "part_of", *STUDY_COLUMNS]].copy()
     rows["successes"] = (rows["success_rate"] * rows["episodes"]).round().astype(int)
     rows["episodes"] = rows["episodes"].astype(int)
     return rows.drop(columns="success_rate")
@@ -217,7 +234,8 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
     if episodes:
         _evaluate(run, episodes)
     counts: dict[str, dict[str, Any]] = {}
-    run_columns = {"study": "", "method": run.method, "seed": run.config.seed, "after_episodes": len(run.episodes)}
+    names = {"study": "", "part_of": "", "method": run.method}
+    run_columns = {**names, "seed": run.config.seed, "after_episodes": len(run.episodes)}
     for name, rows in stored_episodes(RunFolder(run.path), run.config, HELD_OUT_SEED):
         policy = LEARNED if name == POLICY else name
         if policy not in counts or counts[policy]["episodes"] < len(rows):

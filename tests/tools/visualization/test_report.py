@@ -128,6 +128,28 @@ def test_rows_of_a_partial_study_are_counted_once(studied, tmp_path):
     assert "guiderail study beads.yaml --methods learner --seeds 1,5 --out studies" in text
 
 
+def test_study_named_like_another_one_is_whole(studied, tmp_path):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    rows = read_table(studied / "beads.csv")
+    for name in ("beads", "beads-hard", "beads-3"):
+        write_table(folder / name, rows)
+    text = text_of(write_report([folder], tmp_path / "page.html").read_text())
+    for name in ("beads", "beads-hard", "beads-3"):
+        assert f"{name}: learner 3 held out 16/20" in text
+        assert f"guiderail study {name}.yaml --out studies" in text
+
+
+def test_own_seeds_of_a_method_are_not_in_the_name(studied, tmp_path):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    shutil.copy(studied / "beads.csv", folder)
+    rows = read_table(studied / "beads.csv")
+    write_table(folder / "beads-2", rows.iloc[1:])  # the method "nothing" has the seed 1
+    text = text_of(write_report([folder], tmp_path / "page.html").read_text())
+    assert "beads-2" not in text
+
+
 def test_runs_with_one_folder_name_get_different_ones(studied, tmp_path):
     for name in ("a", "b"):
         shutil.copytree(studied / "skgrl-1", tmp_path / name / "same")
