@@ -23,7 +23,6 @@ from guiderail.tools.evaluation.evaluation import (
     LABELS,
     POLICY,
     POLICY_FOLDER,
-    REPORTS_SUCCESS,
     Evaluation,
     compare,
     episodes_file,
@@ -34,10 +33,8 @@ from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.rollout import (
     HELD_OUT_SEED,
-    Callback,
     EpisodeProgress,
     PolicyFn,
-    Transition,
     check_seed,
     has_image,
     is_compatible,
@@ -60,22 +57,6 @@ SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
 # Function from an environment and an episode's row to the data that is kept of the episode.
 Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
-
-
-class _SuccessReport(Callback):
-    """Callback that adds the column `REPORTS_SUCCESS` to an episode's row."""
-
-    def on_episode_start(self) -> None:
-        """Reset the column for a new episode."""
-        self._is_reported = False
-
-    def on_step(self, transition: Transition) -> None:
-        """Note whether `info` has a key for success, whatever its value."""
-        self._is_reported |= not {"is_success", "success"}.isdisjoint(transition.info)
-
-    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Return the column: 1 if any `info` of the episode had such a key."""
-        return {REPORTS_SUCCESS: int(self._is_reported)}
 
 
 def evaluate_policies(
@@ -117,13 +98,12 @@ def evaluate_policies(
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     names = list(policies)
-    callbacks = () if hasattr(env.unwrapped, "trace") else (_SuccessReport(),)
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
         act, index = policies[names[number // episodes]], number % episodes
         if (start := getattr(act, "start_episode", None)) is not None:
             start(index)
-        row = rollout(env, act, *callbacks, index=index, seed=seed + index, held_out=True, options=options)
+        row = rollout(env, act, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 
     results = forked_map(run, len(names) * episodes, processes)

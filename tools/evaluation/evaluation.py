@@ -16,13 +16,11 @@ import pandas as pd
 import scipy  # `scipy.stats` is imported on first use
 
 from guiderail.tools.environments import task_content
-from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE
+from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, reports_success
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, installed_versions
 from guiderail.tools.tables import read_table, table_text
 
-# Column for environments of other packages: 1 if `info` had `is_success` or `success`, true or false; else 0.
-REPORTS_SUCCESS = "reports_success"
 POLICY = "policy"  # name of the evaluated policy
 POLICY_FOLDER = "held_out"  # folder of the policy's evaluated episodes, in the run's folder
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' evaluated episodes, in the run's folder
@@ -180,11 +178,6 @@ class Evaluation(Mapping[str, Any]):
     @staticmethod
     def _name(policy: str) -> str:
         return LABELS.get(policy, policy.replace("_", " "))
-
-
-def reports_success(rows: pd.DataFrame) -> bool:
-    """Return False for episodes of an environment whose `info` has neither `is_success` nor `success`."""
-    return REPORTS_SUCCESS not in rows or bool((rows[REPORTS_SUCCESS] > 0).any())
 
 
 def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:

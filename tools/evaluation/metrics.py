@@ -26,6 +26,7 @@ CONFIDENCE = 0.95  # level of all confidence intervals
 RESAMPLES = 1000  # number of bootstrap resamples
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
+REPORTS_SUCCESS = "reports_success"  # column of an outside environment: 1 if `info` had a success, true or not
 TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
@@ -202,9 +203,10 @@ def episode_row(episode: Episode) -> dict[str, Any]:
 def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *, is_terminated: bool) -> dict[str, Any]:
     """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
-    `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step.
-    The largest `constraint_violation` and `contact_force` of any step are the columns `max_commanded_violation` and
-    `peak_force`. `is_terminated` is False if the episode was truncated.
+    `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step;
+    without either in any step, the column `REPORTS_SUCCESS` is 0. The largest `constraint_violation` and
+    `contact_force` of any step are the columns `max_commanded_violation` and `peak_force`. `is_terminated` is False if
+    the episode was truncated.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -217,7 +219,12 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
         if values := [float(info[name]) for info in infos if name in info]:
             row[column] = float(np.max(values))  # NaN if one is NaN
-    return row
+    return row | {REPORTS_SUCCESS: int(any("is_success" in info or "success" in info for info in infos))}
+
+
+def reports_success(rows: pd.DataFrame) -> bool:
+    """Return False for episodes of an environment whose `info` has neither `is_success` nor `success`."""
+    return REPORTS_SUCCESS not in rows or bool((rows[REPORTS_SUCCESS] > 0).any())
 
 
 WORDS = ("termination", "fault")  # columns of text; `fault` exists on hardware only

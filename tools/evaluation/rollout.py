@@ -267,6 +267,7 @@ class EpisodeProgress:
         self._done, self._count, self._window = 0, 0, window
         self._recent: deque[tuple[float, float]] = deque(maxlen=window)
         self._max_violation = float("-inf")
+        self._reports_success = False
         self._started = self._printed = time.monotonic()
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -289,8 +290,11 @@ class EpisodeProgress:
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Add a finished episode, given its row."""
+        from guiderail.tools.evaluation.metrics import REPORTS_SUCCESS  # pandas takes a second
+
         self._done, self._count = int(row["episode"]) + 1, self._count + 1
         self._recent.append((float(row["success"]), float(row["return"])))
+        self._reports_success |= bool(row.get(REPORTS_SUCCESS, True))
         violation = float(row.get("max_commanded_violation", -math.inf))
         self._max_violation = float(np.maximum(self._max_violation, violation))  # NaN if one is NaN
         self._bar.update(self._task, completed=self._done, status=self.status(), refresh=True)
@@ -302,13 +306,17 @@ class EpisodeProgress:
             self._console.print(text, soft_wrap=True)
 
     def status(self) -> str:
-        """Return success and return of the last episodes and the largest violation of all; call it after `update`."""
+        """Return success and return of the last episodes and the largest violation of all; call it after `update`.
+
+        The success is left out if the environment reports none.
+        """
         from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # pandas takes a second
 
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
         violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} {VIOLATION}"
         prefix = "" if self._window is None else f"last {len(self._recent)}: "
-        return f"{prefix}success {success:.0%}  return {returns:.1f}  largest violation {violation}"
+        prefix += f"success {success:.0%}  " if self._reports_success else ""
+        return f"{prefix}return {returns:.1f}  largest violation {violation}"
 
     def _remaining(self, now: float) -> str:
         if self._done == self._episodes:

@@ -20,7 +20,7 @@ from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, task_content, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.metrics import own_episodes, summary
+from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
 from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
 from guiderail.tools.imports import import_modules
@@ -76,11 +76,14 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Statistics of training, and the paths of the pictures."""
         rows = self.episodes
-        recent = own_episodes(rows)["success"].tail(10)
+        recent, values = own_episodes(rows)["success"].tail(10), summary(rows, SUMMARY)
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
+        if not reports_success(rows):
+            values |= dict.fromkeys(("episodes_to_convergence", "success_rate", "success_rate_last_10"))
+            note = "the environment reports none"
         trust = " --trust-imports" if _names_code(self.path / "config.yaml") else ""
         note += f"; evaluate the deterministic policy with guiderail evaluate {shlex.quote(str(self.path))}{trust}"
-        return {"run": str(self.path), **summary(rows, SUMMARY), "success_in_training": note, **self.pictures}
+        return {"run": str(self.path), **values, "success_in_training": note, **self.pictures}
 
 
 def _names_code(file: Path) -> bool:

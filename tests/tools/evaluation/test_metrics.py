@@ -53,6 +53,13 @@ def test_nan_is_not_hidden_by_a_maximum():
     assert np.isnan([row["max_commanded_violation"], row["peak_force"]]).all()
 
 
+@pytest.mark.parametrize(
+    ("infos", "is_reported"), [([{}, {}], 0), ([{"success": False}, {}], 1), ([{}, {"is_success": True}], 1)]
+)
+def test_outside_row_states_whether_success_is_reported(infos, is_reported):
+    assert outside_row(0, 0.0, infos, is_terminated=True)["reports_success"] == is_reported
+
+
 @pytest.mark.parametrize(("successes", "number"), [(0, 10), (7, 10), (10, 10), (98, 100)])
 def test_success_interval_is_that_of_wilson(successes, number):
     statistics = summary(episodes("1" * successes + "0" * (number - successes)), ("success_low", "success_high"))

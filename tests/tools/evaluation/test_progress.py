@@ -51,3 +51,12 @@ def test_violation_that_is_not_a_number_is_shown():
     for episode, violation in enumerate((math.nan, 0.0)):
         progress.update({"episode": episode, "success": 1, "return": 0.0, "max_commanded_violation": violation})
     assert "largest violation nan" in progress.status()
+
+
+def test_success_is_left_out_if_the_environment_reports_none():
+    progress = EpisodeProgress(2)
+    row = {"episode": 0, "success": 0, "return": 2.0, "reports_success": 0}
+    progress.update(row)
+    assert progress.status() == "last 1: return 2.0  largest violation none"
+    progress.update(row | {"episode": 1, "reports_success": 1})
+    assert progress.status().startswith("last 2: success 0%")
