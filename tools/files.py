@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import in_order
+from guiderail.models.common.files import visible_files
 from guiderail.models.common.files import write_atomically as write_atomically
 from guiderail.models.primitives import Demonstrations
 
@@ -135,7 +135,7 @@ ENDINGS = (".npz", ".csv")  # endings of demonstration files
 
 
 def load_demonstrations(path: Path) -> Demonstrations:
-    """Return the demonstrations of a file, or of all .npz and .csv files of a folder.
+    """Return the demonstrations of a file, or of all .npz and .csv files of a folder that are not hidden.
 
     Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts a folder only of
     .csv files.
@@ -144,10 +144,10 @@ def load_demonstrations(path: Path) -> Demonstrations:
         InputError: If there are no demonstrations, a file is invalid, or files have different outputs.
     """
     if path_exists(path) and path.is_dir():
-        files = in_order(file for file in path.iterdir() if file.suffix in ENDINGS)
+        files = visible_files(path, ENDINGS)
         if not files:
             raise InputError(f"there is no file {' or '.join(ENDINGS)} in {path}: name a folder of demonstrations")
-        parts = [load_demonstrations(file) for file in files]
+        parts = [Demonstrations.load(file) for file in files]
         for file, part in zip(files, parts, strict=True):
             if part.names != parts[0].names:
                 raise InputError(

@@ -72,6 +72,19 @@ def as_doubles(values: ArrayLike, what: str) -> np.ndarray:
     return as_numbers(values, what)
 
 
+def parse_number(text: str) -> float:
+    """Return the number that a text holds.
+
+    Python's float reads more than other programs do: digits of other scripts, and 1_000.
+
+    Raises:
+        ValueError: If the text is not a number.
+    """
+    if not text.isascii() or "_" in text:
+        raise ValueError(f"could not convert string to float: {text!r}")
+    return float(text)
+
+
 _EXACT = 2**53  # a double represents smaller whole numbers exactly
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import visible_files
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_NUMBERS
@@ -59,7 +60,7 @@ def import_recording(
             raise InputError("a LeRobot dataset does not state which numbers are a pose: leave --target out")
     elif find_bags(source):
         recorded, kind = read_bags(source, signal, target), "ROS 2 bags"
-    elif source.suffix == ".csv" or (source.is_dir() and any(source.glob("*.csv"))):
+    elif source.suffix == ".csv" or (source.is_dir() and visible_files(source, (".csv",))):
         if signal is not None:
             raise InputError("a CSV file holds one motion and no signals to choose from: leave --signal out")
         recorded, kind = read_csv_files(source, target=target, **csv_options), "CSV files"

@@ -37,6 +37,18 @@ def test_folder_contains_the_demonstrations_of_all_files(tmp_path):
         np.testing.assert_array_equal(outputs, motion(index))
 
 
+@pytest.mark.parametrize("ending", [".csv", ".npz"])
+def test_folder_is_read_without_hidden_files(ending, tmp_path):
+    write(tmp_path / "0.csv")
+    (tmp_path / f"._0{ending}").write_bytes(b"\x00\x05\x16\x07")
+    (tmp_path / f".old{ending}").mkdir()
+    assert load_demonstrations(tmp_path).num_demonstrations == 1
+    (tmp_path / f"1{ending}").mkdir()
+    write(tmp_path / f"1{ending}" / "2.csv", 2)
+    with pytest.raises(InputError, match=f"1{ending} is a folder with the name of a file"):
+        load_demonstrations(tmp_path)
+
+
 def test_saved_csv_file_is_read_again(tmp_path):
     Demonstrations(CLOCK, [motion(0), motion(1)]).save(tmp_path / "two.csv")
     assert load_demonstrations(tmp_path / "two.csv").num_demonstrations == 2

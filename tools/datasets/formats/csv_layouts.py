@@ -18,8 +18,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import in_order, read_bytes
+from guiderail.models.common.files import read_bytes, visible_files
 from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
@@ -96,7 +97,7 @@ def read_csv_files(
     ):
         if given is not None and given not in known:
             raise InputError(f"{option} is one of {', '.join(known)}, not {given!r}")
-    files = [path] if path.is_file() else in_order(path.glob("*.csv"))
+    files = [path] if path.is_file() else visible_files(path, (".csv",))
     if not files:
         raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
     recorded = Recorded([], [], ())
@@ -202,7 +203,7 @@ def _table(file: Path) -> list[_Column]:
         for number, row in rows:
             if len(row) != len(names):
                 raise InputError(f"{file}: line {number} has {len(row)} fields, the header has {len(names)}")
-            values.extend([np.nan if one.strip().lower() in _EMPTY else float(one) for one in row])
+            values.extend([np.nan if one.strip().lower() in _EMPTY else parse_number(one) for one in row])
     except InputError:
         raise
     except (ValueError, OSError, csv.Error) as error:

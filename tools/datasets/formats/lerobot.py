@@ -44,7 +44,10 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
 
     try:
         info = json.loads((folder / INFO).read_text(encoding="utf-8"))
-        version, features, fps = str(info["codebase_version"]), dict(info["features"]), float(info["fps"])
+        version, features, fps = str(info["codebase_version"]), dict(info["features"]), info["fps"]
+        if isinstance(fps, bool | str):
+            raise TypeError("fps is not a number")
+        fps = float(fps)
         vectors = [name for name, feature in features.items() if _is_vector(name, feature)]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"{folder} is not a LeRobot dataset: its {INFO} is missing or damaged") from error
@@ -53,7 +56,8 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     if not version.startswith("v3"):
         raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
     chosen, assumptions = choose_signal(sorted(vectors), signal, str(folder), "--signal")
-    files = sorted((folder / "data").rglob("*.parquet"))
+    # Copies made by macOS hold hidden files next to the data.
+    files = sorted(file for file in (folder / "data").rglob("*.parquet") if not file.name.startswith("."))
     if not files:
         raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
     check_parquet(files, MAX_LINES)

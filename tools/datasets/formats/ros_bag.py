@@ -42,13 +42,14 @@ _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bit
 
 
 def find_bags(path: Path) -> list[Path]:
-    """Return the bag at a path, or all bags in the folder, sorted by name; empty without one.
+    """Return the bag at a path, or all bags in the folder that are not hidden, sorted by name; empty without one.
 
     A folder is a bag if it has a `metadata.yaml`, and a file if its name ends in .mcap.
     """
     if _is_bag(path):
         return [path]
-    return in_order(filter(_is_bag, path.iterdir())) if path.is_dir() else []
+    entries = [one for one in path.iterdir() if not one.name.startswith(".")] if path.is_dir() else []
+    return in_order(filter(_is_bag, entries))
 
 
 def _is_bag(path: Path) -> bool:

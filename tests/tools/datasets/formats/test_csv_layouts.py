@@ -94,6 +94,21 @@ def test_quaternion_with_nan_is_refused(file):
         read_csv_files(file)
 
 
+@pytest.mark.parametrize("number", ["1_0", "\u0661", "\uff11"])
+def test_number_that_only_python_reads_is_refused(number, file):
+    with pytest.raises(InputError, match="not a table of numbers"):
+        read_csv_files(write(file, "t,x_m,y_m,z_m", 0, number, 2))
+
+
+def test_hidden_file_in_a_folder_is_not_read(file):
+    write(file, "t,x_m,y_m,z_m", 0, 1, 2)
+    file.with_name("._a.csv").write_bytes(b"\x00\x05\x16\x07")
+    assert len(read_csv_files(file.parent).times) == 1
+    file.with_name("b.csv").mkdir()
+    with pytest.raises(InputError, match=r"b\.csv is a folder with the name of a file"):
+        read_csv_files(file.parent)
+
+
 @pytest.mark.parametrize("row", ["0,0,0,3,5", "0,0,0,3,", "0,0,0"])
 def test_line_with_another_number_of_fields_is_refused(row, file):
     file.write_text(f"t,x,y,z\n{row}\n" + 3 * "0.1,1,2,3\n")

@@ -25,6 +25,8 @@ def dataset(tmp_path):
     [
         ({"features": {"action": "x"}}, "info.json is missing or damaged"),
         ({"features": {"action": {"dtype": "float32", "shape": 1}}}, "info.json is missing or damaged"),
+        ({"fps": "1_0"}, "info.json is missing or damaged"),
+        ({"fps": True}, "info.json is missing or damaged"),
         ({"fps": 0}, "0 frames a second: correct fps"),
         ({"fps": -10}, "-10 frames a second"),
         ({"fps": float("nan")}, "nan frames a second"),
@@ -35,6 +37,12 @@ def test_invalid_description_is_refused(changed, words, dataset):
     (dataset / INFO).write_text(json.dumps(info | changed))
     with pytest.raises(InputError, match=words):
         read_lerobot(dataset, "action")
+
+
+def test_hidden_file_next_to_the_data_is_not_read(dataset):
+    (file,) = (dataset / "data").rglob("*.parquet")
+    file.with_name(f"._{file.name}").write_bytes(b"\x00\x05\x16\x07")
+    assert len(read_lerobot(dataset, "action").times) == 1
 
 
 def test_dataset_with_too_many_rows_is_refused(dataset, monkeypatch):

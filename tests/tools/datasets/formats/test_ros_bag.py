@@ -54,6 +54,12 @@ def test_joint_order_may_differ_between_messages(tmp_path):
     np.testing.assert_array_equal(result.outputs[0], [[1, 2, 3]] * 4)
 
 
+def test_hidden_file_next_to_bags_is_not_read(tmp_path):
+    write(tmp_path / "0", JOINTS, joints, [("abc", (1, 2, 3))] * 2)
+    (tmp_path / "._1.mcap").write_bytes(b"\x00\x05\x16\x07")
+    assert len(read_bags(tmp_path, None, None).times) == 1
+
+
 def test_joint_order_may_differ_between_bags(tmp_path):
     for name, order in (("0", ("abc", (1, 2, 3))), ("1", ("cab", (3, 1, 2)))):
         write(tmp_path / name, JOINTS, joints, [order] * 2)
