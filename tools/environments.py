@@ -32,6 +32,7 @@ from guiderail.diagrams.tasks.registry import (
     is_task_folder,
     register_task_folder,
 )
+from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 
@@ -252,7 +253,7 @@ def _numbers(value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_numbers(one) for one in value)
     try:
-        return float(value) if isinstance(value, str) else value
+        return parse_number(value) if isinstance(value, str) else value
     except ValueError:
         return value
 
@@ -266,3 +267,17 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     threadpool_limits(1)
     arguments = check_environment(task, arguments)
     return gymnasium.make(environment_id(task), disable_env_checker=True, render_mode=render_mode, **arguments)
+
+
+def task_of(env: gymnasium.Env, name: str) -> Any:
+    """Return the task of an environment; `name` is the environment's name for the message.
+
+    Raises:
+        InputError: If the environment is not one of a task of guiderail.
+    """
+    task = getattr(env.unwrapped, "task", None)
+    if task is None:
+        raise InputError(
+            f"{name} is an environment without a task of guiderail, which can only be evaluated: register a task for it"
+        )
+    return task

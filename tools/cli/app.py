@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -288,8 +289,10 @@ def parse_floats(text: str, count: int, option: str) -> list[float]:
     Raises:
         InputError: If the number of values is not `count`, or a value is not finite.
     """
+    from guiderail.models.common.arrays import parse_number
+
     try:
-        numbers = [float(number) for number in text.split(",")]
+        numbers = [parse_number(number) for number in text.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
@@ -303,10 +306,11 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
     Raises:
         InputError: If a value is not an integer.
     """
-    try:
-        return None if text is None else [int(number) for number in text.split(",")]
-    except ValueError:
-        raise InputError(f"{option} takes whole numbers separated by commas, such as 0,1, not {text!r}") from None
+    if text is None:
+        return None
+    if not re.fullmatch(r"\s*[-+]?[0-9]{1,18}\s*(,\s*[-+]?[0-9]{1,18}\s*)*", text):
+        raise InputError(f"{option} takes whole numbers separated by commas, such as 0,1, not {text!r}")
+    return [int(number) for number in text.split(",")]
 
 
 def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:

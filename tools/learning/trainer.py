@@ -15,7 +15,7 @@ import torch
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment
+from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
 from guiderail.tools.evaluation.step_log import StepLog, remove_step_logs
@@ -102,7 +102,7 @@ def run_training(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
             )
-        arguments = learner_arguments(config, cast(Any, env.unwrapped).task)
+        arguments = learner_arguments(config, task_of(env, config.task))
         try:
             learner: Learner = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
         except MemoryError as error:

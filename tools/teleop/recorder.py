@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -30,7 +30,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.systems.meshcat_device import MeshcatDevice
 from guiderail.systems.support.drake_multibody import transform_to_vector
-from guiderail.tools.environments import make_environment
+from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.files import check_new
 from guiderail.tools.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS, MeshcatPanel, Slider, page_address, set_camera
@@ -435,13 +435,13 @@ def teleoperate(
     if record is not None:
         return record_demonstrations(task, environment, record, log)
     env = make_environment(task, environment, render_mode="human")
-    base, size = cast(Any, env.unwrapped), int(env.action_space.shape[0])  # type: ignore[index]
+    own, size = task_of(env, task), int(env.action_space.shape[0])  # type: ignore[index]
     if size > len(GAMEPAD_AXES):
         raise InputError(
             f"an action of {task} has {size} numbers, a device only {len(GAMEPAD_AXES)}: choose another --guidance"
         )
-    device = MeshcatDevice(base.task.meshcat, GAMEPAD_AXES[:size], KEY_PAIRS[:size], base.task.control_period)
-    log(f"Teleoperate at {page_address(base.task.meshcat)} with a gamepad, the sliders, or the keys:")
+    device = MeshcatDevice(own.meshcat, GAMEPAD_AXES[:size], KEY_PAIRS[:size], own.control_period)
+    log(f"Teleoperate at {page_address(own.meshcat)} with a gamepad, the sliders, or the keys:")
     log(", ".join(f"{lower[-1]} and {higher[-1]}" for lower, higher in KEY_PAIRS[:size]) + ". Ctrl-C ends.")
     while True:
         log(run_episode(env, lambda observation: device.read()))

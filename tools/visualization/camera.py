@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from guiderail.tools.environments import make_environment
+from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
@@ -121,6 +121,7 @@ def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], li
 def _run(episode: EpisodeSpec, max_frames: int) -> tuple[dict[str, Any], Frames]:
     """Run an episode; return the row of its metrics and at most `max_frames` camera frames."""
     env = make_environment(episode.task, episode.environment, render_mode="rgb_array")
+    task_of(env, episode.task)
     env.reset(seed=episode.run_seed)
     frames, policy = Frames(env, max_frames), episode.policy(env)
     _LOGGER.info("simulating a held-out episode, then writing its camera frames")

@@ -23,7 +23,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.tools.environments import make_environment
+from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
@@ -196,7 +196,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     check_page(html)
     env = make_environment(episode.task, episode.environment, render_mode="human")
     base = cast(Any, env.unwrapped)
-    meshcat = getattr(base.task, "meshcat", None)
+    meshcat = getattr(task_of(env, episode.task), "meshcat", None)
     if meshcat is None:
         raise InputError(f"{episode.task} has no animation: give --image or --video, if its environment renders images")
     base.simulator.set_target_realtime_rate(0.0)

@@ -2,12 +2,14 @@ import json
 import subprocess
 import sys
 
+import gymnasium
 import numpy as np
 import pytest
 import typer
 
 import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
@@ -100,10 +102,15 @@ def trained(bead_run):
         (["dataset", "validate", "."], "no file .npz or .csv"),
         (["dataset", "validate", "new.yaml"], "there is no file new.yaml"),
         (["dataset", "fit-bounds", "new.npz", "--outputs", "x"], "whole numbers separated by commas"),
+        (["dataset", "import", "new.csv", "--out", "new.npz", "--target", "1_0,0,0,0,0,0"], "takes 6 numbers"),
         (["template", "validate", "pourin"], "or one of end_effector_velocity, grid_clamp, pouring"),
         (["template", "validate", "."], "a template is .yaml"),
         (["study", "connector.yaml", "--out", "new"], "there is no file connector.yaml"),
         (["study", CONNECTOR, "--out", "new", "--seeds", "1;2"], "whole numbers separated by commas"),
+        (["study", CONNECTOR, "--out", "new", "--seeds", "1_0"], "whole numbers separated by commas"),
+        (["study", CONNECTOR, "--out", "new", "--seeds", "\u0661"], "whole numbers separated by commas"),
+        (["study", CONNECTOR, "--out", "new", "--seeds", "1,1"], "given twice"),
+        (["study", CONNECTOR, "--out", "new", "--seeds=-1"], "seeds, 0: "),
         (["study", CONNECTOR, "--out", "new", "--methods", "skgrll"], "did you mean skgrl?"),
         (["study", CONNECTOR, "--out", "new", "--engine", "rya"], "did you mean ray?"),
         (["study", CONNECTOR, "--out", "new", "--processes", "0"], "at least one process"),
@@ -297,11 +304,49 @@ for words in ("--version", "--help", "study --help", "evaluate --help", "list ta
 
 
 @pytest.mark.parametrize(
-    "text", ["0", "-7", "007", "1.50", "-0.0", "word", "nan", "inf", "true", "null", "no", "a-b", "1e-3"]
+    "text",
+    [
+        "0",
+        "-7",
+        "007",
+        "1.50",
+        "-0.0",
+        "word",
+        "nan",
+        "inf",
+        "true",
+        "null",
+        "no",
+        "a-b",
+        "1e-3",
+        "1_0",
+        "1_0.5",
+        "\u0661",
+    ],
 )
 def test_as_value_reads_plain_text_as_yaml_does(text):
     (expected,) = as_value(f"[{text}]")
     assert repr(as_value(text)) == repr(expected)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "Foreign", "--out", "new"],
+        ["visualize", "Foreign", "--policy", "zero", "--html", "new.html"],
+        ["visualize", "Foreign", "--policy", "zero", "--image", "new.png"],
+        ["teleoperate", "Foreign"],
+    ],
+)
+def test_environment_without_a_task_is_refused(words, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+    gymnasium.register(environment_id("Foreign"), entry_point=entry)
+    code, _, err = call(capsys, *words)
+    gymnasium.registry.pop(environment_id("Foreign"))
+    assert (code, err.count("\n")) == (2, 1)
+    assert "Foreign is an environment without a task of guiderail" in err
+    assert not list(tmp_path.iterdir())
 
 
 def test_train_refuses_mistakes_before_slow_imports(tmp_path):
@@ -361,6 +406,8 @@ def test_train_accepts_any_option_of_an_environment(capsys, tmp_path):
         ("arm", "arm"),
         ("null", None),
         ("2001-99-99", "2001-99-99"),
+        ("1_0", "1_0"),
+        ("\u0661", "\u0661"),
         ("a: b: c", "a: b: c"),
         ("[" * 99, "[" * 99),
     ],
