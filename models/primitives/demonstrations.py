@@ -11,6 +11,8 @@ from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
 
+MAX_MAGNITUDE = 1e100  # largest absolute value: covariances are products of two outputs
+
 
 class Demonstrations:
     """M recordings of O outputs over time, each with its own length and rate.
@@ -24,8 +26,8 @@ class Demonstrations:
 
     Raises:
         InputError: If there is no demonstration, one has fewer than two points or no output, shapes or dimensions
-            differ, a number is not finite, time does not increase strictly, or `names` are not O different short
-            printable texts.
+            differ, a number is not finite or above `MAX_MAGNITUDE`, time does not increase strictly, or `names` are not
+            O different short printable texts.
 
     Attributes:
         times, outputs: M arrays (N_m,) and (N_m, O).
@@ -63,6 +65,8 @@ class Demonstrations:
                 )
             if not np.isfinite(t).all() or not np.isfinite(y).all():
                 raise InputError(f"demonstration {m} contains NaN or infinity: cut those samples out")
+            if (largest := max(np.abs(t).max(initial=0.0), np.abs(y).max(initial=0.0))) > MAX_MAGNITUDE:
+                raise InputError(f"demonstration {m} contains {largest:.3g}, which is too large to compute with: check its unit")
         self._drop_repeated_samples()
         for m, t in enumerate(self.times):
             if len(t) < 2:

@@ -57,6 +57,8 @@ def test_constructor_drops_repeated_samples():
         ([[0.0]], [[[1.0]]], "1 point"),
         ([[0.0, 1.0]], [[[1.0], [np.nan]]], "NaN"),
         ([[0.0, np.inf]], [[[1.0], [2.0]]], "infinity"),
+        ([[0.0, 1.0]], [[[1.0], [-1e101]]], "1e.101, which is too large"),
+        ([[0.0, 1e101]], [[[1.0], [2.0]]], "1e.101, which is too large"),
         ([[0.0, 0.0]], [[[1.0], [2.0]]], "does not increase at sample 1"),
         ([[0.0, 2.0, 1.0]], [[[1.0], [2.0], [3.0]]], "does not increase at sample 2"),
         ([[0.0, 1.0], [0.0, 1.0]], [[[1.0], [2.0]], [[1.0, 1.0], [2.0, 2.0]]], "2 outputs, the first has 1"),
