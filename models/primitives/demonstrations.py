@@ -66,7 +66,7 @@ class Demonstrations:
             if not np.isfinite(t).all() or not np.isfinite(y).all():
                 raise InputError(f"demonstration {m} contains NaN or infinity: cut those samples out")
             if (largest := max(np.abs(t).max(initial=0.0), np.abs(y).max(initial=0.0))) > MAX_MAGNITUDE:
-                raise InputError(f"demonstration {m} contains {largest:.3g}, which is too large to compute with: check its unit")
+                raise InputError(f"demonstration {m} contains {largest:.3g}, which is too large: check its unit")
         self._drop_repeated_samples()
         for m, t in enumerate(self.times):
             if len(t) < 2:
