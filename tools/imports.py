@@ -122,11 +122,15 @@ def _is_dotted_name(name: str) -> bool:
 
 
 def _is_module(name: str) -> bool:
-    """Return True if there is a module of that name, even if its package imports another module that is missing."""
+    """Return True if there is a module of that name, even if its package cannot be imported.
+
+    A folder without `__init__.py`, which Python imports as a namespace, is none: it registers nothing.
+    """
     if not _is_dotted_name(name):
         return False
     try:
-        return find_spec(name) is not None
+        spec = find_spec(name)
+        return spec is not None and spec.origin is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
     except (ImportError, ValueError):  # for example __main__, which has no module specification

@@ -67,6 +67,13 @@ def test_path_is_no_module(name, canary, monkeypatch):
     assert not executed.exists()
 
 
+def test_folder_without_code_is_no_module(tmp_path, monkeypatch):
+    (tmp_path / "recordings_of_mine").mkdir()
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(InputError, match="there is no module, file or task folder recordings_of_mine"):
+        import_modules(["recordings_of_mine"])
+
+
 def test_loaded_module_needs_no_trust(tmp_path):
     assert import_stored(["json"], tmp_path / "config.yaml") == ("json",)
 
