@@ -275,12 +275,21 @@ def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str,
     """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message.
 
     Raises:
-        InputError: If a value has no `=`.
+        InputError: If a value has no `=`, or two values of one name differ.
     """
+    pairs: dict[str, str] = {}
     for pair in given or []:
         if "=" not in pair:
             raise InputError(f"{option} takes name=value, such as {example}, not {pair!r}")
-    return {key.strip(): value.strip() for key, _, value in (pair.partition("=") for pair in given or [])}
+        name, value = (part.strip() for part in pair.split("=", 1))
+        check_same(name, pairs.setdefault(name, value), value)
+    return pairs
+
+
+def check_same(name: str, value: Any, other: Any) -> None:
+    """Raise an InputError if an option that was given twice has two values."""
+    if value != other:
+        raise InputError(f"{name} is given as {value} and as {other}: give it once")
 
 
 def parse_floats(text: str, count: int, option: str) -> list[float]:
@@ -316,17 +325,16 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
 def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:
     """Return the options of an environment: values of `--env`, read as YAML, and other options that are not None.
 
-    The values of `--env` take precedence.
-
     Raises:
-        InputError: If a value of `--env` has no `=`.
+        InputError: If a value of `--env` has no `=`, or two values of one option differ.
     """
     environment = {name: value for name, value in options.items() if value is not None}
     if given:
         from guiderail.tools.environments import as_value
 
         pairs = parse_pairs(given, "--env", "station=arm")
-        environment |= {key: as_value(value) for key, value in pairs.items()}
+        for name, value in ((name, as_value(text)) for name, text in pairs.items()):
+            check_same(name, environment.setdefault(name, value), value)
     return environment
 
 

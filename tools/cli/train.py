@@ -112,7 +112,7 @@ def train(
         environment = _with_stored_robot(out, environment)
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     if num_envs is not None:
-        settings["num_envs"] = str(num_envs)
+        cli.check_same("num_envs", settings.setdefault("num_envs", str(num_envs)), str(num_envs))
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
     if task is not None and not modules and not resume:

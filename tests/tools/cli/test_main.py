@@ -61,6 +61,16 @@ def trained(bead_run):
         (["train", "Bead", "--with-person"], "no option --with-person"),
         (["train", "Bead", "--out", "new", "--env", "action_repeat"], "--env takes name=value"),
         (["train", "Bead", "--out", "new", "--env", "action_repaet=2"], "did you mean action_repeat?"),
+        (["train", "Bead", "--out", "new", "--env", "wall=1", "--env", "wall=2"], "wall is given as 1 and as 2"),
+        (
+            ["train", "Bead", "--out", "new", "--guidance", "kmp", "--env", "guidance=skgrl"],
+            "given as kmp and as skgrl",
+        ),
+        (
+            ["train", "Bead", "--out", "new", "--num-envs", "2", "--set", "num_envs=1"],
+            "num_envs is given as 1 and as 2",
+        ),
+        (["train", "Bead", "--out", "new", "--set", "tau=1", "--set", "tau=0.5"], "tau is given as 1 and as 0.5"),
         (["train", "Bead", "--out", "new", "--env", "action_repeat=two"], "give a value such as 1"),
         (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
         (["train", "BncConnector", "--out", "new", "--robot", "panda"], "it is one of station='arm'"),
