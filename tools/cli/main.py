@@ -81,9 +81,13 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         code = 1
     except OSError as error:
-        if error.filename is None or error.errno not in (errno.ENAMETOOLONG, errno.EACCES):
+        if error.filename is None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            message = f"the output cannot be written ({error.strerror}): choose a place with room to write"
+        elif error.filename is not None and error.errno in (errno.ENAMETOOLONG, errno.EACCES):
+            message = f"the path {brief(error.filename)} cannot be used ({error.strerror}): name another"
+        else:
             raise
-        print_message(f"the path {brief(error.filename)} cannot be used ({error.strerror}): name another")
+        print_message(message)
         code = 2
     except Exception as error:
         missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -357,6 +358,16 @@ def test_environment_without_a_task_is_refused(words, capsys, tmp_path, monkeypa
     assert (code, err.count("\n")) == (2, 1)
     assert "Foreign is an environment without a task of guiderail" in err
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this machine has no /dev/full")
+def test_full_disk_of_standard_output_is_named():
+    with open("/dev/full", "w") as full:
+        words = [sys.executable, "-m", "guiderail", "list", "tasks"]
+        result = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+    assert result.returncode == 2
+    assert result.stderr.startswith("guiderail: the output cannot be written (No space left on device): ")
+    assert result.stderr.count("\n") == 1
 
 
 def test_train_refuses_mistakes_before_slow_imports(tmp_path):
