@@ -172,8 +172,6 @@ def _train(
         remove_step_logs(folder.steps, config.episodes)
         if num_written < len(rows):
             folder.write_episodes(rows)  # the loop below does not write the table of a complete run
-        if len(rows) < config.episodes:
-            folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
     num_restored, supervised = len(rows), None
     if config.human_in_the_loop and supervisor is not None:
         from guiderail.tools.learning.interventions import SupervisedTraining
@@ -182,6 +180,8 @@ def _train(
         supervised.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
         env, config = supervised.env, supervised.config
     folder.write_config(config)
+    if resume and len(rows) < config.episodes:
+        folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
 
     step_log = StepLog(env, folder.steps)
     callbacks: list[Callback] = [step_log] if config.step_log else []

@@ -52,6 +52,15 @@ def test_run_resumes_when_a_full_disk_has_room_again(at, whole, module_config, t
     assert differences(whole, folder.path) == []
 
 
+def test_policy_is_kept_when_a_full_disk_refuses_to_resume(module_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    run_training(folder, replace(module_config, episodes=3))
+    before = content(folder)
+    with full_disk(), refused("cannot be written"):
+        run_training(folder, module_config, resume=True)
+    assert content(folder) == before
+
+
 def test_run_is_unchanged_when_its_folder_is_read_only(whole, module_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(module_config, episodes=3))
