@@ -105,6 +105,8 @@ class CartesianPositionController(LeafSystem):
         super().__init__()
         check_period(period)
         num_joints = plant.num_positions()
+        if num_joints < 6:
+            raise InputError(f"a position controller needs an arm of at least six joints, not {num_joints}")
         if not 0.0 <= posture_gain < np.inf:
             raise InputError(
                 f"a position controller's posture gain must be finite and not negative, not {posture_gain}"

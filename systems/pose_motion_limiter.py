@@ -5,6 +5,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError, Synchronization, Trajectory
 from scipy.spatial.transform import Rotation
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.systems.support import declarations as declare
@@ -29,7 +30,7 @@ class PoseMotionLimiter(LeafSystem):
     Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
     (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
     the limits. A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the
-    output comes to rest at the last valid one.
+    output comes to rest at the last valid one. A measured pose that is not finite is ignored: the last output is kept.
 
     .. pydrake_system::
 
@@ -49,8 +50,8 @@ class PoseMotionLimiter(LeafSystem):
         period: Sampling period [s], positive.
 
     Raises:
-        InputError: If the period is out of range. At an evaluation, if no trajectory within the limits is found, not
-            even one to rest.
+        InputError: If the period is out of range. At initialization, if the measured pose is not finite. At an
+            evaluation, if no trajectory within the limits is found, not even one to rest.
     """
 
     def __init__(self, limits: MotionLimits, *, period: float):
@@ -74,9 +75,13 @@ class PoseMotionLimiter(LeafSystem):
     get_limited_pose_output_port = output_getter("limited_pose", "pose within the limits of the motion, (6,)")
 
     def _calc_next_state(self, context: Context) -> np.ndarray:
-        if self._blend_factor_port.Eval(context)[0] <= 0.0:
-            return _at_rest(self._pose_port.Eval(context))
         state = context.get_discrete_state().value(self._state).copy()
+        if self._blend_factor_port.Eval(context)[0] <= 0.0:
+            measured = self._pose_port.Eval(context)
+            if is_finite(measured):
+                return _at_rest(measured)
+            state[6:18], state[18:24] = 0.0, state[:6]
+            return state
         start = Rotation.from_quat(state[24:])
         desired = self._desired_pose_port.Eval(context)
         if np.isfinite(desired).all():
@@ -97,7 +102,7 @@ class PoseMotionLimiter(LeafSystem):
         return np.concatenate([state[:3], angles[::-1]])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(_at_rest(self._pose_port.Eval(context)))
+        discrete_state.set_value(_at_rest(declare.start_pose(self._pose_port, context)))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._next_state.Eval(context))

@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_difference
 from guiderail.systems.support import declarations as declare
@@ -16,7 +17,7 @@ class PoseRateLimiter(LeafSystem):
     towards the desired pose; if it is positive at initialization, the output starts from the pose measured then. In
     each period the position moves along a straight line by at most speed times period; each angle turns separately, in
     the shorter direction. A desired pose within the speed limits is output unchanged. A desired pose that is not finite
-    is ignored.
+    is ignored, and so is a measured pose: the last output is kept.
 
     .. pydrake_system::
 
@@ -37,7 +38,7 @@ class PoseRateLimiter(LeafSystem):
         angular_speed: Speed limit of each angle [rad/s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range. At initialization, if the measured pose is not finite.
     """
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):
@@ -59,9 +60,10 @@ class PoseRateLimiter(LeafSystem):
     get_limited_pose_output_port = output_getter("limited_pose", "rate-limited pose, (6,)")
 
     def _limited_pose(self, context: Context) -> np.ndarray:
-        if self._blend_factor_port.Eval(context)[0] <= 0.0:
-            return self._pose_port.Eval(context)
         last = context.get_discrete_state().value(self._last_pose)
+        if self._blend_factor_port.Eval(context)[0] <= 0.0:
+            measured = self._pose_port.Eval(context)
+            return measured if is_finite(measured) else last
         desired = self._desired_pose_port.Eval(context)
         if not np.isfinite(desired).all():
             return last  # NaN would remain in the state for ever
@@ -74,7 +76,7 @@ class PoseRateLimiter(LeafSystem):
         return last + change
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._pose_port.Eval(context))
+        discrete_state.set_value(declare.start_pose(self._pose_port, context))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._limited_pose(context))

@@ -3,6 +3,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from pydrake.multibody.inverse_kinematics import DifferentialInverseKinematicsStatus
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import RevoluteJoint
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
@@ -246,6 +248,15 @@ def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     plant, model = arm
     with pytest.raises(InputError):
         CartesianPositionController(plant, model.target, model.tool_center, **({"posture": READY_POSTURE} | wrong))
+
+
+def test_constructor_refuses_an_arm_of_fewer_than_six_joints():
+    plant = MultibodyPlant(0.0)
+    body = plant.AddRigidBody("link")
+    plant.AddJoint(RevoluteJoint("joint", plant.world_frame(), body.body_frame(), [0.0, 0.0, 1.0]))
+    plant.Finalize()
+    with pytest.raises(InputError, match="at least six joints, not 1"):
+        CartesianPositionController(plant, plant.world_frame(), body.body_frame(), posture=np.zeros(1))
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, np.nan])

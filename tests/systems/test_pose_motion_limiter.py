@@ -179,3 +179,18 @@ def test_orientation_stays_continuous_across_half_a_turn_of_an_angle():
     loop = Loop()
     loop.set(START + [0, 0, 0, 0, 0, 0.4])  # Rx passes π
     assert derivatives(loop.run(300))[1][0] <= LIMITS.angular[0]
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_measured_pose_is_ignored_when_it_is_not_finite(number):
+    loop, moved = Loop(), START + [0.02, 0.0, 0.0, 0.0, 0.0, 0.0]
+    loop.set(moved)
+    last = loop.run(20)[-1]
+    loop.system.get_pose_input_port().FixValue(loop.context, [number, *START[1:]])
+    loop.set(moved, blend_factor=0.0)
+    kept = loop.run(3)
+    assert_close(kept[0], last, atol=2e-3)
+    np.testing.assert_array_equal(kept, [kept[0]] * 3)
+    loop.context.SetTime(0.0)
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        loop.simulator.Initialize()

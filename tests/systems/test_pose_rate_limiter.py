@@ -174,6 +174,18 @@ def test_constructor_refuses_arguments_out_of_range(wrong):
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_measured_pose_is_ignored_when_it_is_not_finite(number):
+    rig = Rig(MEASURED)
+    rig.advance()
+    rig.pose.GetMutableData().set_value([number, *MEASURED[1:]])
+    np.testing.assert_array_equal(rig.advance(2), [MEASURED] * 2)
+    np.testing.assert_array_equal(rig.start_blending().advance(), [MEASURED])
+    rig.simulator.get_mutable_context().SetTime(0.0)
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        rig.simulator.Initialize()
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_desired_pose_is_ignored_when_it_is_not_finite(number):
     rig = Rig(MEASURED + 0.01).start_blending()
     before = rig.advance(4)[-1]
