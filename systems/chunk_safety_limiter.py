@@ -1,5 +1,6 @@
 """Limiter that keeps the chunks of a policy within bounds, velocity limits and jerk limits."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.chunk_guard import MIN_STEPS, ChunkGuard
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, input_getter, output_getter
+from guiderail.systems.support.declarations import after_start, check_period, input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ class ChunkSafetyLimiter(LeafSystem):
         guard: Limits and mode, for O outputs; its state is not used.
         num_steps: Number K of steps of a chunk, at least 4 and at least `replan_steps`.
         replan_steps: Number of control steps that are executed of each chunk, at least 1.
-        period: Control period [s], positive. It must equal the period of the guard, which is not checked.
+        period: Control period [s], positive, that of the guard.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
@@ -59,6 +60,9 @@ class ChunkSafetyLimiter(LeafSystem):
                 f"num_steps of a chunk must be at least {MIN_STEPS}, and replan_steps from 1 to num_steps, not "
                 f"{num_steps} and {replan_steps}"
             )
+        check_period(period)
+        if not math.isclose(period, guard.period, rel_tol=1e-6):
+            raise InputError(f"the period must be that of the guard, {guard.period} s, not {period} s")
         self._guard, self._num_steps, self._replan_steps = guard, num_steps, replan_steps
         self._outputs = guard.constraints.num_outputs
         self._chunk_port = self.DeclareVectorInputPort("chunk", num_steps * self._outputs)

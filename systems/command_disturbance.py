@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -39,6 +40,7 @@ class CommandDisturbance(LeafSystem):
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
         super().__init__()
+        size, delay = as_whole(size, "size of a command"), as_whole(delay, "delay of commands")
         if size < 1:
             raise InputError(f"a command has at least one number, not {size}")
         if not 0.0 <= loss_probability < 1.0:
@@ -64,8 +66,12 @@ class CommandDisturbance(LeafSystem):
     get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Set the seed of the losses, not negative; `context` is this system's."""
-        context.get_mutable_numeric_parameter(self._seed).SetFromVector([float(seed)])
+        """Set the seed of the losses; `context` is this system's.
+
+        Raises:
+            InputError: If the seed is not a whole number of at least 0.
+        """
+        context.get_mutable_numeric_parameter(self._seed).SetFromVector(declare.seed_parameter(seed))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

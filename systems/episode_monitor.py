@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import SignalPorts, after_start, check_takes, output_getter
 
@@ -54,8 +55,8 @@ class TerminationTerm:
     def __post_init__(self) -> None:
         if self.termination not in TERMINATIONS[1:]:
             raise InputError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
-        if not 1 <= self.steps < np.inf:
-            raise InputError(f"the steps of a condition must be finite and at least 1, not {self.steps}")
+        if not is_whole(self.steps, 1):
+            raise InputError(f"the steps of a condition must be a whole number of at least 1, not {brief(self.steps)}")
         if not 0.0 <= self.min_progress < np.inf:
             raise InputError(f"the smallest progress must be finite and not negative, not {self.min_progress}")
 

@@ -8,7 +8,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.sensor_disturbance import DRIFT_TIME
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
@@ -118,16 +119,27 @@ class ExternalTorqueSensor(LeafSystem):
         return tuple(self._bodies)
 
     def set_errors(self, context: Context, errors: JointTorqueErrors, seed: int) -> None:
-        """Set the errors of an episode and the seed of noise and drift, not negative; `context` is this system's."""
-        for index, values in (
-            (self._gain, errors.gain),
-            (self._offset, errors.offset),
-            (self._friction, errors.friction),
-            (self._mass, errors.mass),
-            (self._center, errors.center.ravel()),
-            (self._seed, [float(seed)]),
+        """Set the errors of an episode and the seed of noise and drift; `context` is this system's.
+
+        Raises:
+            InputError: If an error has the wrong shape or is not finite, or the seed is not a whole number of at
+                least 0.
+        """
+        n, bodies = len(self._noise), len(self._bodies)
+        parameters = {self._seed: np.array(declare.seed_parameter(seed))}
+        for name, index, shape in (
+            ("gain", self._gain, (n,)),
+            ("offset", self._offset, (n,)),
+            ("friction", self._friction, (n,)),
+            ("mass", self._mass, (bodies,)),
+            ("center", self._center, (bodies, 3)),
         ):
-            context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
+            values = as_numbers(getattr(errors, name), f"{name} of joint torque errors")
+            if values.shape != shape or not np.isfinite(values).all():
+                raise InputError(f"{name} of joint torque errors must be finite numbers {shape}, not {brief(values)}")
+            parameters[index] = values.ravel()
+        for index, values in parameters.items():
+            context.get_mutable_numeric_parameter(index).SetFromVector(values)
 
     def add_payload(self, context: Context, mass: float) -> None:
         """Add a payload of a mass [kg] that is not in the arm's model; `context` is this system's."""

@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import after_start, input_getter, output_getter
@@ -41,6 +42,7 @@ class HistoryBuffer(LeafSystem):
 
     def __init__(self, num_outputs: int, length: int, period: float):
         super().__init__()
+        num_outputs, length = as_whole(num_outputs, "num_outputs of a history"), as_whole(length, "length of a history")
         if num_outputs < 1 or length < 1:
             raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
         self._shape = (length, num_outputs)

@@ -1,5 +1,6 @@
 """Linearly constrained null-space movement primitive as a system (thesis, equations 4.21 and 5.1)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -64,8 +65,10 @@ class LcNsKmpSystem(LeafSystem):
 
     Raises:
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or the primitives in
-            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`. At an
-            evaluation, if the action or the history is not finite, or no primitive has the selected history length.
+            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`. At
+            initialization, if ``reference_window`` is connected and the primitives have different horizons. At an
+            evaluation, if the action, the history or the time is not finite, or no primitive has the selected history
+            length.
     """
 
     def __init__(
@@ -157,6 +160,9 @@ class LcNsKmpSystem(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the command is a fallback, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        horizons = sorted({primitive.horizon for primitive, _ in self._by_history_length.values()})
+        if len(horizons) > 1 and self._reference_window_port.HasValue(context):
+            raise InputError(f"with a reference window all primitives must have one horizon, not {horizons}")
         step = round(context.get_time() / self._period)
         discrete_state.set_value(self._step, [step])
         if step == 0:  # an initialization at a later time keeps the last command for fallbacks
@@ -171,7 +177,10 @@ class LcNsKmpSystem(LeafSystem):
     def _predict(self, context: Context) -> _Prediction:
         step = int(context.get_discrete_state().value(self._step).item())
         if self._motion_time_port.HasValue(context):
-            step = round(self._motion_time_port.Eval(context)[0] / self._period)
+            time = self._motion_time_port.Eval(context)[0]
+            if not math.isfinite(time):
+                raise InputError(f"motion_time must be finite, not {time} s")
+            step = round(time / self._period)
         length = self._primitive.history
         if self._history_length_port is not None:
             length = self._history_length_port.Eval(context)[0]

@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -39,6 +40,7 @@ class MeanForce(LeafSystem):
 
     def __init__(self, size: int, substeps: int, period: float):
         super().__init__()
+        size, substeps = as_whole(size, "size of a mean force"), as_whole(substeps, "substeps of a mean force")
         if size < 1 or substeps < 1:
             raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
         self._scale = 1.0 / substeps

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import SignalPorts, output_getter
@@ -55,11 +56,12 @@ class Recorder(LeafSystem):
 
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
         super().__init__()
+        num_samples = as_whole(num_samples, "num_samples of a recorder")
         if not signals or num_samples < 1:
             raise InputError("a recorder needs at least one signal, and room for one sample")
         self._signals = SignalPorts(self, signals)
-        self._sizes, self._num_samples, self._period = dict(signals), num_samples, period
-        self._width = sum(signals.values())
+        self._sizes = {name: self._signals.port(name).size() for name in signals}
+        self._width, self._num_samples, self._period = sum(self._sizes.values()), num_samples, period
         self._count = self.DeclareDiscreteState(1)
         self._samples = self.DeclareDiscreteState(num_samples * self._width)
         self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)

@@ -107,8 +107,12 @@ class SensorDisturbance(LeafSystem):
         """Set scale s (n,), bias b (n,) in the units of the sensor, and the seed of noise and drift, not negative.
 
         `context` is this system's.
+
+        Raises:
+            InputError: If the seed is not a whole number of at least 0.
         """
-        for index, values in ((self._scale, scale), (self._bias, bias), (self._seed, [seed])):
+        given = ((self._scale, scale), (self._bias, bias), (self._seed, declare.seed_parameter(seed)))
+        for index, values in given:
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
     def set_delay(self, context: Context, delay: int) -> None:

@@ -83,7 +83,7 @@ class ChunkGuard:
             raise InputError(f"a control period is positive, not {period}")
         if mode not in MODES:
             raise InputError(f"a guard's mode is {' or '.join(MODES)}, not {brief(mode)}")
-        self.constraints, self._mode = constraints, mode
+        self.constraints, self.period, self._mode = constraints, period, mode
         self._step, self._jerk = limits[0] * period, limits[1] * period**3
         self._tolerance = 0.1 * self._step if tolerance is None else limits[2]
         coupled = (constraints.G != 0).T.astype(float) @ (constraints.G != 0)

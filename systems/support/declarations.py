@@ -22,8 +22,8 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from guiderail.models.common.arrays import is_finite
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_whole, is_finite, is_whole
+from guiderail.models.common.errors import InputError, brief
 
 
 class SignalPorts:
@@ -34,12 +34,13 @@ class SignalPorts:
         signals: Mappings from name to size, at least 1. Equal names share one port.
 
     Raises:
-        InputError: If a size is below 1, or a signal has two sizes.
+        InputError: If a size is not a whole number of at least 1, or a signal has two sizes.
     """
 
     def __init__(self, system: LeafSystem, *signals: Mapping[str, int]):
         sizes: dict[str, int] = {}
         for name, size in (item for mapping in signals for item in mapping.items()):
+            size = as_whole(size, f"the size of signal '{name}'")
             if size < 1:
                 raise InputError(f"signal '{name}' needs a size of at least 1, not {size}")
             if sizes.setdefault(name, size) != size:
@@ -95,6 +96,17 @@ def check_period(period: float) -> None:
     """Raise an `InputError` unless the period [s] is positive and finite."""
     if not 0.0 < period < np.inf:
         raise InputError(f"a system's period must be positive and finite, not {period} s")
+
+
+def seed_parameter(seed: object) -> list[float]:
+    """Return a seed as the value of a numeric parameter (1,).
+
+    Raises:
+        InputError: If it is not a whole number of at least 0.
+    """
+    if not is_whole(seed, 0):
+        raise InputError(f"a seed is a whole number of at least 0, not {brief(seed)}")
+    return [float(as_whole(seed, "a seed"))]
 
 
 Source: TypeAlias = InputPort | CacheEntry | DiscreteStateIndex | DependencyTicket

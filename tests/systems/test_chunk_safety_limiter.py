@@ -88,6 +88,8 @@ def test_argument_is_refused_when_it_is_out_of_range():
             ChunkSafetyLimiter(guard(), steps, replan, PERIOD)
     with pytest.raises(InputError, match="period"):
         ChunkSafetyLimiter(guard(), 4, 4, 0.0)
+    with pytest.raises(InputError, match="the period must be that of the guard"):
+        ChunkSafetyLimiter(guard(), 4, 4, 2 * PERIOD)
     ChunkSafetyLimiter(guard(), 4, 4, PERIOD)
     ChunkSafetyLimiter(guard(), 4, 1, PERIOD)
 

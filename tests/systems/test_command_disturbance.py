@@ -60,10 +60,28 @@ def test_lost_command_is_replaced_by_the_last_delivered_one():
     assert not np.array_equal(delivered(400, loss_probability=0.3, seed=2), outputs)
 
 
-@pytest.mark.parametrize("wrong", [{"loss_probability": 1.0}, {"loss_probability": -0.1}, {"delay": -1}, {"size": 0}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"loss_probability": 1.0},
+        {"loss_probability": -0.1},
+        {"delay": -1},
+        {"delay": 1.5},
+        {"delay": np.nan},
+        {"size": 0},
+        {"size": 1.5},
+    ],
+)
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):
         CommandDisturbance(**{"size": 1, "period": PERIOD} | wrong)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, np.nan])
+def test_seed_is_refused_when_it_is_no_whole_number_from_zero(seed):
+    system = CommandDisturbance(1, PERIOD)
+    with pytest.raises(InputError, match="a seed is a whole number of at least 0, not"):
+        system.set_seed(system.CreateDefaultContext(), seed)
 
 
 def test_losses_are_samples_of_seed_and_count_and_repeat_after_a_reset():

@@ -110,6 +110,7 @@ def test_first_term_takes_precedence():
         lambda: above(1, min_progress=float("nan")),
         lambda: above(1, min_progress=float("inf")),
         lambda: above(1, steps=0.9995),
+        lambda: above(1, steps=1.5),
     ],
 )
 def test_constructor_refuses_invalid_arguments(make):

@@ -57,6 +57,21 @@ def test_gain_acts_on_gravity_too(arm):
     np.testing.assert_allclose(measured(arm, gain=gain)[0], CONTACT + gain * (CONTACT + gravity(arm)), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"gain": np.zeros(6)}, r"gain of joint torque errors must be finite numbers \(7,\)"),
+        ({"friction": np.full(7, np.nan)}, "friction"),
+        ({"mass": np.zeros(7)}, "mass"),
+        ({"center": np.zeros(3)}, "center"),
+        ({"seed": -1}, "a seed is a whole number of at least 0, not -1"),
+    ],
+)
+def test_errors_are_refused_when_they_are_out_of_range(arm, wrong, words):
+    with pytest.raises(InputError, match=words):
+        measured(arm, **wrong)
+
+
 def test_payload_is_measured_as_its_weight(arm):
     expected = CONTACT + gravity(arm, 0.5) - gravity(arm)
     np.testing.assert_allclose(measured(arm, payload=0.5)[0], expected, atol=1e-9)

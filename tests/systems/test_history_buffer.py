@@ -110,7 +110,9 @@ def test_initialization_fills_the_history_again(system):
     np.testing.assert_array_equal(history(system, context), [[7.0, 8.0]] * 3)
 
 
-@pytest.mark.parametrize("arguments", [(0, 3, 0.1), (2, 0, 0.1), (2, 3, 0.0), (2, 3, float("nan"))])
+@pytest.mark.parametrize(
+    "arguments", [(0, 3, 0.1), (2, 0, 0.1), (2, 2.5, 0.1), (1.5, 2, 0.1), (2, 3, 0.0), (2, 3, float("nan"))]
+)
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         HistoryBuffer(*arguments)

@@ -323,6 +323,28 @@ def test_constructor_refuses_primitives_with_other_constraints(shorter, words):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(one, np.ones(2)) for one in shorter])
 
 
+def test_window_is_refused_when_the_primitives_have_different_horizons():
+    longest = primitive(history=2)
+    other = LcNsKmp(longest.reference, horizon=3, history=1, constraints=longest.constraints)
+    system = LcNsKmpSystem(longest, None, PERIOD, shorter=[(other, np.ones(2))])
+    simulator = Simulator(system)
+    simulator.Initialize()
+    port = system.get_reference_window_input_port()
+    port.FixValue(simulator.get_mutable_context(), np.zeros(port.size()))
+    with pytest.raises(InputError, match=r"must have one horizon, not \[3, 8\]"):
+        simulator.Initialize()
+
+
+@pytest.mark.parametrize("time", [np.nan, np.inf])
+def test_motion_time_is_refused_when_it_is_not_finite(time):
+    system = LcNsKmpSystem(primitive(history=0), None, PERIOD)
+    context = system.CreateDefaultContext()
+    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    system.get_motion_time_input_port().FixValue(context, [time])
+    with pytest.raises(InputError, match="motion_time must be finite"):
+        system.get_command_output_port().Eval(context)
+
+
 def test_violation_is_finite_without_constraints():
     system = LcNsKmpSystem(LcNsKmp(primitive().reference, horizon=8), None, PERIOD)
     context = system.CreateDefaultContext()

@@ -74,7 +74,17 @@ def test_recording_is_a_copy(ramp):
     assert (read(simulator, recorder)["command"] >= 0.0).all()
 
 
-@pytest.mark.parametrize("arguments", [({}, 1, 0.1), ({"a": 0}, 1, 0.1), ({"a": 1}, 0, 0.1), ({"a": 1}, 1, 0.0)])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ({}, 1, 0.1),
+        ({"a": 0}, 1, 0.1),
+        ({"a": 1.5}, 1, 0.1),
+        ({"a": 1}, 0, 0.1),
+        ({"a": 1}, 1.5, 0.1),
+        ({"a": 1}, 1, 0),
+    ],
+)
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         Recorder(*arguments)
