@@ -22,6 +22,7 @@ import numpy as np
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
+from guiderail.tools.files import path_exists
 from guiderail.tools.learning.run_folder import RunFolder, as_arguments
 
 MAX_LINE = 100_000  # longest request, including the end of its line [characters]
@@ -35,9 +36,10 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
         options: Options of the environment by name; they override those of the run.
 
     Raises:
-        InputError: If there is no such task, the files of a run's task have changed, or an option is invalid.
+        InputError: If there is no such task, the file system refuses the name, the files of a run's task have changed,
+            or an option is invalid.
     """
-    if (Path(name) / "config.yaml").is_file():
+    if path_exists(config_file := Path(name) / "config.yaml") and config_file.is_file():
         config = RunFolder(name).config()
         config.refuse_changed_task(Path(name), "open the task by its name")
         name, options = config.task, config.environment | options

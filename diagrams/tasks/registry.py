@@ -103,7 +103,10 @@ def check_num_steps(name: str, num_steps: Any) -> None:
 
 def is_task_folder(name: str | Path) -> bool:
     """Return True if `name` is the path of a folder that `guiderail create-task` made."""
-    return (Path(name) / "task.yaml").is_file()
+    try:
+        return (Path(name) / "task.yaml").is_file()
+    except OSError:  # the file system refuses the path, as for a name that is too long
+        return False
 
 
 def register_task_folder(folder: str | Path) -> str:

@@ -2,12 +2,14 @@
 
 import io
 import json
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
+from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
 from guiderail.tools.env_server import MAX_LINE, EnvServer, open_environment, serve
 
@@ -91,6 +93,14 @@ def test_line_that_is_too_long_has_one_answer(server):
     assert "one line of JSON" in first["error"]
     assert "observation" in second
     assert "one line of JSON" in third["error"]
+
+
+@pytest.mark.parametrize(
+    ("opened", "words"), [(partial(open_environment, options={}), "cannot be read"), (make_env, "there is no task")]
+)
+def test_name_that_is_too_long_is_refused(opened, words):
+    with pytest.raises(InputError, match=words):
+        opened("x" * 300)
 
 
 def test_real_robot_is_refused():

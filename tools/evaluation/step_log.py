@@ -79,7 +79,8 @@ def remove_step_logs(folder: Path, episodes: int) -> None:
     A run that was stopped may have logged episodes after its last checkpoint.
     """
     for file in folder.glob("episode-*.parquet"):
-        if int(file.stem.removeprefix("episode-")) >= episodes:
+        number = file.stem.removeprefix("episode-")
+        if number.isdecimal() and int(number) >= episodes:
             file.unlink()
 
 

@@ -23,6 +23,7 @@ from guiderail.tools.evaluation.evaluation import policy_digest
 from guiderail.tools.evaluation.metrics import COLLISION
 from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible
+from guiderail.tools.files import path_exists
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail.tools.visualization.style import is_demonstrated
@@ -188,7 +189,7 @@ def find_subject(
             return Subject("policy", config, lambda env: act, digest=unknown)
         return Subject("policy", config, partial(check_compatible, act), digest=unknown)
     source = find_run(policy)
-    if is_policy_file(policy) or source.is_dir():
+    if is_policy_file(policy) or (path_exists(source) and source.is_dir()):
         make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
         return Subject(source.name.replace(":", "."), config, make_policy, digest=policy_digest(source))
     name = str(policy)

@@ -143,6 +143,11 @@ def test_evaluate_saves_nothing_when_no_episode_succeeds(bead_run, tmp_path):
     assert not (tmp_path / "none.npz").exists()
 
 
+def test_evaluate_refuses_a_policy_whose_name_is_too_long():
+    with pytest.raises(InputError, match="cannot be read"):
+        evaluate("x" * 300, "Bead", 1)
+
+
 def test_evaluate_describes_differences_when_asked(bead_run):
     assert "differences" not in evaluate(bead_run, episodes=1)
     result = evaluate(bead_run, episodes=1, describe_differences=lambda config: [config.task])

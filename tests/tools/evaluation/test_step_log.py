@@ -5,7 +5,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.evaluation.step_log import MEANINGS, StepLog, read_step_log, step_log_file
+from guiderail.tools.evaluation.step_log import MEANINGS, StepLog, read_step_log, remove_step_logs, step_log_file
 
 
 def act(env, seed=0):
@@ -56,6 +56,14 @@ def test_step_log_has_collisions_and_wrenches(tmp_path):
     step_log = read_step_log(tmp_path)
     assert row["collision_steps"] == step_log["collision"].sum() > 0
     assert np.linalg.norm(step_log.loc[step_log["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
+
+
+def test_removal_of_step_logs_leaves_other_files(tmp_path):
+    files = [*(step_log_file(tmp_path, number) for number in range(3)), tmp_path / "episode-abc.parquet"]
+    for file in files:
+        file.touch()
+    remove_step_logs(tmp_path, 2)
+    assert [file.exists() for file in files] == [True, True, False, True]
 
 
 def test_step_log_is_refused_when_absent_or_damaged(logged, tmp_path):
