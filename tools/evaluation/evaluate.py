@@ -233,8 +233,9 @@ def evaluate(
 
     Raises:
         InputError: If there is no trained policy, an argument is out of range, the policy's observation, action or
-            guidance does not match the environment, or `save` cannot be written. With `resample_offsets`, also if the
-            task has no hidden offset, or an episode has the seed of the run and so its offset.
+            guidance does not match the environment, a baseline policy cannot have its name, `save` cannot be written,
+            or the environment records no poses to save. With `resample_offsets`, also if the task has no hidden offset,
+            or an episode has the seed of the run and so its offset.
     """
     save = None if save is None else Path(save)
     _check_saved(save, signal)
@@ -269,6 +270,8 @@ def evaluate(
         opened = closing(cast(gymnasium.Env, env) if config is None else make_environment(config.task, where))
     with opened as evaluation_env:
         if config is not None:
+            if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
+                raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         files = {name: _episodes_file(subject, name, where, how) for name in (POLICY, *others)}
         stored = {name: read_table(file) for name in others if (file := files[name]) is not None and file.exists()}

@@ -135,7 +135,9 @@ class Evaluation(Mapping[str, Any]):
         """
         names = [self._name(name) for name in self.rows]
         rows = [statistics(rows) for rows in self.rows.values()]
-        return pd.DataFrame(rows, index=pd.Index(names, name="policy")).dropna(axis="columns", how="all")
+        table = pd.DataFrame(rows, index=pd.Index(names, name="policy")).dropna(axis="columns", how="all")
+        unknown = [name for name in COLLISIONS if name in table and self.statistics.get(name, 0) is None]
+        return table.drop(columns=unknown)
 
     @property
     def comparison(self) -> Comparison | None:

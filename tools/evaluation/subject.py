@@ -297,7 +297,8 @@ class EpisodeSpec:
 
 
 def outcome(row: Mapping[str, Any]) -> str:
-    """Describe the end of an episode, from its row: termination, control steps and peak force."""
+    """Describe the end of an episode, from its row: termination, control steps and, if known, peak force."""
     reason = row["termination"] or "running"
     meaning = f" ({COLLISION})" if reason == "collision" else ""
-    return f"{reason} after {row['steps']} control steps, peak force {row['peak_force']:.1f} N{meaning}"
+    force = f", peak force {row['peak_force']:.1f} N" if "peak_force" in row else ""
+    return f"{reason} after {row['steps']} control steps{force}{meaning}"

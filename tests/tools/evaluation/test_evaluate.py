@@ -1,9 +1,12 @@
 import json
 from functools import partial
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+from gymnasium.envs.registration import EnvSpec
+from point_env import PointEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
@@ -16,7 +19,7 @@ from guiderail.tools.evaluation.evaluate import (
 )
 from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, stored_episodes
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
-from guiderail.tools.evaluation.subject import evaluation_scope, refuse_guidance_change
+from guiderail.tools.evaluation.subject import evaluation_scope, outcome, refuse_guidance_change
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import Run
 
@@ -137,6 +140,13 @@ def test_evaluate_saves_successful_episodes(tmp_path):
         evaluate("zero", "NarrowPassage", save=tmp_path / "other.npz", signal="wrench")
 
 
+def test_evaluate_refuses_to_save_poses_that_are_not_recorded(tmp_path, monkeypatch):
+    spec = EnvSpec("guiderail/Outside-v0", lambda render_mode: PointEnv(), max_episode_steps=1)
+    monkeypatch.setitem(gymnasium.registry, spec.id, spec)
+    with pytest.raises(InputError, match="Outside is no task of this package and records no poses: leave --save out"):
+        evaluate("zero", "Outside", 1, save=tmp_path / "saved.npz")
+
+
 def test_evaluate_saves_nothing_when_no_episode_succeeds(bead_run, tmp_path):
     result = evaluate(bead_run, episodes=1, environment={"wall": -0.5}, save=tmp_path / "none.npz")
     assert result["saved"] == 0
@@ -220,6 +230,18 @@ def test_evaluation_has_a_table_and_a_sentence(bead_run):
     assert result.sentence.endswith("; every command satisfied the constraints.")
     assert result.sentence in str(result)
     assert result.sentence in result._repr_html_()
+
+
+def test_table_omits_collisions_that_are_not_counted():
+    rows = {"policy": pd.DataFrame({"success": [1], "collisions": [0], "collision_steps": [0]})}
+    assert {"collisions", "collision_steps"} <= {*Evaluation({"collisions": 0}, rows).table}
+    table = Evaluation({"collisions": None, "collision_steps": None}, rows).table
+    assert list(table) == ["success_rate", "success_low", "success_high"]
+
+
+@pytest.mark.parametrize(("force", "words"), [({"peak_force": 2.0}, ", peak force 2.0 N"), ({}, "")])
+def test_outcome_names_the_force_if_it_is_known(force, words):
+    assert outcome({"termination": "success", "steps": 3, **force}) == f"success after 3 control steps{words}"
 
 
 def test_sentence_names_the_best_baseline():
