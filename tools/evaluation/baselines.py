@@ -103,6 +103,18 @@ zero_policy: MakePolicy = partial(BaselinePolicy, zero)
 """Make the policy of zero actions for an environment."""
 
 
+def digest_of(make_policy: MakePolicy) -> str | None:
+    """Return what identifies a function that makes a policy, for the names of stored files: a baseline and its seed.
+
+    The result is None for other functions, because they may read files and variables.
+    """
+    if isinstance(make_policy, partial) and make_policy.func is BaselinePolicy and {*make_policy.keywords} <= {"seed"}:
+        for name, factory in BASELINES.items():
+            if make_policy.args == (factory,):
+                return f"{name} {make_policy.keywords.get('seed', 0)}"
+    return None
+
+
 def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
     """Return the policy that returns the same action (A,) at every step of every episode."""
     return BaselinePolicy(lambda rng, size: lambda observation: np.asarray(action, np.float32), env)
@@ -146,7 +158,7 @@ def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
         InputError: If the task has no policy of that name.
     """
     if name in BASELINES:
-        return lambda env: BaselinePolicy(BASELINES[name], env, seed)
+        return partial(BaselinePolicy, BASELINES[name], seed=seed)
     find_scripted_policy(task, name)
 
     def make_policy(env: gymnasium.Env) -> PolicyFn:

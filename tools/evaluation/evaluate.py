@@ -16,7 +16,7 @@ from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
+from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
 from guiderail.tools.evaluation.evaluation import (
     BASELINES_FOLDER,
     COLLISIONS,
@@ -154,7 +154,7 @@ def evaluate_run(
 
 
 def evaluate_once(
-    folder: Path,
+    folder: Path | None,
     name: str,
     config: RunConfig,
     make_policy: MakePolicy,
@@ -165,8 +165,8 @@ def evaluate_once(
 ) -> pd.DataFrame | None:
     """Return the stored rows of held-out episodes; if there are none, evaluate the policy and store its rows.
 
-    The task, and the seed of the hidden values, are those of `config`. See `episodes_file` for `about`. Further
-    arguments are those of `evaluate_policy`; the default label is `name`.
+    The task, and the seed of the hidden values, are those of `config`. See `episodes_file` for `about`. With `folder`
+    None, the rows are not stored. Further arguments are those of `evaluate_policy`; the default label is `name`.
 
     Returns:
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
@@ -174,9 +174,13 @@ def evaluate_once(
     Raises:
         InputError: If the stored file is damaged or cannot be written, or an argument is invalid.
     """
-    file = episodes_file(folder, name, config, environment, about=about, **how)
-    how = {"label": name, "skips_incompatible": True, **how}
-    rows = load_or_compute(file, partial(evaluate_run, config, make_policy, environment, **how))
+    compute = partial(
+        evaluate_run, config, make_policy, environment, **{"label": name, "skips_incompatible": True, **how}
+    )
+    if folder is None:
+        rows = compute()
+    else:
+        rows = load_or_compute(episodes_file(folder, name, config, environment, about=about, **how), compute)
     return rows if len(rows) else None
 
 
@@ -197,8 +201,9 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
-    The rows of the baseline policies are stored in the run's folder, under the policies' names, and used again. The
-    rows of the run's policy in its own environment are stored for a report.
+    The rows of the baseline policies are stored in the run's folder, under the policies' names, and used again; those
+    of given functions are stored only if the functions are `partial(BaselinePolicy, FACTORY)`. The rows of the run's
+    policy in its own environment are stored for a report.
 
     Args:
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
@@ -273,7 +278,8 @@ def evaluate(
             if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
                 raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
-        files = {name: _episodes_file(subject, name, where, how) for name in (POLICY, *others)}
+        functions = baselines if isinstance(baselines, Mapping) else {}
+        files = {name: _episodes_file(subject, name, where, how, functions.get(name)) for name in (POLICY, *others)}
         stored = {name: read_table(file) for name in others if (file := files[name]) is not None and file.exists()}
         missing = {name: make for name, make in others.items() if name not in stored}
         skipped = [name for name, make in missing.items() if not is_compatible(make, evaluation_env)]
@@ -326,16 +332,26 @@ def _check_saved(save: Path | None, signal: str) -> None:
         check_new(save, "file")
 
 
-def _episodes_file(subject: Subject, name: str, environment: Mapping[str, Any], how: Mapping[str, Any]) -> Path | None:
+def _episodes_file(
+    subject: Subject,
+    name: str,
+    environment: Mapping[str, Any],
+    how: Mapping[str, Any],
+    function: MakePolicy | None,
+) -> Path | None:
     """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
 
-    Episodes of the run's own policy are stored only in the run's own environment, and if nothing is resampled.
+    `function` is what the caller gave for a baseline policy instead of a name; `digest_of` must identify it. Episodes
+    of the run's own policy are stored only in the run's own environment, and if nothing is resampled.
     """
     folder, config = subject.folder, subject.config
     if folder is None or config is None or not subject.is_stored:
         return None
     if name != POLICY:
-        return episodes_file(folder.path / BASELINES_FOLDER, name, config, environment, **how)
+        about = None if function is None else digest_of(function)
+        if function is not None and about is None:
+            return None
+        return episodes_file(folder.path / BASELINES_FOLDER, name, config, environment, about=about, **how)
     if environment != config.environment or "options" in how:
         return None
     return episodes_file(folder.path / POLICY_FOLDER, POLICY, config, environment, about=subject.digest, **how)

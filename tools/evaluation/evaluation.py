@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import pandas as pd
 import scipy  # `scipy.stats` is imported on first use
 
+from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.metrics import STATISTICS, TOLERANCE, reports_success
 from guiderail.tools.files import write_atomically
@@ -23,6 +24,7 @@ from guiderail.tools.tables import read_table, table_text
 
 POLICY = "policy"  # name of the evaluated policy
 POLICY_FOLDER = "held_out"  # folder of the policy's evaluated episodes, in the run's folder
+MAX_NAME_BYTES = 200  # largest size of the name of a policy in a file's name, of which 255 are possible
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' evaluated episodes, in the run's folder
 
 
@@ -50,8 +52,12 @@ def episodes_file(
     depend on, such as the digest of the policy.
 
     Raises:
-        InputError: If a file of the task cannot be read.
+        InputError: If `name` cannot be part of a file's name, or a file of the task cannot be read.
     """
+    if not (name.isprintable() and "/" not in name and 0 < len(name.encode()) <= MAX_NAME_BYTES):
+        raise InputError(
+            f"the name of a policy is a printable text of 1 to {MAX_NAME_BYTES} bytes without '/', not {brief(name)}"
+        )
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
     more = [*([] if about is None else [about]), *filter(None, [content])]

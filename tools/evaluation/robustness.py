@@ -14,11 +14,12 @@ import pandas as pd
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
+from guiderail.models.primitives.io import find_repeated
 from guiderail.tools.environments import check_environment
-from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
+from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_once
 from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
@@ -246,7 +247,8 @@ class _Actor:
     make_policy: MakePolicy  # function from an environment to the policy
     # Configuration of the run, with the `environment` options given to `robustness`.
     config: RunConfig
-    about: str | None = None  # digest of a learned policy
+    about: str | None = None  # digest of the policy; None for a baseline policy of the same name
+    is_stored: bool = True  # False if nothing identifies the policy
 
 
 def robustness(
@@ -277,9 +279,10 @@ def robustness(
         environment: Options of the environment that differ from training at all points, such as the station.
         axes: Names of axes, comma-separated; all by default.
         baselines: Baseline policies: their names, or functions that make them, by name; None for the default set of
-            the task without "constant".
+            the task without "constant". A name that is among `policies` too is evaluated once. Episodes of functions
+            other than `partial(BaselinePolicy, FACTORY)` are not stored.
         out: Folder to write; by default `robustness/<station>` in the run. Required for several policies, and for a
-            policy without a run.
+            policy without a run. The table's name there contains those of the policies.
         log: Function called with a sentence on the differences between the runs, and the sentences of `points`.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
         trust_policy: True to read a policy file that can execute code.
@@ -289,8 +292,8 @@ def robustness(
         without baseline policies.
 
     Raises:
-        InputError: If there is no trained run, runs are of different tasks, an argument is invalid or missing, or all
-            points are left out.
+        InputError: If there is no trained run, runs are of different tasks, two policies have the same name, an
+            argument is invalid or missing, or all points are left out.
     """
     episodes, seed = as_whole(episodes, "the number of episodes"), check_seed(seed)
     if episodes < 1:
@@ -301,15 +304,12 @@ def robustness(
     first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None
     if out is None and (len(policies) > 1 or folder is None):
         raise InputError("several runs, or a policy without a run, need a folder for table and picture: give --out")
+    are_functions = isinstance(baselines, Mapping)
     if baselines is None:
         baselines = [name for name in default_baselines(first.task, first.environment) if name != "constant"]
     baselines = make_baselines(first, first.environment, baselines)
-    actors = list(compared)
-    if is_demonstrated(first.environment.get("guidance")):
-        actors.append(_Actor(DEMONSTRATION, zero_policy, first))
-    for name, make_policy in baselines.items():
-        if name != "zero" or len(actors) == len(compared):
-            actors.append(_Actor(name, make_policy, first))
+    actors = [*compared, *_baseline_actors(compared, baselines, are_functions=are_functions)]
+    names = [actor.name for actor in compared] if len(compared) > 1 else [] if out is None else [subjects[0].name]
     if out is None:
         assert folder is not None
         out = folder.path / "robustness" / str(first.environment.get("station", ""))
@@ -319,7 +319,8 @@ def robustness(
         progress = f"{number}/{len(jobs)} {point.axis.name} {point.value:.3g} {actor.name}"
         options = {"options": dict(point.options)} if point.options else {}
         evaluated = evaluate_once(
-            out / "episodes", actor.name, actor.config, actor.make_policy, point.environment,
+            out / "episodes" if actor.is_stored else None,
+            actor.name, actor.config, actor.make_policy, point.environment,
             about=actor.about, episodes=episodes, seed=seed, label=progress, processes=processes, **options,
         )  # fmt: skip
         if evaluated is not None:
@@ -329,8 +330,7 @@ def robustness(
     given = dict(environment or {})
     given |= {"episodes": episodes} if episodes != EPISODES else {}
     given |= {"seed": seed} if seed != HELD_OUT_SEED else {}
-    names = [*([actor.name for actor in compared] if len(compared) > 1 else []), *sorted(baselines)]
-    table = write_table(out / _table_name(axes, given, names), rows).with_suffix(".csv")
+    table = write_table(out / _table_name(axes, given, [*names, *sorted(baselines)]), rows).with_suffix(".csv")
     picture = draw(table.with_suffix(".png"), rows)
     return {"table": table, "picture": picture, "rows": rows, "policies": [actor.name for actor in compared]}
 
@@ -360,6 +360,33 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
         _Actor(name, subject.make_policy, replace(config, environment=options), subject.digest)
         for name, subject, config, options in zip(names, subjects, configs, changed, strict=True)
     ]
+
+
+def _baseline_actors(
+    compared: Sequence[_Actor], baselines: Mapping[str, MakePolicy], *, are_functions: bool
+) -> list[_Actor]:
+    """Return the demonstration alone and the baseline policies, without those that are compared by their names.
+
+    With `are_functions`, the caller gave the functions, and only those that `digest_of` identifies are stored.
+
+    Raises:
+        InputError: If two policies have the same name.
+    """
+    config = compared[0].config
+    actors = []
+    if is_demonstrated(config.environment.get("guidance")):
+        actors.append(_Actor(DEMONSTRATION, zero_policy, config))
+        baselines = {name: make_policy for name, make_policy in baselines.items() if name != "zero"}
+    by_name = {actor.name for actor in compared if actor.about == actor.name}
+    for name, make_policy in baselines.items():
+        if are_functions:
+            about = digest_of(make_policy)
+            actors.append(_Actor(name, make_policy, config, about, is_stored=about is not None))
+        elif name not in by_name:
+            actors.append(_Actor(name, make_policy, config))
+    if repeated := find_repeated([actor.name for actor in (*compared, *actors)]):
+        raise InputError(f"two policies are called {brief(repeated)}: rename one, or leave that baseline out")
+    return actors
 
 
 def _jobs(actors: Sequence[_Actor], axes: Sequence[Axis], log: Callable[[str], None]) -> list[tuple[_Actor, Point]]:

@@ -93,7 +93,7 @@ class Subject:
     make_policy: MakePolicy  # function from an environment to the policy
     folder: RunFolder | None = None  # folder of its run, or None
     is_stored: bool = False  # True if evaluated episodes are stored in the run's folder
-    digest: str | None = None  # digest of the policy, for the names of stored files; None for a baseline policy
+    digest: str | None = None  # digest of the policy, or name of a baseline policy, for the names of stored files
 
     def changed_environment(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """Return the environment's options with changes; `config` must not be None.
@@ -193,7 +193,8 @@ def find_subject(
         make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
         return Subject(source.name.replace(":", "."), config, make_policy, digest=policy_digest(source))
     name = str(policy)
-    return Subject(name, config, partial(_make_compatible, name, make_baselines(config, {}, [name])[name]))
+    make_policy = partial(_make_compatible, name, make_baselines(config, {}, [name])[name])
+    return Subject(name, config, make_policy, digest=name)
 
 
 def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> PolicyFn:

@@ -102,6 +102,21 @@ def test_baselines_are_evaluated_once(bead_run, capsys):
     assert four["uniform_random_mean_return"] != first["uniform_random_mean_return"]
 
 
+def test_rows_of_another_function_are_not_used_again(bead_run):
+    seeded = [partial(BaselinePolicy, uniform_random, seed=seed) for seed in (1, 2)]
+    makers = [*seeded, *(lambda env, value=value: lambda _: np.full(2, value) for value in (0.5, 1.0))]
+    how = [["uniform_random"], *({"uniform_random": make} for make in makers)]
+    returns = [evaluate(bead_run, episodes=1, baselines=one)["uniform_random_mean_return"] for one in how]
+    assert len(set(returns)) == len(how)
+    assert len(list(bead_run.glob("baselines/uniform_random-*.csv"))) == 1 + len(seeded)
+
+
+@pytest.mark.parametrize("name", ["../zero", "", "\0", "z" * 201])
+def test_evaluate_refuses_a_baseline_that_cannot_name_a_file(bead_run, name):
+    with pytest.raises(InputError, match="the name of a policy is a printable text of 1 to 200 bytes without '/'"):
+        evaluate(bead_run, episodes=1, baselines={name: zero_policy})
+
+
 def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
     folder = RunFolder(bead_run)
     evaluate(bead_run, episodes=2, baselines=["constant"])

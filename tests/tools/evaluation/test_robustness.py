@@ -11,7 +11,7 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation import robustness as module
-from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
+from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.robustness import (
     AXES,
@@ -112,6 +112,33 @@ def test_robustness_compares_several_runs(run, bead_config, tmp_path, capsys):
     assert [row["policy"] for row in result["rows"]] == ["sKGRL", "demonstration alone", "demonstration"] * 2
     assert robustness([run, tmp_path / "other"], episodes=2, out=out)["rows"] == result["rows"]
     assert capsys.readouterr().err == ""
+
+
+def test_policies_by_name_have_their_own_episodes_and_tables(run, tmp_path):
+    how = {"task": "Bead", "episodes": 1, "out": tmp_path}
+    first, second = (robustness([name], **how) for name in ("zero", "random_corner"))
+    assert first["rows"][2]["max_commanded_violation"] != second["rows"][2]["max_commanded_violation"]
+    assert first["table"] != second["table"]
+    assert second["rows"] == robustness(["random_corner"], **how | {"out": tmp_path / "new"})["rows"]
+
+
+def test_baseline_among_the_policies_is_evaluated_once(run, tmp_path, monkeypatch):
+    how = {"task": "Bead", "episodes": 1, "out": tmp_path}
+    monkeypatch.setattr(module, "is_demonstrated", lambda guidance: False)
+    rows = robustness(["random_corner", "constant"], baselines=["uniform_random", "constant", "zero"], **how)["rows"]
+    assert [row["policy"] for row in rows] == ["random_corner", "constant", "uniform_random", "zero"] * 2
+    for names, baseline in ((["zero", "constant"], "constant"), ([run], "policy")):
+        with pytest.raises(InputError, match=f"two policies are called '{baseline}': rename one"):
+            robustness(names, baselines={baseline: zero_policy}, **how)
+
+
+def test_episodes_of_another_function_are_not_used_again(run):
+    results = [
+        robustness([run], episodes=1, baselines={"own": lambda env, value=value: lambda _: np.full(2, value)})
+        for value in (0.0, 1.0)
+    ]
+    first, second = (result["rows"][-1]["max_commanded_violation"] for result in results)
+    assert first != second
 
 
 def test_robustness_refuses_other_tasks_and_the_same_folder(run, tmp_path):
