@@ -110,9 +110,11 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
         raise
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} is not an array of numbers: {error}") from error
-    is_large = raw.dtype.kind in "iuf" and raw.dtype.itemsize == 8 and bool((np.abs(array) >= _EXACT).any())
-    is_rounded = is_large and raw.dtype.kind != "f"
-    if is_large and not is_rounded and raw is not values:
+    holds_integers = raw.dtype.kind in "iu" and raw.dtype.itemsize == 8
+    is_list = raw.dtype == float and raw is not values
+    is_large = (holds_integers or is_list) and bool((np.abs(array) >= _EXACT).any())
+    is_rounded = holds_integers and is_large
+    if is_list and is_large:
         raw = np.asarray(values, dtype=object)  # whole numbers among others, which NumPy has already rounded
     # NumPy holds whole numbers of 2^64 and more as objects.
     if is_rounded or any(isinstance(value, int | np.integer) and abs(int(value)) >= _EXACT for value in _objects(raw)):
