@@ -132,12 +132,12 @@ class ChunkLearner(BcLearner):
         return np.concatenate([np.flatnonzero(groups == one) for one in drawn])
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range."""
-        if not len(self.network):
-            raise InputError(
-                f"chunk trains after {self.config.demonstration_episodes} demonstrations: give at least that many "
-                "--episodes"
-            )
+        """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range.
+
+        Raises:
+            InputError: If there were fewer demonstrations than `demonstration_episodes`.
+        """
+        self._check_trained()
         members: list[Any] = [
             [one for one in member.children() if hasattr(one, "weight")] for member in self.network.children()
         ]
@@ -166,6 +166,9 @@ class ChunkLearner(BcLearner):
                 **description,
             },
         )
+
+    def _is_trained(self) -> bool:
+        return len(self.network) > 0
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return everything that the rest of a run depends on: the demonstrations."""

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.checkpoint import entries_of
@@ -96,8 +97,23 @@ class BcLearner(Learner):
         return {"train/loss": loss} if np.isfinite(loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the cloned policy; `description` holds further entries of the policy's description."""
+        """Return the cloned policy; `description` holds further entries of the policy's description.
+
+        Raises:
+            InputError: If there were fewer demonstrations than `demonstration_episodes`.
+        """
+        self._check_trained()
         return export_layers([*self.network], self._space, {"squash": "clip", **description})
+
+    def _check_trained(self) -> None:
+        if not self._is_trained():
+            raise InputError(
+                f"{self.config.algorithm} trains after {self.config.demonstration_episodes} demonstrations: give at "
+                "least that many --episodes"
+            )
+
+    def _is_trained(self) -> bool:
+        return self.episodes >= self.config.demonstration_episodes
 
     def has_diverged(self) -> bool:
         """Return True if a parameter is NaN or infinite."""

@@ -43,6 +43,7 @@ def _check_ent_coef(ent_coef: str) -> str:
 BatchSize = Annotated[int, Field(ge=1, le=10**6), BeforeValidator(reject_bool)]
 NumUnits = Annotated[int, Field(ge=1, le=10**4), BeforeValidator(reject_bool)]
 Fraction = Annotated[float, Field(ge=0, le=1), BeforeValidator(reject_bool)]
+Dropout = Annotated[float, Field(ge=0, lt=1), BeforeValidator(reject_bool)]
 Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
 Noise = Annotated[float, Field(ge=0, le=10), BeforeValidator(reject_bool)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
@@ -91,7 +92,7 @@ class OffPolicyConfig(LearnerConfig):
     image_encoder: Literal["average_pooling", "convolutional"] = "average_pooling"  # features of observed images
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
-    dropout: Fraction = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
+    dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
     init_from: Folder = ""  # run from whose networks, optimizers and replay buffer learning starts
 
     def __post_init__(self) -> None:
@@ -123,6 +124,13 @@ class CrossQConfig(OffPolicyConfig):
     algorithm: str = "crossq"
     policy_delay: Positive = 3  # critic updates per actor update
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.dropout:
+            raise InputError(
+                f"crossq has no dropout, which replaces its batch normalization: leave dropout={self.dropout:g} out"
+            )
+
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class OnPolicyConfig(LearnerConfig):
@@ -142,6 +150,8 @@ class OnPolicyConfig(LearnerConfig):
     def __post_init__(self) -> None:
         if self.demonstration_episodes:
             raise InputError(f"{self.algorithm} learns from its own actions: leave demonstration_episodes out")
+        if self.symmetry:
+            raise InputError(f"{self.algorithm} learns from no symmetric copies: leave symmetry out")
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

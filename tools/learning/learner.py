@@ -56,7 +56,7 @@ class LearnerConfig:
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
-            On-policy learners ignore it.
+            On-policy learners refuse it.
         pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
             older. The result is deterministic too.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the

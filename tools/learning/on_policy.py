@@ -52,7 +52,7 @@ class OnPolicyLearner(Learner):
     ):
         """Construct the learner; `Learner` describes the arguments.
 
-        Only the spaces of `env` are used; `max_transitions` and `symmetry` have no effect.
+        Only the spaces of `env` are used; `max_transitions` and the task's `symmetry` have no effect.
         """
         self.config = config
         algorithm: Any = self.algorithm

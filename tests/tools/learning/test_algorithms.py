@@ -218,11 +218,16 @@ def test_demonstration_fraction_needs_demonstrations():
     [
         ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
+        ({"algorithm": "crossq", "dropout": 0.01}, "leave dropout=0.01 out"),
+        ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
+        ({"algorithm": "ppo", "symmetry": True}, "ppo learns from no symmetric copies: leave symmetry out"),
+        ({"algorithm": "trpo", "symmetry": "near"}, "trpo learns from no symmetric copies"),
     ],
 )
 def test_settings_that_exclude_each_other_are_named(settings, words):
+    settings = {"algorithm": "tqc"} | settings
     with pytest.raises(InputError, match=words):
-        resolve_preset(None, "tqc", settings)
+        resolve_preset(None, settings.pop("algorithm"), settings)
 
 
 def test_newest_row_of_a_full_buffer_is_the_last_one():
@@ -273,6 +278,8 @@ def test_behavior_cloning_acts_as_the_demonstrator():
     learner = make(config)
     rng = np.random.default_rng(0)
     clone(learner, 3, rng)
+    with pytest.raises(InputError, match="bc trains after 4 demonstrations: give at least that many --episodes"):
+        learner.policy({})
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
     clone(learner, 1, np.random.default_rng(5))

@@ -10,7 +10,7 @@ from guiderail.tools.learning.learner import LEARNERS
     [
         ("ent_coef", "_0.5"), ("ent_coef", "auto0.5"),
         ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"),
-        ("net_arch", ""),
+        ("net_arch", ""), ("dropout", 1.0),
         ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),
         ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],
