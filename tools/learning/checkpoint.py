@@ -15,6 +15,7 @@ from safetensors.numpy import save
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest
 from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.run_folder import RunFolder
 
 Actor = dict[str, torch.Tensor]
 Entry = TypeVar("Entry")
@@ -126,3 +127,23 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise InputError(
             f"the checkpoint {path} is damaged: restore a copy, or train again in another folder"
         ) from error
+
+
+def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return the arrays and values of a run's off-policy learner; a pipelined one has not learned its last episode.
+
+    Raises:
+        InputError: If the run has no checkpoint, or its learner is not off-policy.
+    """
+    file = RunFolder(Path(run)).checkpoint
+    if not file.is_file():
+        raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
+    arrays, stored = load_checkpoint(file)
+    values = stored["learner"]
+    if "acting" in values:  # pipelined; only the acting process counts the episodes
+        arrays, values = entries_of(arrays, "learning"), values["learning"] | {"episodes": values["acting"]["episodes"]}
+    elif "learner" in values:  # with parallel actors
+        arrays, values = entries_of(arrays, "learner"), values["learner"]
+    if "exploration" not in values:
+        raise InputError(f"init_from names {run}, whose learner is not off-policy: name one of the same algorithm")
+    return arrays, values

@@ -10,7 +10,6 @@ import copy
 import inspect
 import json
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import gymnasium
@@ -26,7 +25,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_checkpoint
+from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_off_policy
 from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
@@ -43,7 +42,6 @@ from guiderail.tools.learning.networks import (
     share_encoder,
     with_privileged,
 )
-from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.sb3 import (
     DemonstrationReplayBuffer,
     module_arrays,
@@ -109,7 +107,7 @@ class OffPolicyLearner(Learner):
             }
         self.config = config
         self.transitions = 0
-        initial = _checkpoint_of(config.init_from) if config.init_from else None
+        initial = load_off_policy(config.init_from) if config.init_from else None
         if initial is not None:
             max_transitions += initial[1]["transitions"]
         arguments = {
@@ -165,6 +163,14 @@ class OffPolicyLearner(Learner):
 
     def _start_from(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any], seed: int) -> None:
         """Load the state of another run, except its random generators, greedy successes and checkpoint selection."""
+        number, size = len(arrays["buffer/rewards"]), self.model.replay_buffer.buffer_size
+        is_full = values["buffer"][1]
+        if number != size if is_full else number >= size:
+            raise InputError(
+                f"the replay buffer of {self.config.init_from} {'is full of' if is_full else 'holds'} {number} "
+                f"transitions: give --set buffer_size={number if is_full else number + 1}"
+                f"{' or more' * (not is_full)}, not {size}"
+            )
         generators = random_state()
         try:
             self.restore(arrays, values)
@@ -436,17 +442,6 @@ _BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "do
 def _array_key(array: np.ndarray | None) -> tuple[Any, ...]:
     """Return the comparison key of an array; 0-d arrays count as 1-d, as safetensors stores them."""
     return () if array is None else (np.atleast_1d(array).shape, array.dtype, array.tobytes())
-
-
-def _checkpoint_of(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the state of a run's off-policy learner; raise an InputError if it has none."""
-    file = RunFolder(Path(run)).checkpoint
-    if not file.is_file():
-        raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
-    arrays, values = load_checkpoint(file)
-    if "transitions" not in values["learner"]:
-        raise InputError(f"init_from names {run}, whose learner is not off-policy: name one of the same algorithm")
-    return arrays, values["learner"]
 
 
 @register_learner("sac")

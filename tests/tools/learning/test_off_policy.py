@@ -14,11 +14,13 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.checkpoint import load_checkpoint
+from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
 from guiderail.tools.learning.networks import export_layers, export_policy
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.trainer import run_training
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -186,6 +188,40 @@ def test_learner_starts_from_another_run(bead_config, bead_run):
     assert state["selection"] == {"rows": {}}
     assert state["greedy_successes"] == 0
     assert state["exploration"] == np.random.default_rng(8).bit_generator.state
+
+
+@pytest.mark.parametrize(("more", "part"), [({"num_envs": 1}, "learner"), ({"pipelined": True}, "learning")])
+def test_learner_starts_from_a_run_with_several_processes(more, part, bead_config, tmp_path, forkserver):
+    run_training(RunFolder(tmp_path), replace(bead_config, learner=replace(bead_config.learner, **more)))
+    arrays, values = load_checkpoint(RunFolder(tmp_path).checkpoint)
+    config = replace(bead_config.learner, init_from=str(tmp_path))
+    with contextlib.closing(make_environment("Bead", {})) as env:
+        learner = LEARNERS.get("tqc")(config, env, **learner_arguments(bead_config, env.unwrapped.task))
+    expected = (values["learner"][part]["transitions"], bead_config.episodes)
+    assert (learner.transitions, learner.episodes) == expected
+    started = learner.state()[0]
+    for name in ("policy/actor.mu.weight", "buffer/rewards"):
+        np.testing.assert_array_equal(started[name], arrays[f"{part}/{name}"])
+
+
+@pytest.mark.parametrize(
+    ("stored", "size", "words"),
+    [
+        (5, 4, "holds 5 transitions: give --set buffer_size=6 or more, not 4"),
+        (5, 5, "holds 5 transitions: give --set buffer_size=6 or more, not 5"),
+        (20, 30, "is full of 20 transitions: give --set buffer_size=20, not 30"),
+        (5, 6, ""),
+        (20, 20, ""),
+    ],
+)
+def test_replay_buffer_of_another_run_must_fit(stored, size, words, config, tmp_path):
+    first = make(replace(config, buffer_size=20))
+    learn_from_random_transitions(first, stored)
+    arrays, values = first.state()
+    (tmp_path / "checkpoint").mkdir()
+    save_checkpoint(RunFolder(tmp_path).checkpoint, arrays, {"learner": values})
+    with pytest.raises(InputError, match=words) if words else contextlib.nullcontext():
+        learn_from_random_transitions(make(replace(config, buffer_size=size, init_from=str(tmp_path))), 3)
 
 
 def test_init_from_refuses_runs_of_other_learners(bead_config, bead_run, config, tmp_path):
