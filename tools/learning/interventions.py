@@ -17,7 +17,8 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import kernel_from_options
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.gains import deviation
 from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
@@ -96,8 +97,13 @@ class InterventionPolicy(Callback):
         self._supervisor.on_episode_start(self._env)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the policy's action (A,), or the correction clipped to the action's limits."""
-        offset = self._supervisor.correction(observation)
+        """Return the policy's action (A,), or the correction clipped to the action's limits.
+
+        Raises:
+            InputError: If the correction is not (A,) or not finite.
+        """
+        given = self._supervisor.correction(observation)
+        offset = None if given is None else self._corrections.check_offset(given)
         if offset is not None and self._offset is None:
             self.interventions += 1
         self._offset = offset
@@ -145,6 +151,13 @@ class ViaPointCorrections:
         self._action_dims = list(range(reference.num_outputs)) if action_dims is None else list(action_dims)
         self.reach = np.sqrt(3.0) * values["action_scale"] * deviation(reference)[self._action_dims]
         self._constraints = instance.constraints()
+
+    def check_offset(self, offset: np.ndarray) -> np.ndarray:
+        """Return a correction (A,) as doubles; raise an `InputError` unless it has this shape and is finite."""
+        numbers = as_numbers(offset, "a correction")
+        if numbers.shape != self.reach.shape or not is_finite(numbers):
+            raise InputError(f"a correction must be {len(self.reach)} finite numbers, not {brief(offset)}")
+        return numbers
 
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
         """Return the via-points so far with those of an episode's corrections.

@@ -149,6 +149,14 @@ def test_correction_of_a_failed_first_step_is_no_via_point():
         assert min(policy.via_points[::3], default=0.0) >= 0.0
 
 
+@pytest.mark.parametrize("offset", [[np.nan, 0.0], [0.5], 0.5, [[0.5, 0.5]], ["a", "b"]])
+def test_correction_is_refused_unless_it_is_an_offset_of_each_action(offset):
+    corrections, env = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"}), SimpleNamespace(unwrapped=None)
+    supervisor = SimpleNamespace(correction=lambda observation: np.array(offset))
+    with pytest.raises(InputError, match="a correction"):
+        InterventionPolicy(env, supervisor, lambda observation: observation, corrections)(np.zeros(2))
+
+
 def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
     labels = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
     rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, labels))
