@@ -94,7 +94,16 @@ class DistillationLearner(ChunkLearner):
         return np.array(commands)
 
     def finish(self) -> None:
-        """Label the observations and noisy copies of them, and train."""
+        """Label the observations and noisy copies of them, and train.
+
+        Raises:
+            InputError: If there are noisy copies and only one episode, in which every entry may be the observed clock.
+        """
+        if self.config.noisy_copies and self.config.copy_noise and len(set(self._groups)) < 2:
+            raise InputError(
+                "noisy copies leave the observed clock out, which is found by comparing episodes: give at least 2 "
+                "--episodes, not 1, or --set noisy_copies=0"
+            )
         observations, steps, groups = np.array(self._observations), np.array(self._steps), list(self._groups)
         scale = observations.std(axis=0) * ~self._clocks(observations, steps)
         random = np.random.default_rng([self._seed, 0])

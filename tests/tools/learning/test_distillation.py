@@ -1,5 +1,7 @@
 """Policy distillation: labels are the teacher's commands, the student predicts them, and runs that are resumed."""
 
+from contextlib import nullcontext
+
 import numpy as np
 import pytest
 
@@ -63,6 +65,14 @@ def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
 def test_numbers_that_depend_on_the_step_alone_are_found():
     observations = np.array([[0.0, 1.0], [0.5, 2.0], [0.0, 3.0], [0.5, 2.0]])
     assert DistillationLearner._clocks(observations, np.array([0, 10, 0, 10])).tolist() == [True, False]
+
+
+def test_noise_of_copies_needs_a_second_episode(teacher):
+    for settings in ({}, {"copy_noise": 0.0}, {"noisy_copies": 0}):
+        learner, env = make(teacher, **settings | {"gradient_steps": 1})
+        rollout(env, learner.act, learner, seed=5)
+        with nullcontext() if settings else pytest.raises(InputError, match="at least 2 --episodes"):
+            learner.finish()
 
 
 @pytest.mark.parametrize(

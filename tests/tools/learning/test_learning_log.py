@@ -54,6 +54,8 @@ def test_resumed_run_keeps_the_log_of_its_first_part(bead_config, tmp_path):
 
 
 def test_log_format_is_refused_when_unknown_or_not_installed(monkeypatch, bead_config, tmp_path):
+    with pytest.raises(InputError, match="log is a format or a list of formats, not 5"):
+        check_log_formats(5)
     with pytest.raises(InputError, match="did you mean tensorboard"):
         run_training(RunFolder(tmp_path), bead_config, log=["tensorbord"])
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
