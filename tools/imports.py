@@ -133,8 +133,8 @@ def _is_module(name: str) -> bool:
         return spec is not None and spec.origin is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
-    except (ImportError, ValueError):  # for example __main__, which has no module specification
-        return False
+    except (Exception, SystemExit):  # its package fails, which importing it reports, or it has no specification
+        return name not in sys.modules  # for example __main__
 
 
 def module_name(path: Path) -> str:

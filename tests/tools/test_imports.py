@@ -1,6 +1,7 @@
 """Files that name code, such as the configuration of a run, execute it only if the user trusts them for that call."""
 
 import sys
+from types import ModuleType
 
 import pytest
 import yaml
@@ -125,6 +126,21 @@ def test_trust_ends_with_the_command(bead_run, canary, capsys, tmp_path):
     assert executed.exists()
     with pytest.raises(InputError, match="--trust-imports"):
         import_stored(["another_module"], file)
+
+
+@pytest.mark.parametrize(
+    "line", ["raise RuntimeError(3)", "raise ImportError(3)", "1 +", "raise SystemExit(3)", "int('a')"]
+)
+def test_failure_of_the_package_of_a_module_is_reported(line, tmp_path, monkeypatch):
+    (tmp_path / "failing_package").mkdir()
+    (tmp_path / "failing_package" / "__init__.py").write_text(line)
+    (tmp_path / "failing_package" / "part.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, "without_specification", ModuleType("without_specification"))
+    with pytest.raises(InputError, match=r"importing failing_package.part failed: .*(Error|SystemExit)"):
+        import_modules(["failing_package.part"])
+    with pytest.raises(InputError, match="there is no module"):
+        import_modules(["without_specification"])
 
 
 def test_file_that_ends_the_program_is_an_error(tmp_path):
