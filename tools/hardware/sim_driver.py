@@ -15,13 +15,16 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
-from guiderail.diagrams.hardware.driver import find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import DRIVERS, find_driver, safety_limits
 from guiderail.diagrams.hardware.lcm import IiwaDriver, LcmDriver, open_bus
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask, part_poses
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import did_you_mean
+from guiderail.models.robots import DEFAULT_ROBOT
+from guiderail.models.robots.robot import robot_names
 from guiderail.tools.hardware.connection import FCI, SIMULATED, check_simulation
 from guiderail.tools.hardware.scenario import load_scenario
 
@@ -60,10 +63,12 @@ def run_sim_driver(
         rate: Rate of the robot's clock relative to the wall clock, in (0, 1]. With None, the iiwa waits for an
             acknowledgement of each status instead (lockstep), and the Franka has the rate 1.
         offset: Offset (x, y) of the fixture from its nominal position [m]; zero by default.
-        scenario: Scenario file with the surroundings of the iiwa (see `load_scenario`); refused with "fci".
+        scenario: Scenario file with the surroundings of the iiwa (see `load_scenario`); its `station` and address have
+            no effect. Refused with "fci".
         driver: "fci" for a Franka arm on the Franka Control Interface, otherwise the iiwa. The Franka runs in lockstep
             while a `FciLockstepClock` is connected, otherwise by the wall clock.
-        joint_friction: Friction of each joint of the Franka [Nm]; by default the residual of friction compensation.
+        joint_friction: Friction of each joint of the Franka [Nm], by default the residual of friction compensation;
+            refused for the iiwa.
         log: Function that shows a message.
 
     Returns:
@@ -73,7 +78,7 @@ def run_sim_driver(
         InputError: If the task is no insertion, there is no such simulated driver, an argument is out of range, or the
             scenario is invalid or refused.
     """
-    for name, value in {"seconds": seconds, "command_timeout": command_timeout}.items():
+    for name, value in {"--seconds": seconds, "--command-timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
             raise InputError(f"{name} must be a positive number, not {value:g}")
     check_simulation(driver, scenario, joint_friction)
@@ -81,6 +86,10 @@ def run_sim_driver(
         check_rate(rate)
     if driver and driver not in SIMULATED:
         raise InputError(f"there is no simulated driver {driver!r}: choose one of {', '.join(SIMULATED)}")
+    if joint_friction is not None and driver != FCI:
+        raise InputError(
+            f"the simulated {DEFAULT_ROBOT} has no joint friction: leave joint_friction={joint_friction:g} out"
+        )
     insertion = _insertion_task(task)
     if offset is not None and len(offset) != 2:
         raise InputError(f"a fixture's offset is x and y, not {len(offset)} numbers")
@@ -94,7 +103,11 @@ def run_sim_driver(
         robot = fci_simulated.WorkcellSimulator(insertion.workcell(), friction)
         fci_simulated.serve(robot, start, part_poses(*parts), seconds, rate or 1.0, url or "127.0.0.1", log)
         return True
-    directives = [] if scenario is None else load_scenario(scenario).directives
+    surroundings = None if scenario is None else load_scenario(scenario)
+    if surroundings is not None and surroundings.robot != DEFAULT_ROBOT:
+        raise InputError(
+            f"{scenario} has the robot {brief(surroundings.robot)}: name a scenario of the simulated {DEFAULT_ROBOT}"
+        )
     lcm = open_bus(url)
     # In real time the monitor has a bus connection of its own, as on a real robot, where it is another process.
     robot_lcm, monitor_lcm = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
@@ -102,7 +115,7 @@ def run_sim_driver(
         insertion.workcell(),
         robot_lcm,
         IiwaDriver.period / (1 if rate is None else PLANT_STEPS_PER_STATUS),
-        directives=directives,
+        directives=() if surroundings is None else surroundings.directives,
     )
     simulator = robot.simulator()
     robot.set_pose(simulator.get_mutable_context(), start)
@@ -140,6 +153,8 @@ def run_safety_monitor(
             the commands of other programs, or `rate` is out of range.
     """
     check_rate(rate)
+    if robot not in (known := [name for name in robot_names() if name in DRIVERS.names()]):
+        raise InputError(f"a safety monitor watches no robot {brief(robot)}: {did_you_mean(robot, known)}")
     driver_type = find_driver(robot)
     plant = ArmControllerPlant(_insertion_task(task).workcell(), robot).plant
     driver = driver_type(url)

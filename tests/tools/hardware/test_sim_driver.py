@@ -14,6 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.hardware.sim_driver import (
     PartRandomizer,
     publish_part_offsets,
+    run_safety_monitor,
     run_sim_driver,
     subscribe_part_offsets,
 )
@@ -25,6 +26,31 @@ SEED = 30
 def test_driver_refuses_an_impossible_joint_friction(value):
     with pytest.raises(InputError, match="joint_friction must be at least 0"):
         run_sim_driver("", 1.0, 1.0, driver="fci", joint_friction=value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"seconds": 0.0}, "^--seconds must be a positive number, not 0$"),
+        ({"command_timeout": -1.0}, "^--command-timeout must be a positive number, not -1$"),
+        ({"joint_friction": 0.1}, "leave joint_friction=0.1 out"),
+        (
+            {"scenario": "model_drivers: {panda: !PandaDriver {}}"},
+            "has the robot 'panda': name a scenario of .* iiwa14",
+        ),
+    ],
+)
+def test_driver_refuses_what_the_iiwa_has_not(arguments, words, tmp_path):
+    if "scenario" in arguments:
+        (tmp_path / "a.yaml").write_text(arguments["scenario"])
+        arguments = {"scenario": tmp_path / "a.yaml"}
+    with pytest.raises(InputError, match=words):
+        run_sim_driver(**{"url": "memq://", "seconds": 0.01, "command_timeout": 0.1} | arguments)
+
+
+def test_monitor_names_the_robots_that_it_can_watch():
+    with pytest.raises(InputError, match=r"watches no robot 'nope': choose one of iiwa14, panda$"):
+        run_safety_monitor("", "nope", "BncConnector")
 
 
 def test_offsets_equal_those_of_simulation_for_the_same_seed():
