@@ -119,8 +119,13 @@ def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
             f"--rate {rate:g} makes {samples:.3g} samples, and a file holds {MAX_NUMBERS} numbers: give a lower one"
         )
     times, outputs = [], []
-    for t, y in zip(demonstrations.times, demonstrations.outputs, strict=True):
+    for index, (t, y) in enumerate(zip(demonstrations.times, demonstrations.outputs, strict=True)):
         at = np.arange(int(np.floor((t[-1] - t[0]) * rate + 1e-9)) + 1) / rate
+        if len(at) < 2:
+            raise InputError(
+                f"--rate {rate:g} leaves one sample of demonstration {index}, which lasts {t[-1] - t[0]:g} s: give a "
+                "higher one"
+            )
         times.append(at)
         outputs.append(np.column_stack([np.interp(at + t[0], t, column) for column in y.T]))
     return Demonstrations(times, outputs, demonstrations.names)

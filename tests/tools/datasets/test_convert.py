@@ -298,10 +298,17 @@ def test_export_states_a_shifted_start_when_resampled(tmp_path):
     assert result["note"].count("first samples were at -0.2 s") == 1
 
 
-@pytest.mark.parametrize("rate", [1e15, 1e308])
-def test_import_refuses_more_samples_than_a_file_holds(rate, tmp_path):
+@pytest.mark.parametrize(
+    ("rate", "words"),
+    [
+        (1e15, "give a lower one"),
+        (1e308, "give a lower one"),
+        (30.0, "--rate 30 leaves one .* 0.03 s: give a higher one"),
+    ],
+)
+def test_import_refuses_a_rate_with_too_many_or_too_few_samples(rate, words, tmp_path):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m", [(0.01 * n, n, 2, 3) for n in range(4)])
-    with pytest.raises(InputError, match="give a lower one"):
+    with pytest.raises(InputError, match=words):
         import_recording(tmp_path / "a.csv", tmp_path / "a.npz", rate=rate)
 
 

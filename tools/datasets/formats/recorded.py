@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.poses import SINGULAR
 
@@ -61,11 +62,15 @@ def poses_in_target(
             to the mean of these poses: a full turn between two demonstrations would be learned as variance.
 
     Raises:
-        InputError: If Ry comes within 1° of ±90°, where Rz and Rx are not unique.
+        InputError: If `target` is not six finite numbers, or Ry comes within 1° of ±90°, where Rz and Rx are not
+            unique.
     """
     if target is not None:
-        turn = Rotation.from_euler("xyz", np.asarray(target[3:], dtype=float), degrees=True)
-        positions = turn.inv().apply(positions - np.asarray(target[:3], dtype=float))
+        pose = as_numbers(target, "target")
+        if pose.shape != (6,) or not is_finite(pose):
+            raise InputError(f"target must be six finite numbers, [x y z rx ry rz], not {brief(target)}")
+        turn = Rotation.from_euler("xyz", pose[3:], degrees=True)
+        positions = turn.inv().apply(positions - pose[:3])
         rotations = turn.inv() * rotations
     if np.abs(rotations.as_matrix()[:, 2, 0]).max(initial=0.0) > SINGULAR:
         raise InputError(

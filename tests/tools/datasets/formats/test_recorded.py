@@ -6,6 +6,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.datasets.formats.recorded import poses_in_target
 
 
+@pytest.mark.parametrize("target", [[1.0, 2.0, 3.0], [0.0, 0.0, 0.0, np.nan, 0.0, 0.0], 1.0, ["a"] * 6])
+def test_target_is_refused_unless_it_is_a_pose(target):
+    with pytest.raises(InputError, match=r"^target "):
+        poses_in_target(np.zeros((2, 3)), Rotation.identity(2), target)
+
+
 def test_singular_angles_are_refused_and_a_turned_target_makes_them_regular():
     turns = Rotation.from_euler("y", np.linspace(80.0, 100.0, 21)[:, None], degrees=True)
     with pytest.raises(InputError, match="Ry comes near ±90°"):
