@@ -34,12 +34,14 @@ class SignalPorts:
         signals: Mappings from name to size, at least 1. Equal names share one port.
 
     Raises:
-        InputError: If a size is not a whole number of at least 1, or a signal has two sizes.
+        InputError: If a name is empty, a size is not a whole number of at least 1, or a signal has two sizes.
     """
 
     def __init__(self, system: LeafSystem, *signals: Mapping[str, int]):
         sizes: dict[str, int] = {}
         for name, size in (item for mapping in signals for item in mapping.items()):
+            if not name:
+                raise InputError("a signal needs a name, not ''")
             size = as_whole(size, f"the size of signal '{name}'")
             if size < 1:
                 raise InputError(f"signal '{name}' needs a size of at least 1, not {size}")

@@ -31,9 +31,10 @@ def test_signal_is_refused_when_it_has_two_sizes(system):
         SignalPorts(system, {"pose": 2}, {"pose": 6})
 
 
-def test_signal_is_refused_when_its_size_is_zero(system):
-    with pytest.raises(InputError, match="'pose'"):
-        SignalPorts(system, {"pose": 0})
+@pytest.mark.parametrize(("signals", "words"), [({"pose": 0}, "'pose'"), ({"": 1}, "needs a name, not ''")])
+def test_signal_is_refused_when_its_size_is_zero_or_its_name_empty(signals, words, system):
+    with pytest.raises(InputError, match=words):
+        SignalPorts(system, signals)
 
 
 def test_unknown_signal_is_refused_with_the_known_names(system):
