@@ -104,14 +104,16 @@ zero_policy: MakePolicy = partial(BaselinePolicy, zero)
 
 
 def digest_of(make_policy: MakePolicy) -> str | None:
-    """Return what identifies a function that makes a policy, for the names of stored files: a baseline and its seed.
+    """Return what identifies a function that makes a policy, for the names of stored files.
 
-    The result is None for other functions, because they may read files and variables.
+    It is the name of a baseline policy, with the seed unless that is 0. The result is None for functions other than
+    `partial(BaselinePolicy, FACTORY)`, because they may read files and variables.
     """
     if isinstance(make_policy, partial) and make_policy.func is BaselinePolicy and {*make_policy.keywords} <= {"seed"}:
         for name, factory in BASELINES.items():
             if make_policy.args == (factory,):
-                return f"{name} {make_policy.keywords.get('seed', 0)}"
+                seed = make_policy.keywords.get("seed", 0)
+                return f"{name} {seed}" if seed else name
     return None
 
 

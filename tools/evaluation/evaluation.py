@@ -54,7 +54,7 @@ def episodes_file(
     Raises:
         InputError: If `name` cannot be part of a file's name, or a file of the task cannot be read.
     """
-    if not (name.isprintable() and "/" not in name and 0 < len(name.encode()) <= MAX_NAME_BYTES):
+    if not _can_name_file(name):
         raise InputError(
             f"the name of a policy is a printable text of 1 to {MAX_NAME_BYTES} bytes without '/', not {brief(name)}"
         )
@@ -63,6 +63,10 @@ def episodes_file(
     more = [*([] if about is None else [about]), *filter(None, [content])]
     key = json.dumps([environment, how, config.seed, installed_versions(), *more], sort_keys=True, default=str)
     return folder / f"{name}-{hashlib.blake2b(key.encode(), digest_size=6).hexdigest()}.csv"
+
+
+def _can_name_file(policy: str) -> bool:
+    return policy.isprintable() and "/" not in policy and 0 < len(policy.encode()) <= MAX_NAME_BYTES
 
 
 def policy_digest(source: Path) -> str:
@@ -83,9 +87,11 @@ def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator
         path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
     ):
         name, rows = file.stem.rpartition("-")[0], read_table(file)
-        about = digest if file.parent.name == POLICY_FOLDER else None
         how = {"episodes": len(rows), "seed": seed}
-        if file == episodes_file(file.parent, name, config, config.environment, about=about, **how):
+        abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)  # by name, or given as a function
+        if _can_name_file(name) and any(
+            file == episodes_file(file.parent, name, config, config.environment, about=about, **how) for about in abouts
+        ):
             yield name, rows
 
 

@@ -121,6 +121,7 @@ def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
     folder = RunFolder(bead_run)
     evaluate(bead_run, episodes=2, baselines=["constant"])
     evaluate(bead_run, episodes=2, environment={"wall": -0.5})
+    pd.DataFrame({"success": [1]}).to_csv(bead_run / "baselines" / "other.csv", index=False)
     stored = dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
     assert {name: len(rows) for name, rows in stored.items()} == {"policy": 2, "demonstration": 2, "constant": 2}
     policy = Policy.load(bead_run)
