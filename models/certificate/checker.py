@@ -1,15 +1,13 @@
 """Check a certificate with NumPy alone: `python checker.py FOLDER [KEY_FILE]`.
 
 Exit codes: 0 valid, 1 rejected, 2 unreadable or wrong arguments.
-
 The checker bounds the commands y of a window of steps for all actions a. Given the history h, the prior has the mean
 W h and the kernel C; μ, Σ, λ and β are the primitive's means, covariances and parameters, G its rows of constraints:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
-Windows are computed in extended precision. A bound on their rounding errors is carried through the loop, and a claim
-must leave room for these errors (see docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also
-compares subject, primitive, impedance and budget with those of the skill; this program does not.
-The digest detects accidental changes only, as anyone can compute it; a signature needs the key.
+Windows are computed in extended precision, with a bound on their rounding errors for which a claim must leave room
+(docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also compares subject, primitive, impedance
+and budget with those of the skill. The digest detects accidental changes only; a signature needs the key.
 """
 
 import hashlib
@@ -27,8 +25,7 @@ import numpy as np
 Arrays = dict[str, np.ndarray]
 Real = np.longdouble
 KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / (2 * length * length)).exp()}
-QUANTITIES = ("lower", "upper", "speed", "acceleration")
-BUDGETS = ("excess", "residue")
+QUANTITIES, BUDGETS = ("lower", "upper", "speed", "acceleration"), ("excess", "residue")
 AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
 BORDER = 1e-5  # slack, relative to a constraint's terms, up to which a claim that the constraint is active is accepted
 COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts

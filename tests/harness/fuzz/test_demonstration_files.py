@@ -17,9 +17,10 @@ from fuzz.changes import edited, edits
 from fuzz.tally import attempt
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.demonstrations import MAX_MAGNITUDE
 from oracles.files import csv_demonstrations, npz_demonstrations
 
-FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+FLOATS = st.floats(-MAX_MAGNITUDE, MAX_MAGNITUDE)
 NAMES = st.text(st.characters(codec="utf-8", exclude_categories=("Cs", "Cc")), max_size=12).filter(
     lambda name: name.isprintable() and name == name.strip()
 )

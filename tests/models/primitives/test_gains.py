@@ -88,9 +88,3 @@ def test_exploration_rms_accepts_lists_and_defaults_to_one_step(primitive):
     gains = [0.5, 2.0]
     np.testing.assert_array_equal(exploration_rms(primitive, gains), exploration_rms(primitive, np.array(gains), 1))
     np.testing.assert_array_equal(authority(primitive, tuple(gains)), authority(primitive, np.array(gains)))
-
-
-@pytest.mark.parametrize("outputs", [[0.5], ["x"], 0, [True], [True, False, True]])
-def test_outputs_that_are_no_indices_or_mask_are_refused(primitive, outputs):
-    with pytest.raises(InputError, match="action_dims must be among 0 … 1"):
-        authority_gains(primitive, outputs=outputs)

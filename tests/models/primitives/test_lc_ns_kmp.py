@@ -587,7 +587,7 @@ def test_predict_refuses_what_is_no_number():
     primitive = LcNsKmp(_small_reference(), history=2)
     past = np.zeros((2, 2))
     for step in ("1", None, [1], np.array([1, 2]), True):
-        with pytest.raises(InputError, match="a step is a whole number, not"):
+        with pytest.raises(InputError, match="a step must be a whole number, not"):
             primitive.predict(step, None, past)
     for action in ("ab", ["1", "2"], [1.0, [2.0]], [1j, 0.0]):
         with pytest.raises(InputError, match="a null-space action is not an array of numbers"):

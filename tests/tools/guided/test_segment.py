@@ -206,7 +206,7 @@ def test_wrong_band_is_refused(band):
 
 @pytest.mark.parametrize("wrong", [None, 5, [recordings()]])
 def test_segment_needs_demonstrations_or_their_file(wrong):
-    with pytest.raises(InputError, match="a segment has Demonstrations or their file, not"):
+    with pytest.raises(InputError, match="demonstrations of a segment are Demonstrations or their file, not"):
         Segment(wrong)
 
 
