@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
@@ -70,15 +71,25 @@ _KINDS = {
 
 
 def _check_kinds(text: str) -> None:
-    """Raise a ValueError if the root of a document, or one of its collections, is of another kind."""
+    """Raise a ValueError if the root of a document, one of its collections, or an entry of these is of another kind."""
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     if not isinstance(root, yaml.MappingNode):
         raise ValueError("it must be a mapping with model_drivers")
     for key, node in root.value:
-        kind, name = _KINDS.get(key.value, (yaml.Node, ""))
-        if not isinstance(node, kind):
-            given = brief(node.value) if isinstance(node, yaml.ScalarNode) else f"a {node.id}"
-            raise ValueError(f"{key.value} must be {name}, not {given}")
+        if key.value not in _KINDS:
+            continue
+        _check_kind(node, *_KINDS[key.value], key.value)
+        is_list = isinstance(node, yaml.SequenceNode)
+        entries = enumerate(node.value) if is_list else ((name.value, entry) for name, entry in node.value)
+        for name, entry in entries:
+            if name != "<<":  # a merge may also be of a list of mappings
+                _check_kind(entry, yaml.MappingNode, "a mapping", f"{name} of {key.value}")
+
+
+def _check_kind(node: Any, kind: type[yaml.Node], name: str, what: str) -> None:
+    if not isinstance(node, kind):
+        given = brief(node.value) if isinstance(node, yaml.ScalarNode) else f"a {node.id}"
+        raise ValueError(f"{what} must be {name}, not {given}")
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -298,10 +298,12 @@ class DemonstrationRecorder:
         success = next((term for term in task.termination_terms() if term.termination == "success"), None)
         if success is None or list(success.inputs) != [task.workpiece]:
             return None
-        plant = self.station.plant
-        context = plant.GetMyContextFromRoot(self.simulator.get_context())
-        X = plant.GetFrameByName(task.workpiece).CalcPose(context, plant.GetFrameByName(task.fixture))
-        return bool(success.condition(transform_to_vector(X)))
+        # As in the task's own success: the plant's context holds no simulated poses if another engine simulates.
+        context = self.station.GetMyContextFromRoot(self.simulator.get_context())
+        poses = self.station.GetOutputPort("body_poses").Eval(context)
+        bodies = (self.station.plant.GetBodyByName(name) for name in (task.fixture, task.workpiece))
+        X_WFixture, X_WWorkpiece = (poses[body.index()] for body in bodies)
+        return bool(success.condition(transform_to_vector(X_WFixture.InvertAndCompose(X_WWorkpiece))))
 
     def summarize(self) -> dict[str, Any]:
         """Replay the mean of the demonstrations, draw it with its spread, and return statistics."""

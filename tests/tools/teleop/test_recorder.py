@@ -94,6 +94,19 @@ def test_keep_writes_the_demonstration_at_once(session):
     assert Demonstrations.load(session.out).num_demonstrations == 2
 
 
+@pytest.mark.parametrize("station", ["gantry", "mujoco"])
+def test_success_is_that_of_the_simulated_pose(station, tmp_path):
+    if station == "mujoco":
+        pytest.importorskip("mujoco")
+    session = DemonstrationRecorder("GridClamp", {"station": station}, tmp_path / "recorded.npz", meshcat=Page())
+    session.reset()
+    lead(session, "x [mm]", 2.0, 20)
+    assert ", NOT at the target" in session.keep()
+    assert session.successes == [False]
+    session.station.set_pose(session.simulator.get_mutable_context(), np.zeros(6))
+    assert session.is_success() is True
+
+
 def test_gauge_shows_the_force_on_the_robot(session):
     session.reset()
     lead(session, "x [mm]", 3.0, 15)  # next to the holes
