@@ -58,7 +58,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             segment's discrete output, such as a gripper command.
         guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (the action is added to the motion,
             without constraints), "clipped_residual" (as "residual", moved to the nearest point within the linear
-            constraints), "template", or a `Guide`, with which arguments about the motion are ignored.
+            constraints), "template", or a `Guide`, with which arguments about the motion are ignored. A guide holds an
+            episode, so that each environment needs its own: give `Guide.copy()` to another one.
         constraints: Constraints of a single motion without segments; `Segment` has its own.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
@@ -151,6 +152,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.action_repeat, self._observe = int(action_repeat), observed
         self._pose, self._to_action = pose, to_action
         self._command: GuideCommand | None = None
+        self._is_pending = False  # True if an error kept the environment from a step with `_command`
         self._observation: Any = None
         self._has_begun = False
         self._terminated = self._truncated = False
@@ -165,7 +167,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self._has_begun = False  # an error leaves no episode to continue
         self._observation, info = self.env.reset(seed=seed, options=options)
-        self._terminated = self._truncated = False
+        self._terminated = self._truncated = self._is_pending = False
         measured = self._measured()
         self.guide.reset(self.env, self._observation, measured)
         self._has_begun = True
@@ -208,18 +210,25 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._count >= self.action_repeat or self._terminated or self._truncated
 
     def request(self) -> Any:
-        """Return the request for the next step's prediction, or None if the guide needs no prediction.
+        """Return the request for the next step's prediction, or None if the step needs no prediction.
+
+        After an error in `to_action` or in the environment, the next step repeats the command, whatever the action.
 
         Raises:
             InputError: If the measured pose is not (O,) finite numbers.
         """
-        return self.guide.request(self.env, self._observation, self._action, self._measured())
+        measured = self._measured()
+        return None if self._is_pending else self.guide.request(self.env, self._observation, self._action, measured)
 
     def advance(self, output: np.ndarray | None) -> None:
         """Step the environment with the predicted output (O,); None without a request or a solution."""
-        self._command = command = self.guide.finish(output)
+        command = self._command
+        if command is None or not self._is_pending:
+            self._command = command = self.guide.finish(output)
+        self._is_pending = True
         action = self._to_action(self.env, self._observation, command.output, command.extra)
         self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
+        self._is_pending = False
         self._reward += float(reward)
         self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
         self._fallbacks += command.is_fallback

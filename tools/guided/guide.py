@@ -295,11 +295,11 @@ class PrimitiveGuide(Guide):
             output = output + self._residual
             if self.guidance == "clipped_residual":
                 output = self.constraints.nearest(output, step)
+        extra = self._extra(self._step)  # a function of the user, whose error must not skip a command
         command = self._stepper.finish(output)
         self._last = command.output
         world = self.frame.to_world(command.output, self._orientation)
         self._recent = [*self._recent, world][-max(self.settings.history, 2) :]
-        extra = self._extra(self._step)
         self._step += 1
         violation = (self._motion or self.constraints).violation(command.output, step)
         return GuideCommand(world, violation, command.is_fallback, extra)
@@ -434,12 +434,12 @@ class TemplateGuide(Guide):
 
     def finish(self, output: np.ndarray | None) -> GuideCommand:
         """Project the request into the active constraints; repeat the last command if the result is not finite."""
+        extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
         X = self.template.command(self._state, self._X, self._request, self._frames, self._period).X_WE
         is_fallback = not np.isfinite(transform_to_pose(X)).all()
         if not is_fallback:
             self._X = X
         violation = self.template.violation(self._state, self._X, self._frames)
-        extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
         return GuideCommand(transform_to_pose(self._X), violation, is_fallback, extra)
 
     @property

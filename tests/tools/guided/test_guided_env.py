@@ -1,5 +1,6 @@
 """Guidance around an environment of another origin: constraints, frames, segments, observations and refusals."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import gymnasium
@@ -600,6 +601,65 @@ def test_failed_reset_leaves_no_episode():
     measured.reverse()
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.step(np.zeros(3))
+
+
+@pytest.mark.parametrize("failing", ["to_action", "step", "extra"])
+@pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "residual"])
+def test_error_skips_no_command(failing, guidance, monkeypatch):
+    calls = {failing: 0}
+
+    def fails(name, function):
+        def call(*arguments):
+            calls[name] = calls.get(name, 0) + 1
+            if name == failing and calls[name] == 4:
+                raise OSError("no connection")
+            return function(*arguments)
+
+        return call
+
+    def commands(is_failing):
+        wrap = fails if is_failing else lambda name, function: function
+        segment = Segment(SHOWN, frame=at_target, constraints=LIMIT, extra=wrap("extra", lambda phase, is_over: 0.0))
+        keywords = {"demonstrations": [segment], "constraints": None, "frame": None, "action_repeat": 1}
+        env = guided(
+            guidance, **keywords, to_action=wrap("to_action", lambda e, o, command, extra: np.append(command, 0))
+        )
+        monkeypatch.setattr(env.unwrapped, "step", wrap("step", env.unwrapped.step))
+        env.reset(seed=0)
+        taken = []
+        while len(taken) < 8:
+            with nullcontext() if not is_failing or calls[failing] != 3 else pytest.raises(OSError, match="connection"):
+                taken.append(env.step(np.full(3, 0.3))[-1]["command"])
+        return taken
+
+    np.testing.assert_array_equal(commands(True), commands(False))
+
+
+def test_error_skips_no_command_of_a_template():
+    is_failing = [False]
+
+    def extra(state):
+        if is_failing[0]:
+            raise OSError("no connection")
+        return 0.0
+
+    outputs = []
+    for failing_at in (None, 3):
+        template_guide = guide.TemplateGuide(
+            load_template("pouring"), lambda env, o: {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, 0.02, extra
+        )
+        template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.0, 0.0, 0.0]))
+        for k in range(6):
+            is_failing[0] = k == failing_at
+            template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+            if is_failing[0]:
+                with pytest.raises(OSError, match="connection"):
+                    template_guide.finish(None)
+                is_failing[0] = False
+                template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+            command = template_guide.finish(None)
+        outputs.append(command.output)
+    np.testing.assert_array_equal(*outputs)
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "constraints", "frame", "action_dims"])
