@@ -385,9 +385,9 @@ class LcNsKmp:
             if past.shape != self._history_shape:
                 raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
             x = np.concatenate((past.ravel(), action))
-        # One reduction instead of isfinite().all(): any NaN or infinity makes the product not finite.
+        # One reduction instead of isfinite().all(): any NaN, infinity or overflow makes the product not finite.
         if not math.isfinite(x.dot(x)):
-            raise InputError("history and null-space action must be finite")
+            raise InputError("history and null-space action must be finite, also when squared")
         return x
 
     def _stack_batch(
@@ -415,8 +415,8 @@ class LcNsKmp:
             x[:, : -self.num_outputs] = past.reshape(size, -1)
         if actions is not None:
             x[:, -self.num_outputs :] = actions
-        if not np.isfinite(x).all():
-            raise InputError("histories and null-space actions must be finite")
+        if not np.isfinite(np.einsum("ij,ij->i", x, x)).all():  # as in `_stack`
+            raise InputError("histories and null-space actions must be finite, also when squared")
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _checked_step(self, step: int) -> int:

@@ -125,6 +125,21 @@ def test_wrong_argument_is_refused(steps, actions, histories, message):
         primitive().predict_batch(steps, actions, histories)
 
 
+@pytest.mark.parametrize(("size", "is_accepted"), [(1e150, True), (1e155, False), (-1e300, False)])
+def test_actions_whose_squares_overflow_are_refused_as_by_predict(size, is_accepted):
+    p = primitive(upper=None)
+    action, history = np.array([0.0, size, 0.0]), p.reference.means[:4]
+    for predict in (
+        lambda: p.predict(4, action, history).output,
+        lambda: p.predict_batch([4, 4], np.array([np.zeros(3), action]), np.array([history] * 2)).outputs[1],
+    ):
+        if is_accepted:
+            assert np.isfinite(predict()).all()
+        else:
+            with pytest.raises(InputError, match="must be finite, also when squared"):
+                predict()
+
+
 def test_history_without_history_is_refused():
     with pytest.raises(InputError, match="no history"):
         primitive(history=0).predict_batch([0], np.zeros((1, 3)), np.zeros((1, 4, 3)))
