@@ -8,9 +8,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.tasks.registry import known_tasks
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults
@@ -28,12 +30,13 @@ from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.tables import read_table
+from guiderail.tools.tables import read_columns, read_table
 from guiderail.tools.visualization.style import color, is_demonstrated, label
 
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
 STUDY_COLUMNS = ("method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate")
+MAX_COUNT = 1e12  # number of episodes from which a study's table is damaged
 REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
     "fallback_steps",
@@ -139,9 +142,11 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     episodes, together with baseline policies. If `episodes` is 0, only stored evaluations are read.
 
     Raises:
-        InputError: If a folder contains neither a run nor a study's table, no run has a finished episode, or a file is
-            damaged.
+        InputError: If no folder is given, a folder contains neither a run nor a study's table, no run has a finished
+            episode, or a file is damaged.
     """
+    if not paths:
+        raise InputError("a report needs at least one run or study: give their folders")
     folders: list[Path] = []
     single_runs: list[Path] = []  # runs that are not part of a study
     held_out, has_tables = [], False
@@ -188,17 +193,20 @@ def _episodes(folder: RunFolder) -> pd.DataFrame:
 def _study_tables(folder: Path) -> list[pd.DataFrame]:
     """Return the tables of a study, with a row for each method, seed, checkpoint and evaluation set.
 
-    Rows of a partial study's table that are also in the table of the whole study are left out.
+    Rows of a partial study's table that are also in the table of the whole study are left out, and so are other files.
+
+    Raises:
+        InputError: If a table of a study is damaged.
     """
     tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
-        table = read_table(file)
-        if not {*STUDY_COLUMNS} <= {*table.columns}:
+        if file.is_file() and not {*STUDY_COLUMNS} <= {*read_columns(file)}:
             continue
+        table = read_table(file)
         studies = _studies_of(file.stem, table)
         part_of = next((name for name in studies if name in tables), next(iter(studies), ""))
         evaluated = table[(table["eval_set"] != "") & table["success_rate"].notna()]
-        rows = _success_counts(evaluated.assign(study=file.stem, part_of=part_of))
+        rows = _success_counts(evaluated.assign(study=file.stem, part_of=part_of), file)
         for name, whole in tables.items():
             if name in studies:
                 same = list(whole.columns.drop(["study", "part_of"]))
@@ -221,9 +229,19 @@ def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
     return [name.removesuffix(text) for text in texts if name.endswith(text) and name != text]
 
 
-def _success_counts(rows: pd.DataFrame) -> pd.DataFrame:
+def _success_counts(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
     """Return the rows of a study's table with the number of successes instead of the success rate."""
     rows = rows[["study", "part_of", *STUDY_COLUMNS]].copy()
+    episodes, rates = (as_numbers(rows[name], f"{name} in {file}") for name in ("episodes", "success_rate"))
+    is_wrong = ~(
+        (episodes >= 1) & (episodes < MAX_COUNT) & (episodes == np.rint(episodes)) & (rates >= 0) & (rates <= 1)
+    )
+    if is_wrong.any():
+        first = int(is_wrong.argmax())
+        raise InputError(
+            f"{file} is damaged: episodes are whole numbers from 1 on and below {MAX_COUNT:g}, and success_rate is "
+            f"from 0 to 1, not {episodes[first]:g} and {rates[first]:g}; restore it, or run the study again"
+        )
     rows["successes"] = (rows["success_rate"] * rows["episodes"]).round().astype(int)
     rows["episodes"] = rows["episodes"].astype(int)
     return rows.drop(columns="success_rate")

@@ -128,6 +128,43 @@ def test_rows_of_a_partial_study_are_counted_once(studied, tmp_path):
     assert "guiderail study beads.yaml --methods learner --seeds 1,5 --out studies" in text
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("episodes", "ten", "episodes in .*beads.csv is not an array of numbers"),
+        ("episodes", "", "beads.csv is damaged: episodes are whole numbers from 1 on .*, not nan and 0.9"),
+        ("episodes", 0, "not 0 and 0.9; restore it, or run the study again"),
+        ("episodes", 2.5, "not 2.5 and 0.9"),
+        ("episodes", "inf", "not inf and 0.9"),
+        ("success_rate", "high", "success_rate in .*beads.csv is not an array of numbers"),
+        ("success_rate", 1.5, "success_rate is from 0 to 1, not 10 and 1.5"),
+        ("success_rate", -0.1, "not 10 and -0.1"),
+    ],
+)
+def test_damaged_table_of_a_study_is_refused(name, value, message, studied, tmp_path):
+    rows = read_table(studied / "beads.csv").astype({name: object})
+    rows.loc[0, name] = value
+    write_table(tmp_path / "beads", rows)
+    with pytest.raises(InputError, match=message):
+        write_report([tmp_path], tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("text", [b"a,b\n1\n", b"", b"\xff\n", b'a,"b\n', b"a,a\n1,2\n"])
+def test_other_files_in_the_folder_of_a_study_are_left_alone(text, studied, tmp_path):
+    shutil.copy(studied / "beads.csv", tmp_path)
+    (tmp_path / "other.csv").write_bytes(text)
+    assert "16/20" in write_report([tmp_path], tmp_path / "page.html").read_text()
+    table = (studied / "beads.csv").read_text()
+    (tmp_path / "beads.csv").write_text(table + "1,2\n")
+    with pytest.raises(InputError, match=r"beads\.csv is not a table of episodes: restore it"):
+        gather([tmp_path])
+
+
+def test_report_of_nothing_is_refused():
+    with pytest.raises(InputError, match="at least one run or study"):
+        gather([])
+
+
 def test_study_named_like_another_one_is_whole(studied, tmp_path):
     folder = tmp_path / "tables"
     folder.mkdir()
