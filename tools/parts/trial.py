@@ -247,8 +247,8 @@ DEMONSTRATION_SECONDS = 40.0  # CPU time after which demonstrations are written 
 MAX_SESSIONS = 3  # largest number of attempts at each demonstration; the first that seats the plug is used
 
 
-def demonstrate(folder: Path, file: PartTaskFile) -> int:
-    """Write the demonstrations; return how many of them were checked in time and seat the plug."""
+def demonstrate(folder: Path, file: PartTaskFile) -> tuple[int, int]:
+    """Write the demonstrations; return how many of them seat the plug, and how many were checked in time."""
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     press_from = numbers.rim - numbers.press - 1e-3
@@ -257,18 +257,21 @@ def demonstrate(folder: Path, file: PartTaskFile) -> int:
     sockets = np.column_stack([socket_offsets(), socket_turns(search_turn)])
     start = time.process_time()
     chosen: list[np.ndarray] = []
-    seated = 0
+    seated = checked = 0
     for attempts, socket in zip(zip(*sessions, strict=True), sockets, strict=True):
+        is_checked = False
         for motion in attempts:
             in_time = time.process_time() - start < DEMONSTRATION_SECONDS
+            is_checked = is_checked or in_time
             if in_time and _seats(folder, file, times, motion, socket):
                 chosen.append(motion)
                 seated += 1
                 break
         else:
             chosen.append(attempts[0])
+        checked += is_checked
     Demonstrations([times] * len(chosen), chosen, POSE_NAMES).save(folder / file.demonstrations.file)
-    return seated
+    return seated, checked
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, socket: np.ndarray) -> bool:

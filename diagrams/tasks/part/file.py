@@ -328,6 +328,11 @@ class PartTaskFile(Options):
         return self.motion.turn * DEGREE
 
 
+def is_plain_path(name: str) -> bool:
+    """Return True if a task file may name this path of a file in its folder."""
+    return bool(_FILE_NAME.fullmatch(name)) and ".." not in name.split("/")
+
+
 def read_task_file(folder: Path) -> PartTaskFile:
     """Read the task of a folder.
 
@@ -348,7 +353,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
     except InputError as error:
         raise InputError(f"{path} is invalid: {error}") from None
     for name in file.files:
-        if not _FILE_NAME.fullmatch(name) or ".." in name.split("/"):
+        if not is_plain_path(name):
             raise InputError(f"{path} names {brief(name)}, which is not a plain path inside {folder}: rename the file")
         if not (folder / name).is_file():
             raise InputError(f"{path} names {name}, which is not in {folder}: put it there, or create the task again")

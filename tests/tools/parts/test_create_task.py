@@ -57,7 +57,14 @@ def test_measured_properties_are_those_of_the_drawing(folder):
 
 def test_scenarios_with_conflicting_names_are_refused(tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
-    for name in ("a/table.dmd.yaml", "b/table.dmd.yaml", "a/table.yaml", "a/plug.obj", "a/b,c.dmd.yaml"):
+    for name in (
+        "a/table.dmd.yaml",
+        "b/table.dmd.yaml",
+        "a/table.yaml",
+        "a/plug.obj",
+        "a/b,c.dmd.yaml",
+        "a/b#c.dmd.yaml",
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("directives: []\n")
     for names, words in (
@@ -65,6 +72,7 @@ def test_scenarios_with_conflicting_names_are_refused(tmp_path):
         (("a/table.yaml",), "is not a scenario: name a .dmd.yaml file"),
         (("a/plug.obj",), "is not a scenario"),
         (("a/b,c.dmd.yaml",), "has a comma in its name"),
+        (("a/b#c.dmd.yaml",), "a scenario's name is letters, digits, .* and not 'b#c.dmd.yaml'"),
     ):
         with pytest.raises(InputError, match=words):
             create_task(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
@@ -396,6 +404,62 @@ def test_unknown_turn_beyond_the_range_is_refused(tmp_path):
 def test_plug_pose_is_refused_when_it_is_not_six_numbers(pose, tmp_path):
     with pytest.raises(InputError, match="--plug-pose is 6 finite numbers"):
         create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", plug_pose=pose)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"turn": "a"}, "--turn must be a number, not 'a'"),
+        ({"shrink": None}, "--shrink must be a number, not None"),
+        ({"hard_episodes": 2.5}, "--hard-episodes must be a whole number, not 2.5"),
+        ({"plug": 5}, "the plug must be the path of a file or folder, not 5"),
+        ({"scenario": ["missing.dmd.yaml"]}, "there is no scenario missing.dmd.yaml"),
+        ({"center": (0.0, 0.0)}, r"--center is 3 numbers, not \(0.0, 0.0\)"),
+        ({"center": "0,0,0"}, "--center is not an array of numbers"),
+        ({}, "there is no mesh .*a.stl"),
+    ],
+)
+def test_arguments_of_wrong_types_are_refused_and_paths_may_be_text(given, message, tmp_path):
+    paths = {name: str(tmp_path / name) for name in ("plug", "socket", "out")} | {"plug": str(tmp_path / "a.stl")}
+    with pytest.raises(InputError, match=message):
+        create_task(**(paths | {"socket": str(tmp_path / "b.stl"), "unit": "mm"} | given))
+
+
+@pytest.mark.parametrize(("seats", "expected"), [(True, (4, 4)), (False, (0, 2))])
+def test_demonstrations_that_are_not_checked_in_time_are_not_counted(seats, expected, folder, tmp_path, monkeypatch):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.tools.parts import trial
+
+    clock = iter(range(0, 1000, 9))  # the fifth check would begin after 45 s
+    monkeypatch.setattr(trial, "time", SimpleNamespace(process_time=lambda: next(clock)))
+    monkeypatch.setattr(trial, "_seats", lambda *arguments: seats)
+    assert trial.demonstrate(tmp_path, read_task_file(folder)) == expected
+
+
+@pytest.mark.parametrize(
+    ("counts", "stored", "sentences"),
+    [
+        ((10, 10), "10 of 10", []),
+        ((9, 10), "9 of 10", ["only 9 of 10 checked demonstrations"]),
+        ((4, 4), "4 of 4, 6 unchecked", ["6 of 10 demonstrations are not checked"]),
+        ((0, 3), None, []),
+    ],
+)
+def test_unchecked_demonstrations_are_not_reported_as_failed(counts, stored, sentences, folder, tmp_path, monkeypatch):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+    from guiderail.tools.parts import create_task as module
+    from guiderail.tools.parts import trial
+
+    monkeypatch.setattr(trial, "demonstrate", lambda folder, file: counts)
+    monkeypatch.setattr(trial, "write_preview", lambda *arguments: None)
+    file, choice, logged = read_task_file(folder), SimpleNamespace(aligned=None), []
+    refusal = pytest.raises(InputError, match="none of the 3 checked demonstrations seats the plug")
+    with refusal if stored is None else nullcontext():
+        measured = module._write_task(tmp_path, file, choice, {"real_time_factor": 1.0}, 0, 0.0, logged.append)
+        assert measured["demonstrations_seated"] == stored
+    assert [text.startswith(start) for text, start in zip(logged[1:], sentences, strict=True)] == [True] * len(
+        sentences
+    )
 
 
 def test_options_of_a_created_task_are_listed(folder, capsys):
