@@ -39,7 +39,7 @@ def demonstrations(draw):
         clock = sorted(draw(st.sets(FLOATS, min_size=2, max_size=8)))
         times.append(clock)
         values.append(draw(hnp.arrays(float, (len(clock), outputs), elements=FLOATS)))
-    names = draw(st.lists(NAMES, min_size=outputs, max_size=outputs))
+    names = draw(st.lists(NAMES, min_size=outputs, max_size=outputs, unique_by=lambda name: name or object()))
     return Demonstrations(times, values, names)
 
 
