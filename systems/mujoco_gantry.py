@@ -113,7 +113,7 @@ class MujocoGantry(LeafSystem):
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Warnings of divergence and of a full contact buffer, with which the engine ignores further contacts.
+        # Warnings of divergence, and of a full contact or constraint buffer: the engine ignores what no longer fits.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
         # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.

@@ -216,8 +216,8 @@ def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
     if demonstrated.motion is not None or demonstrated.progress is not None:
         raise InputError(
-            "a certificate covers linear constraints and the clock: leave out progress, max_speed, max_acceleration "
-            "and shapes"
+            "a certificate covers only linear constraints and progress=clock: leave out progress, max_speed, "
+            "max_acceleration, joint_margin and shapes"
         )
     has_actions = config.guidance != "kmp"
     primitive = demonstrated.primitive(history=config.guidance == "skgrl", constrained=has_actions)

@@ -18,7 +18,7 @@ from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
-    """Return the configuration of the prior's primitive; the kind of guidance requires demonstrations."""
+    """Return the configuration of the prior's primitive; the prior must have demonstrations."""
     assert prior.demonstrations is not None
     return prior.demonstrations
 

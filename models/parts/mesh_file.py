@@ -49,7 +49,7 @@ class Part:
 
     @cached_property
     def solids(self) -> list[Any]:
-        """Bodies as `manifold3d` solids, empty where faces cross each other."""
+        """Bodies as `manifold3d` solids; a solid is empty if `manifold3d` refuses the faces of its body."""
         return [to_manifold(vertices, triangles) for vertices, triangles in self.bodies]
 
     @property
@@ -126,14 +126,14 @@ def load_part(path: Path, unit: str) -> Part:
     mesh = import_extra("trimesh").Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     if not (mesh.area > 0.0):
-        raise InputError(f"{path} holds triangles without an area only: export the part as a mesh")
+        raise InputError(f"{path} holds only triangles without an area: export the part as a mesh")
     vertices, triangles = np.asarray(mesh.vertices) * UNITS[unit], np.asarray(mesh.faces)
     bodies, repair = close_surface(path.name, vertices, triangles)
     return Part(path, tuple(bodies), repair)
 
 
 def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return vertices (V, 3), triangles (T, 3) and the number of triangles; empty arrays if there are too many.
+    """Return vertices (V, 3), triangles (T, 3) and the larger of T and V / 3; empty arrays if that is too large.
 
     Without a path and materials, a parser opens no other file and decodes no image.
     """

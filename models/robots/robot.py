@@ -58,7 +58,7 @@ class Robot:
         home: Joint positions (n,) [rad] with the flange pointing down in front of the robot, far from limits and
             singularities; inverse kinematics starts there.
         tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
-            base's x axis at home, with the last joint in the middle of its range.
+            base's x axis if the last joint is in the middle of its range, and the other joints are at home.
         apparent_rotor_inertia: Fraction of the rotors' reflected inertia that acts on the joints under torque control;
             joint torque feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
         drives: Drives of the joints under position control; None if unknown.

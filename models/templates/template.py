@@ -22,10 +22,10 @@ BACKTRACKS = 8  # attempts to find an allowed displacement, each shorter than th
 
 @dataclass(frozen=True)
 class Transition:
-    """Transition to the state `to` when the distance of the present state falls below a threshold.
+    """Transition of a state to the state `to` when the distance of the first state falls below a threshold.
 
-    With a hysteresis, the template returns from `to` to the present state when the distance of the present state
-    exceeds below + hysteresis.
+    With a hysteresis, the template returns from `to` to the first state when the distance of the first state exceeds
+    below + hysteresis.
     """
 
     to: str
@@ -41,7 +41,7 @@ class TemplateState:
     input_mapping: tuple[InputMapping, ...]
     active_constraints: tuple[ActiveConstraint, ...]  # applied in this order
     transition_distance: TransitionDistance
-    starts_at: float  # distance at which the phase typically begins, with zero progress [m] or [rad]
+    starts_at: float  # typical distance at the beginning; the phase's own progress is zero there [m] or [rad]
     ends_at: float  # distance at which the phase is complete [m] or [rad]
     weight: float = 1.0  # progress per unit of distance [1/m] or [1/rad]
     transitions: tuple[Transition, ...] = ()
@@ -158,14 +158,14 @@ class SharedControlTemplate:
     ) -> Command:
         """Return an allowed pose that is reachable in one period and close to a request.
 
-        If the projected request exceeds the largest speeds, the requested displacement is scaled down, so that the
-        orientation never lags behind the position: an orientation that depends on the position turns quickly near the
-        object. The displacement is also scaled down if one constraint undoes another. After `BACKTRACKS` attempts, the
-        last command is repeated if it is inside the constraints. Constraints that keep the end effector outside of a
-        shape are linearized at the last command, so that the line to the new command is outside too. If the last
-        command is inside the constraints, so is the new one. If the last command is outside (at the start of an
-        episode, or after an object moved), the commands move inside at the largest speed. The pose is not
-        finite if that of an object is not; callers check it.
+        If the projected request exceeds the largest speeds, the requested displacement is scaled down as a whole, so
+        that the orientation does not lag behind the position. It could lag near the object, where an orientation that
+        depends on the position turns quickly. The displacement is also scaled down if one constraint undoes another.
+        After `BACKTRACKS` attempts, the last command is repeated if it is inside the constraints. Constraints that keep
+        the end effector outside of a shape are linearized at the last command, so that the line to the new command is
+        outside too. If the last command is inside the constraints, so is the new one. If the last command is outside
+        (at the start of an episode, or after an object moved), the commands move inside at the largest speed. The pose
+        is not finite if that of an object is not; callers check it.
         """
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
@@ -266,7 +266,7 @@ class SharedControlTemplate:
 
     @cached_property
     def _initial_progress(self) -> tuple[float, ...]:
-        """Progress at the beginning of each state, summed over the states before it along first transitions; else 0."""
+        """Progress at the beginning of each state, summed along first transitions; 0 if these do not lead to it."""
         progress = [0.0] * len(self.states)
         number, visited = self.initial_state, {self.initial_state}
         while self.states[number].transitions:
@@ -285,9 +285,9 @@ class SharedControlTemplate:
         It is the progress of previous phases plus the weighted decrease of this phase's distance. The previous phases
         are those that lead to this one from the initial state by the first transition of each.
 
-        An increase of progress is d_{t−1} − d_t of equation 3.2, on one scale for all phases. Progress is continuous at
-        a transition if, there, the distance of the phase equals its `ends_at` and that of the next phase its
-        `starts_at`.
+        An increase of progress is d_{t−1} − d_t of equation 3.2, multiplied by the weight of the phase. Progress is
+        continuous at a transition if, there, the distance of the phase equals its `ends_at` and that of the next phase
+        its `starts_at`.
         """
         phase = self.states[state]
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))

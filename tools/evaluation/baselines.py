@@ -104,10 +104,10 @@ zero_policy: MakePolicy = partial(BaselinePolicy, zero)
 
 
 def digest_of(make_policy: MakePolicy) -> str | None:
-    """Return what identifies a function that makes a policy, for the names of stored files.
+    """Return an identifier of a function that makes a policy, for the names of stored files.
 
     It is the name of a baseline policy, with the seed unless that is 0. The result is None for functions other than
-    `partial(BaselinePolicy, FACTORY)`, because they may read files and variables.
+    `partial(BaselinePolicy, FACTORY)` with a factory of `BASELINES`, because they may read files and variables.
     """
     if isinstance(make_policy, partial) and make_policy.func is BaselinePolicy and {*make_policy.keywords} <= {"seed"}:
         for name, factory in BASELINES.items():
@@ -143,9 +143,9 @@ def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> Po
 
 
 def _file_hint(name: str) -> str:
-    """Return advice on how to give the file of a policy that the user seems to mean; "" without such a file."""
+    """Return advice on how to give a policy's file, if `name` ends in .py or lacks the ending of a file; else ""."""
     if name.endswith(".py"):
-        return f"give the function in a file too, as {name}:FUNCTION"
+        return f"give the file with the name of its function, as {name}:FUNCTION"
     file = next((name + ending for ending in ENDINGS if Path(name + ending).is_file()), None)
     return "" if file is None else f"to evaluate the file {file}, give its whole name"
 

@@ -142,11 +142,11 @@ def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
 
 
 def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
-    """Return the ratio of a column between two methods, of each seed and of the sums, as text by label.
+    """Return the ratio of a column between two methods, for each seed and for the sums over seeds, as text by label.
 
-    With several evaluation sets or numbers of training episodes, a seed has several rows: each of them has labels of
-    its own, which name the first method's. The result is empty if the rows of the two methods do not have the same
-    seeds in the same order.
+    With several evaluation sets or numbers of training episodes, a seed has several rows. Each row then has its own
+    labels, with the evaluation set and the number of episodes of the first method. The result is empty if the rows of
+    the two methods do not have the same seeds in the same order.
     """
     of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():

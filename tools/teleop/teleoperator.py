@@ -74,7 +74,7 @@ class MeshcatPanel(Teleoperator):
         self.set(np.zeros(len(self._sliders)))
 
     def apply_gamepad(self, period: float) -> None:
-        """Change the sliders by what the gamepad's deflection adds during `period` [s], if a gamepad is connected."""
+        """Move the sliders for `period` [s] at speeds proportional to the gamepad's deflection, if one is connected."""
         gamepad = self.meshcat.GetGamepad()
         if gamepad.index is None:
             return

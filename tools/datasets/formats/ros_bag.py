@@ -253,7 +253,7 @@ def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]
     for number, t in enumerate(times):
         if t[-1] > _MAX_TIME:
             raise InputError(
-                f"demonstration {number} ends at {t[-1]:g} s, and the time of a bag at {_MAX_TIME:g} s: "
+                f"demonstration {number} ends at {t[-1]:g} s, and the largest time of a bag is {_MAX_TIME:g} s: "
                 "subtract an offset"
             )
         stamps.append(np.rint(t / _NANO).astype(np.int64))
