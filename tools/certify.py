@@ -225,7 +225,7 @@ def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
     start = primitive.constraints.nearest(config.make_task().reference().means[0])
     within = _declared_start(config, len(start)) if start_within is None else np.full(len(start), start_within)
     if not (np.isfinite(within).all() and (within >= 0.0).all()):
-        raise InputError(f"the start offset must be finite and not negative, not {within.min()}")
+        raise InputError(f"the start offset must be finite and not negative, not {within.tolist()}")
     gains = demonstrated.null_space_gains(primitive) if has_actions else np.zeros(primitive.num_outputs)
     return CertifiedLoop(primitive, gains, demonstrated.control_period, start, within)
 

@@ -177,8 +177,10 @@ def register_end_effector(end_effector: EndEffector) -> EndEffector:
     """Add an end effector, whose name is not registered yet, to the registry and return it.
 
     Raises:
-        InputError: If the name is taken.
+        InputError: If it is no end effector, or the name is taken.
     """
+    if not isinstance(end_effector, EndEffector):
+        raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")
     return _END_EFFECTORS.register(end_effector.name, end_effector)
 
 

@@ -16,6 +16,7 @@ from guiderail.models.robots.robot import (
     end_effector_names,
     find_end_effector,
     find_robot,
+    register_end_effector,
     register_robot,
     robot_names,
 )
@@ -251,3 +252,8 @@ def test_robot_names_the_source_of_its_numbers(alone):
 def test_models_reference_no_remote_files(alone):
     text = alone.robot.model.read_text()
     assert not re.search(r"package:|https?:(?!//drake\.mit\.edu)|mesh ", text)
+
+
+def test_register_refuses_what_is_no_end_effector():
+    with pytest.raises(InputError, match="an end effector is registered as an EndEffector object, not 3"):
+        register_end_effector(3)

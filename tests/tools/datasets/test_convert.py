@@ -212,6 +212,14 @@ def test_csv_import_names_the_missing_option(header, row, asks, remedy, tmp_path
         assert outputs[0, 3] == pytest.approx(angle)
 
 
+def test_csv_import_leaves_numbered_joint_positions_out(tmp_path):
+    joints = ",".join(f"q{n}" for n in range(1, 8))
+    rows = [(0.01 * n, n, 0, 0, 0, 0, 1, *range(7)) for n in range(4)]
+    write_table(tmp_path / "a.csv", f"t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{joints}", rows)
+    import_recording(tmp_path / "a.csv", tmp_path / "a.npz")
+    assert Demonstrations.load(tmp_path / "a.npz").outputs[0][0, 3] == pytest.approx(1.0)
+
+
 def test_csv_import_refuses_a_quaternion_of_wrong_length(tmp_path):
     write_table(tmp_path / "a.csv", "t,x_m,y_m,z_m,qx,qy,qz,qw", [(0.01 * n, 0, 0, 0, 0, 0, 0, 3) for n in range(3)])
     with pytest.raises(InputError, match="length 3"):

@@ -47,7 +47,8 @@ _NO_POSE = re.compile(
 )  # column names of quantities other than a pose, such as velocity and force
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
 _EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
-_UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))  # numbered columns: the names do not state the order
+# Numbered columns, whose names do not state the order. With a fifth one they are joint positions.
+_UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
 _DELIMITERS = ",\t;| "  # accepted delimiters; the first one in the header is used, in this order
 _EMPTY = ("", "na", "n/a", "#n/a", "null", "none")  # texts of an empty field, in lower case
 _MAX_LISTED = 8  # largest number of names in a message
@@ -313,7 +314,8 @@ def _rotations(
     for names in _QUATERNION:
         if matches := _columns(file, columns, names):
             return matches, rotations_of(np.column_stack([one.values for one in matches]), str(file))
-    for names in _UNNAMED:
+    numbers = {one.plain for one in columns if re.fullmatch("q[0-9]+", one.plain)}
+    for names in _UNNAMED if len(numbers) == 4 else ():
         same = [_only(file, [one for one in columns if one.plain == name], name) for name in names]
         matches = [one for one in same if one is not None]
         if len(matches) == len(names):
