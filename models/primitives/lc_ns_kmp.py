@@ -110,6 +110,7 @@ class LcNsKmp:
         self._shared_features: WindowFeatures | None = None
         self._whole: StepFactor | None = None
         self._history_shape = (self.history, reference.num_outputs)
+        self._no_action = np.zeros(self.num_outputs)
         if self.history:
             self._features(0)  # raises an InputError if the history's variance is too small
         strength = self.lambda_, self.beta
@@ -372,8 +373,7 @@ class LcNsKmp:
 
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """Check the arguments and return x = [history, null-space action]."""
-        zero = np.zeros(self.num_outputs)
-        action = zero if null_space_action is None else as_doubles(null_space_action, "a null-space action")
+        action = self._no_action if null_space_action is None else as_doubles(null_space_action, "a null-space action")
         if action.shape != (self.num_outputs,):
             raise InputError(f"a null-space action has shape ({self.num_outputs},), not {action.shape}")
         if self.history == 0:
@@ -415,13 +415,13 @@ class LcNsKmp:
             x[:, : -self.num_outputs] = past.reshape(size, -1)
         if actions is not None:
             x[:, -self.num_outputs :] = actions
-        if not np.isfinite(np.einsum("ij,ij->i", x, x)).all():  # as in `_stack`
+        if not math.isfinite(np.vdot(x, x)):  # as in `_stack`; the sum of all squares is one reduction
             raise InputError("histories and null-space actions must be finite, also when squared")
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _checked_step(self, step: int) -> int:
         """Return a step, the last one for a step past the end; raise an `InputError` unless it is a whole number."""
-        if (number := as_whole(step, "a step")) < 0:
+        if (number := step if type(step) is int else as_whole(step, "a step")) < 0:
             raise InputError(f"step counts from 0, not {step}")
         return min(number, self.num_steps - 1)
 
