@@ -76,6 +76,16 @@ def test_guided_env_runs_without_extras():
     assert printed.strip() == "0.2 True"
 
 
+def test_learners_for_other_environments_need_neither_drake_nor_pandas():
+    """The environment with metaworld and robosuite (`make outside`) has neither."""
+    printed = run_light("""
+    sys.meta_path.pop(0)
+    from guiderail.tools.learning import fast_sb3, networks, sb3
+    print(not {"pydrake", "pandas"} & set(sys.modules))
+    """)
+    assert printed.strip() == "True"
+
+
 @pytest.mark.parametrize(
     ("code", "software", "extra"),
     [

@@ -15,7 +15,6 @@ from safetensors.numpy import save
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.run_folder import RunFolder
 
 Actor = dict[str, torch.Tensor]
 Entry = TypeVar("Entry")
@@ -135,6 +134,8 @@ def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     Raises:
         InputError: If the run has no checkpoint, or its learner is not off-policy.
     """
+    from guiderail.tools.learning.run_folder import RunFolder  # pandas, which the learners do not need
+
     file = RunFolder(Path(run)).checkpoint
     if not file.is_file():
         raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
