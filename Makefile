@@ -90,8 +90,9 @@ motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, m
 
 outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, in an environment of its own, hours (downloads 3 GB)
 	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
-	for method in kgrl residual clipped_residual tqc rlpd; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn peg --method $$method --seeds 20 21 22 23 24 --out runs/outside; done
+	for task in peg assembly; do for method in kgrl residual clipped_residual tqc rlpd; do \
+	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method $$method --seeds 20 21 22 23 24 --out runs/outside; \
+	  done; done
 	for task in peg assembly nut; do \
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
 	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 20 21 22 23 24 --out runs/outside; done
