@@ -213,6 +213,16 @@ def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
+def assert_refused(learner, words, folder, episodes):
+    """Train with a learner that is registered for the test only, and expect an `InputError`."""
+    LEARNERS.register("odd")(learner)
+    try:
+        with pytest.raises(InputError, match=words):
+            run_training(RunFolder(folder), configure("Bead", {}, algorithm="odd", episodes=episodes, seed=1))
+    finally:
+        del LEARNERS._entries["odd"]
+
+
 @pytest.mark.parametrize(
     ("columns", "policy", "words"),
     [
@@ -231,12 +241,7 @@ def test_learner_that_returns_something_else_is_named(columns, policy, words, tm
         def policy(self, description):
             return super().policy(description) if policy else None
 
-    LEARNERS.register("odd")(Odd)
-    try:
-        with pytest.raises(InputError, match=words):
-            run_training(RunFolder(tmp_path / "run"), configure("Bead", {}, algorithm="odd", episodes=2, seed=1))
-    finally:
-        del LEARNERS._entries["odd"]
+    assert_refused(Odd, words, tmp_path / "run", episodes=2)
 
 
 @pytest.mark.parametrize(
@@ -253,9 +258,4 @@ def test_state_that_cannot_be_stored_is_named(state, words, tmp_path):
         def state(self):
             return state
 
-    LEARNERS.register("odd")(Odd)
-    try:
-        with pytest.raises(InputError, match=words):
-            run_training(RunFolder(tmp_path / "run"), configure("Bead", {}, algorithm="odd", episodes=1, seed=1))
-    finally:
-        del LEARNERS._entries["odd"]
+    assert_refused(Odd, words, tmp_path / "run", episodes=1)
