@@ -138,7 +138,7 @@ def _train(
         learner.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
         if resume:
-            rows += restore_checkpoint(folder, learner, env)[0]
+            rows += restore_checkpoint(folder, config, learner, env)[0]
             learned_before = sum(row["learned_from"] for row in rows[:-1])
         while len(rows) < config.episodes:
             started = time.perf_counter()
@@ -149,7 +149,7 @@ def _train(
             rows.append(row)
             due = [
                 wait_until_learned,
-                partial(write_checkpoint, folder, rows, learner, env),
+                partial(write_checkpoint, folder, config, rows, learner, env),
                 learner.submit_episode,
                 write_step_log,
                 partial(folder.write_episodes, rows),

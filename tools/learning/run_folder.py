@@ -1,5 +1,6 @@
 """Run folder: the files of one training run, readable without the program that wrote them."""
 
+import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -49,6 +50,13 @@ class RunConfig:
     def action_repeat(self) -> int:
         """Control steps that an action lasts."""
         return int(self.environment.get("action_repeat", 1))
+
+    @property
+    def identity(self) -> str:
+        """Text of all that determines an episode; a resumed run may differ in the rest, such as `episodes`."""
+        # Via points are added during a supervised run.
+        environment = {name: value for name, value in self.environment.items() if name != "via_points"}
+        return json.dumps([self.task, self.seed, environment, config_values(self.learner)], sort_keys=True)
 
     def refuse_changed_task(self, path: Path, otherwise: str = "train again in another folder") -> None:
         """Raise an InputError if the task's files have changed since the run in the folder `path` began.

@@ -168,7 +168,7 @@ def _train(
 ) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if resume:
-        rows, num_written = restore_checkpoint(folder, learner, env)
+        rows, num_written = restore_checkpoint(folder, config, learner, env)
         remove_step_logs(folder.steps, config.episodes)
         if num_written < len(rows):
             folder.write_episodes(rows)  # the loop below does not write the table of a complete run
@@ -213,7 +213,7 @@ def _train(
         is_last = episode + 1 == config.episodes or (sb3_callbacks is not None and sb3_callbacks.is_stopped)
         if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode == 0 or is_last:
             started = time.perf_counter()
-            _save(folder, rows, learner, env, supervised)
+            _save(folder, config, rows, learner, env, supervised)
             last_saving_time = time.perf_counter() - started
             saving_time += last_saving_time
         learner.submit_episode()
@@ -245,19 +245,29 @@ def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored
 
 
 def _save(
-    folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, supervised: SupervisedTraining | None
+    folder: RunFolder,
+    config: RunConfig,
+    rows: list[dict[str, Any]],
+    learner: Learner,
+    env: Any,
+    supervised: SupervisedTraining | None,
 ) -> None:
     """Write the checkpoint, which holds the table too, and then the table: a kill between the two loses nothing."""
-    write_checkpoint(folder, rows, learner, env, {} if supervised is None else supervised.state())
+    write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())
     if supervised is not None:
         folder.write_config(supervised.config)
     folder.write_episodes(rows)
 
 
 def write_checkpoint(
-    folder: RunFolder, rows: list[dict[str, Any]], learner: Learner, env: Any, more: Mapping[str, Any] | None = None
+    folder: RunFolder,
+    config: RunConfig,
+    rows: list[dict[str, Any]],
+    learner: Learner,
+    env: Any,
+    more: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write the checkpoint: the episodes' rows, the states of learner and environment, and `more`.
+    """Write the checkpoint: the run's identity, the episodes' rows, the states of learner and environment, and `more`.
 
     Raises:
         InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold.
@@ -273,11 +283,18 @@ def write_checkpoint(
         json.dumps(values)
     except (TypeError, ValueError) as error:
         raise InputError(f"the values of {type(learner).__name__}.state must be values of JSON: {error}") from error
-    stored = {"rows": rows, "learner": values, "environment": env.unwrapped.np_random.bit_generator.state}
+    stored = {
+        "run": config.identity,
+        "rows": rows,
+        "learner": values,
+        "environment": env.unwrapped.np_random.bit_generator.state,
+    }
     save_checkpoint(folder.checkpoint, arrays, stored | dict(more or {}))
 
 
-def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[list[dict[str, Any]], int]:
+def restore_checkpoint(
+    folder: RunFolder, config: RunConfig, learner: Learner, env: Any
+) -> tuple[list[dict[str, Any]], int]:
     """Restore learner and environment from the checkpoint.
 
     Returns:
@@ -285,14 +302,19 @@ def restore_checkpoint(folder: RunFolder, learner: Learner, env: Any) -> tuple[l
         between writing the two files. Without both files, there are no rows.
 
     Raises:
-        InputError: If the checkpoint is missing or damaged, its rows differ from `episodes.csv`, or its state is that
-            of another learner.
+        InputError: If the checkpoint is missing or damaged, its run had another task, seed, environment or learner
+            than `config`, its rows differ from `episodes.csv`, or its state is that of another learner.
     """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():
         return [], 0  # the run was killed in its first episode
     arrays, values = load_checkpoint(folder.checkpoint)
     try:
+        if values["run"] != config.identity:
+            raise InputError(
+                f"{folder.path / 'config.yaml'} has another task, seed, environment or learner than its checkpoint: "
+                "restore it, or train again in another folder"
+            )
         rows = values["rows"]
         written: Sequence[Mapping[str, Any]] | Any = folder.episodes() if table.exists() else []
         if table_text(written) != table_text(rows[: len(written)]):

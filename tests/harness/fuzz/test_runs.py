@@ -222,7 +222,12 @@ def resumable(folder):
     )
     arrays, values = learner.state()
     arrays = {key: array.copy() for key, array in arrays.items()}
-    values = {"rows": ROWS, "learner": values, "environment": env.np_random.bit_generator.state}
+    values = {
+        "run": CONFIGS[0].identity,
+        "rows": ROWS,
+        "learner": values,
+        "environment": env.np_random.bit_generator.state,
+    }
     return env, learner, arrays, json.loads(json.dumps(values))
 
 
@@ -253,7 +258,9 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
     tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
     save_checkpoint(folder.checkpoint, changed, tree)
     folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
-    resumed = attempt("checkpoint, other content", InputError, lambda: restore_checkpoint(folder, learner, env))
+    resumed = attempt(
+        "checkpoint, other content", InputError, lambda: restore_checkpoint(folder, CONFIGS[0], learner, env)
+    )
     if resumed is not None:
         rows, _ = resumed
         assert rows == tree["rows"]
@@ -272,4 +279,4 @@ def test_negative_number_in_a_generators_state_is_refused(folder, resumable):
     save_checkpoint(folder.checkpoint, arrays, tree)
     folder.write_episodes(ROWS)
     with pytest.raises(InputError, match="belongs to other settings"):
-        restore_checkpoint(folder, learner, env)
+        restore_checkpoint(folder, CONFIGS[0], learner, env)

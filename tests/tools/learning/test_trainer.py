@@ -343,6 +343,17 @@ def test_resume_refuses_other_settings(bead_config, tmp_path):
         start_or_resume(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
 
 
+@pytest.mark.parametrize(("old", "new"), [("seed: 5", "seed: 6"), ("batch_size: 16", "batch_size: 8")])
+def test_resume_refuses_an_edited_configuration(old, new, bead_config, tmp_path):
+    folder = RunFolder(tmp_path)
+    run_training(folder, bead_config)
+    file = tmp_path / "config.yaml"
+    assert old in file.read_text()
+    file.write_text(file.read_text().replace(old, new))
+    with pytest.raises(InputError, match="another task, seed, environment or learner than its checkpoint"):
+        run_training(folder, folder.config(), resume=True)
+
+
 def test_resume_refuses_too_many_episodes(bead_config, tmp_path):
     RunFolder(tmp_path).write_config(bead_config)
     with pytest.raises(InputError, match="at most 1000000000 episodes"):
