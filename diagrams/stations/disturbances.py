@@ -14,7 +14,6 @@ from pydrake.systems.primitives import Adder, ConstantVectorSource
 from guiderail.diagrams.stations.options import SENSING, Disturbances, SensorErrors
 from guiderail.diagrams.stations.station import (
     OUTPUTS,
-    PLANT_PERIOD,
     Impedance,
     Station,
     export_station_ports,
@@ -251,11 +250,10 @@ def _disturbed_period(d: Disturbances, station: Station) -> float:
     if d.clock_factor == 1.0:
         return station.control_period
     period = d.clock_factor * station.control_period
-    step = station.plant.time_step() or PLANT_PERIOD  # the plant is continuous if another engine simulates
     try:
-        return whole_multiple(period, step)
+        return whole_multiple(period, station.time_step)
     except InputError:
         raise InputError(
             f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
-            f"plant's {step:g} s"
+            f"plant's {station.time_step:g} s"
         ) from None

@@ -233,6 +233,7 @@ class MujocoStation(Station):
         inertia = moved.workpiece.CalcSpatialInertiaInBodyFrame(plant.CreateDefaultContext())
         surfaces = workcell.fixture_surfaces(), workcell.workpiece_surfaces()
         model = mujoco_model(*surfaces, inertia, impedance, contact, time_step)
+        self._time_step = time_step
         self.gantry = gantry = MujocoGantry(model, plant, moved, workcell.X_WT, time_step, wrench_time_constant)
         add_system(builder, "gantry", gantry, nominal_body_poses=plant.get_body_poses_output_port())
         desired_pose = add_joint_impedance(
@@ -254,6 +255,11 @@ class MujocoStation(Station):
         builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
         builder.ExportOutput(gantry.get_body_poses_output_port(), "body_poses")
         builder.BuildInto(self)
+
+    @property
+    def time_step(self) -> float:
+        """Period of inputs and outputs, of which the control period is a multiple [s]."""
+        return self._time_step
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the tool at rest at `pose`, (6,); `context` is the root context."""

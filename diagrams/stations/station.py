@@ -167,6 +167,11 @@ class Station(Diagram):
     wraps_angles: bool = False
 
     @property
+    def time_step(self) -> float:
+        """Time step of the simulation, of which the control period is a multiple [s]."""
+        return float(self.plant.time_step())
+
+    @property
     def nominal_period(self) -> float:
         """Time between commands with an undisturbed clock [s]."""
         return self.control_period

@@ -105,7 +105,7 @@ def is_task_folder(name: str | Path) -> bool:
     """Return True if `name` is the path of a folder that `guiderail create-task` made."""
     try:
         return (Path(name) / "task.yaml").is_file()
-    except OSError:  # the file system refuses the path, as for a name that is too long
+    except (OSError, TypeError):  # no path, or the file system refuses it, as a name that is too long
         return False
 
 

@@ -47,7 +47,7 @@ def episodes_file(
 ) -> Path:
     """Return the path of the file for a policy's evaluated episodes; its name is `name` and a digest.
 
-    The digest covers the options of the environment, the run's seed, the task's files, package versions, and the
+    The digest covers the task with its files, the options of the environment, the run's seed, package versions, and the
     arguments `how` of `evaluate_policy` except `label` and `processes`. `about` is anything else that the episodes
     depend on, such as the digest of the policy.
 
@@ -60,8 +60,8 @@ def episodes_file(
         )
     how = {key: value for key, value in how.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
-    more = [*([] if about is None else [about]), *filter(None, [content])]
-    key = json.dumps([environment, how, config.seed, installed_versions(), *more], sort_keys=True, default=str)
+    parts = [config.task, environment, how, config.seed, installed_versions(), about, content]
+    key = json.dumps(parts, sort_keys=True, default=str)
     return folder / f"{name}-{hashlib.blake2b(key.encode(), digest_size=6).hexdigest()}.csv"
 
 

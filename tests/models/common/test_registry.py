@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
+import guiderail
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
@@ -18,6 +19,12 @@ def test_name_must_be_a_string(name):
     shapes.register("sphere", object())
     with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
         shapes.get(name)
+
+
+@pytest.mark.parametrize("task", [5, None, ["NarrowPassage"]])
+def test_task_of_an_environment_must_be_a_string(task):
+    with pytest.raises(InputError, match="a task is named by a word"):
+        guiderail.make_env(task)
 
 
 @pytest.mark.parametrize("name", [object, "", 3, None])

@@ -151,6 +151,8 @@ def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
         return kept, digest(job), digest(job, job.study.eval_sets[0])
 
     before = files()
+    other = replace(config, task="NarrowPassage")
+    assert episodes_file(tmp_path, "uniform_random", other, config.environment, episodes=2).name != before[0].name
     (folder / "task.yaml").write_text(yaml.safe_dump(TASK | {"measured": {"clearance": 1}}))
     assert files() == before, "nothing reads what was measured"
     (folder / "part.obj").write_text(CHANGES["part.obj"])
