@@ -16,8 +16,8 @@ class ReferenceGovernor(LeafSystem):
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
     with measured pose x and velocity v, stiffness K and damping D of the six coordinates, and time step h. The spring
-    accelerates the mass m to at most F / √(k m), with force bound F and contact stiffness k (see `slow_down`). A pose
-    that needs no limiting is output unchanged up to rounding.
+    accelerates the mass m to at most F / (2 √(k m)), with force bound F and contact stiffness k (see `slow_down`).
+    A pose that needs no limiting is output unchanged up to rounding.
 
     .. pydrake_system::
 

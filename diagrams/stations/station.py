@@ -70,7 +70,8 @@ COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; tw
 
 # Force limits along x, y and z as fractions of the limit of the norm. The norm of the three fractions is below 1.
 FORCE_SHARES = (0.45, 0.45, 0.75)
-CONTACT_STIFFNESS = 1e5  # stiffness of workpiece, grasp and fixture in series during an impact [N/m]
+# Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m].
+CONTACT_STIFFNESS = 2.5e4
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class Impedance:
         """Return the same impedance, bounded so that the norm of its force is below `force` [N].
 
         No entry of `limits` is raised. `FORCE_SHARES` favors z, the direction of insertion. The approach speed is
-        limited for contacts of `CONTACT_STIFFNESS`.
+        limited for contacts of at most `CONTACT_STIFFNESS`.
         """
         limits = np.array(self.limits)
         limits[:3] = np.minimum(limits[:3], force * np.array(FORCE_SHARES))

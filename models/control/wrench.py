@@ -32,7 +32,8 @@ class WrenchBound:
     axes: np.ndarray  # limits (6,) along and about the axes [N, Nm], not negative
     force: float  # limit of the norm of the force [N], not negative
     torque: float  # limit of the norm of the torque [Nm], not negative
-    # Stiffness of workpiece, grasp and fixture in an impact [N/m], not negative. 0: the approach speed is not limited.
+    # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m], not
+    # negative. 0: the approach speed is not limited.
     contact_stiffness: float = 0.0
 
     def __post_init__(self) -> None:
@@ -103,12 +104,12 @@ def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: floa
 def slow_down(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, impedance: float, force: float
 ) -> np.ndarray:
-    """Limit a spring's force (3,) to F − (√(k m) − d) |v|, so that it accelerates the mass m to at most F / √(k m).
+    """Limit a spring's force (3,) to F − (c − d) |v|, so that it accelerates the mass to at most F / c.
 
-    d = vᵀ D v / |v|² is the damping in the direction of motion; √(k m) is the `approach_impedance`. Only a force
+    d = vᵀ D v / |v|² is the damping in the direction of motion; c = 2 √(k m) is the `approach_impedance`. Only a force
     that does positive work is reduced, so that no energy is added: on the way to its rest position, the spring returns
     at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s],
-    `impedance` is √(k m) [N s/m], and `force` is F [N].
+    `impedance` is c [N s/m], and `force` is F [N].
     """
     speed = norm(velocity)
     if speed == 0.0 or spring.dot(velocity) <= 0.0:
@@ -119,8 +120,12 @@ def slow_down(
 
 
 def approach_impedance(contact_stiffness: float, mass: float) -> float:
-    """Return √(k m) [N s/m]: a mass m [kg] at speed v hits a stiffness k [N/m] with the peak force v √(k m)."""
-    return math.sqrt(contact_stiffness * mass)
+    """Return c = 2 √(k m) [N s/m], the critical damping of a mass m [kg] in contact with a stiffness k [N/m].
+
+    A mass that is pushed with F − c |v| reaches at most the speed F / c, and presses a stiffness of at most k with at
+    most F, because it does not overshoot. With c = √(k m), half as much, it would press with 1.3 F.
+    """
+    return 2.0 * math.sqrt(contact_stiffness * mass)
 
 
 def bounded_wrench(

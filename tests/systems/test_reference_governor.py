@@ -8,7 +8,7 @@ from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems import ReferenceGovernor
 
 STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]
-BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 1e5)  # [x y z Rx Ry Rz]
+BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 2.5e4)  # [x y z Rx Ry Rz]
 
 
 REST = np.zeros(6)

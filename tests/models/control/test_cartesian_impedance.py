@@ -167,7 +167,7 @@ def test_rotated_axes_give_the_rotated_law(seed):
     assert turned.is_saturated == straight.is_saturated
 
 
-STIFF = {"contact_stiffness": 1e5}
+STIFF = {"contact_stiffness": 2.5e4}
 BOUNDS = {
     "wide": WrenchBound(np.full(6, 1e6), 1e6, 1e6),
     "narrow": WrenchBound(np.array([4.0, 5.0, 6.0, 0.4, 0.5, 0.6]), 6.0, 0.7),
