@@ -30,7 +30,9 @@ class PoseMotionLimiter(LeafSystem):
     Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
     (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
     the limits. A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the
-    output comes to rest at the last valid one. A measured pose that is not finite is ignored: the last output is kept.
+    output comes to rest at the last valid one. While the desired pose is so far away that no trajectory to it can be
+    computed, such as 10 km, the motion is braked to rest. A measured pose that is not finite is ignored: the last
+    output is kept.
 
     .. pydrake_system::
 
@@ -120,7 +122,8 @@ def _plan(motion: InputParameter) -> Trajectory:
             # Constructed on every call: an instance stored in a system would be reported as leaked when Python exits.
             if Ruckig(6).calculate(motion, trajectory) in (Result.Working, Result.Finished):
                 return trajectory
-        except RuckigError:
+        except (RuckigError, ValueError):
+            # A ValueError: the bindings have no name for the result of a motion that would take too long (-101).
             continue
     raise InputError(f"no trajectory from {motion.current_position} is within the limits of the motion")
 

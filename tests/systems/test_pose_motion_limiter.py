@@ -175,6 +175,20 @@ def test_motion_continues_when_axes_cannot_be_synchronized(fails, monkeypatch):
         assert_close(poses[-1], desired, 1e-9)
 
 
+@pytest.mark.parametrize("distance", [1e4, -1e6])
+def test_motion_is_braked_when_the_desired_pose_is_too_far_away(distance):
+    """For example a command in micrometers instead of meters."""
+    loop = Loop()
+    loop.set(START + [0.1, 0.0, 0.0, 0.2, 0.0, 0.0])
+    moving = loop.run(40)
+    loop.set(START + [distance, 0.0, 0.0, 0.0, 0.0, 0.0])
+    poses = np.vstack([moving, loop.run(200)])
+    assert (np.array(derivatives(poses)) <= np.array([LIMITS.linear, LIMITS.angular]) * (1 + 1e-9)).all()
+    assert_close(poses[-1], poses[-2], 1e-12)  # at rest
+    loop.set(START)
+    assert_close(loop.run(400)[-1], START, 1e-9)
+
+
 def test_orientation_stays_continuous_across_half_a_turn_of_an_angle():
     loop = Loop()
     loop.set(START + [0, 0, 0, 0, 0, 0.4])  # Rx passes π
