@@ -13,6 +13,7 @@ from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.support.last_valid_bound import LastValidBound
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
 MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; above it, wrenches could overflow
@@ -92,6 +93,7 @@ class CartesianImpedanceController(LeafSystem):
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
     is not connected, commands never time out. ``max_wrench`` is (8,), limits of [fx fy fz tx ty tz] along the axes of
     the gains, of the norm of the force and of the norm of the torque [N, Nm]; it lowers the bound and cannot raise it.
+    While one of its numbers is NaN or negative, the last valid one remains in force (`LastValidBound`).
     ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T.
     ``saturation`` (1,) is 1 while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid
     command is available.
@@ -143,7 +145,9 @@ class CartesianImpedanceController(LeafSystem):
         self._plant_context = declare.plant_context(
             self, plant, self._estimated_state_port.Eval, [self._estimated_state_port]
         )
-        sources = [*self._followed_pose.tickets, self._estimated_state_port, self._max_wrench_port]
+        bound = gains.bound or WrenchBound(gains.wrench_limits, np.inf, np.inf)
+        self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
+        sources = [*self._followed_pose.tickets, self._estimated_state_port, *self._requested_bound.sources]
         self._law = declare.cache(self, "law", self._calc_law, sources)
         self._generalized_force_port = declare.part_output(
             self, "generalized_force", self._law, lambda law: law.torque, num_joints
@@ -203,7 +207,4 @@ class CartesianImpedanceController(LeafSystem):
         )
 
     def _bound(self, context: Context) -> WrenchBound | None:
-        if not self._max_wrench_port.HasValue(context):
-            return self._gains.bound
-        bound = self._gains.bound or WrenchBound(self._gains.wrench_limits, np.inf, np.inf)
-        return bound.lowered_to(self._max_wrench_port.Eval(context))
+        return self._requested_bound.eval(context) if self._max_wrench_port.HasValue(context) else self._gains.bound

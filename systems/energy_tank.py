@@ -18,6 +18,7 @@ from guiderail.models.control.wrench import (
 )
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.last_valid_bound import LastValidBound
 
 
 class _Admitted(NamedTuple):
@@ -55,8 +56,9 @@ class EnergyTank(LeafSystem):
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
     desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite, reference
     and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,), limits of
-    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm].
-    ``energy`` is (1,), the content [J].
+    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. While a number of
+    ``max_wrench`` is NaN or negative, the last valid one remains in force (`LastValidBound`). ``energy`` is (1,), the
+    content [J].
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
@@ -78,7 +80,7 @@ class EnergyTank(LeafSystem):
             raise InputError(f"an energy tank's capacity must be positive and finite, not {capacity} J")
         if not is_finite(bound.axes):
             raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
-        self._bound, self._capacity, self._period = bound, capacity, period
+        self._capacity, self._period = capacity, period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
@@ -86,7 +88,8 @@ class EnergyTank(LeafSystem):
         self._last_limits = self.DeclareDiscreteState(POSE_SIZE)
         self._last_pose = self.DeclareDiscreteState(POSE_SIZE)
         self._content = self.DeclareDiscreteState([capacity])
-        inputs = (self._desired_pose_port, self._pose_port, self._max_wrench_port)
+        self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
+        inputs = (self._desired_pose_port, self._pose_port, *self._requested_bound.sources)
         states = (self._last_reference, self._last_limits, self._last_pose, self._content)
         self._admitted = declare.cache(self, "admitted", self._calc_admitted, [*inputs, *states])
         self._reference_pose_port = declare.output(
@@ -105,11 +108,6 @@ class EnergyTank(LeafSystem):
     get_admitted_wrench_output_port = output_getter("admitted_wrench", "bound that the tank admits, (8,)")
     get_energy_output_port = output_getter("energy", "energy in the tank, (1,) [J]")
 
-    def _requested_bound(self, context: Context) -> WrenchBound:
-        if not self._max_wrench_port.HasValue(context):
-            return self._bound
-        return self._bound.lowered_to(self._max_wrench_port.Eval(context))
-
     def _calc_admitted(self, context: Context) -> _Admitted:
         pose, desired = self._pose_port.Eval(context), self._desired_pose_port.Eval(context)
         states = context.get_discrete_state()
@@ -117,7 +115,7 @@ class EnergyTank(LeafSystem):
         last_pose, content = states.value(self._last_pose), states.value(self._content).item()
         if not is_finite(desired):
             desired = reference
-        requested = self._requested_bound(context).in_pose_order.axes
+        requested = self._requested_bound.eval(context).in_pose_order.axes
         limits, K = np.minimum(last_limits, requested), self._stiffness
         if not is_finite(pose):  # NaN would fill the tank and remain in its state
             return _Admitted(reference, limits, content)
@@ -141,14 +139,14 @@ class EnergyTank(LeafSystem):
         return self._admitted.Eval(context).reference if is_finite(desired) else desired
 
     def _admitted_wrench(self, context: Context) -> list[float]:
-        bound = self._requested_bound(context)
+        bound = self._requested_bound.eval(context)
         limits = self._admitted.Eval(context).limits.tolist()
         return [*(limits[i] for i in POSE_ORDER), bound.force, bound.torque]
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)
         discrete_state.set_value(self._last_reference, pose)
-        discrete_state.set_value(self._last_limits, self._requested_bound(context).in_pose_order.axes)
+        discrete_state.set_value(self._last_limits, self._requested_bound.eval(context).in_pose_order.axes)
         discrete_state.set_value(self._last_pose, pose)
         discrete_state.set_value(self._content, [self._capacity])
 

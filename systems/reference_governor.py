@@ -31,7 +31,8 @@ class ReferenceGovernor(LeafSystem):
 
     ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
     measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), the limits of [fx fy fz tx ty tz], of the norm
-    of the force and of the norm of the torque [N, Nm]; it can lower the bound but not raise it.
+    of the force and of the norm of the torque [N, Nm]; it can lower the bound but not raise it. NaN and negative
+    numbers count as 0: the spring exerts no force, and the damper, which belongs to the plant, remains.
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.

@@ -231,6 +231,16 @@ def test_requested_bound_lowers_the_configured_one():
     without.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.1))
 
 
+@pytest.mark.parametrize("invalid", [np.nan, -1.0])
+def test_damping_remains_when_the_requested_bound_is_invalid(invalid):
+    law, numbers = Law(), np.full(8, 2.0)
+    law.fix(max_wrench=numbers)
+    Simulator(law.system, law.context).Initialize()
+    law.fix(max_wrench=np.full(8, invalid))
+    law.context.SetDiscreteState(law.system.EvalUniquePeriodicDiscreteUpdate(law.context))
+    law.check(bound=WrenchBound(numbers[:6], 2.0, 2.0))
+
+
 @pytest.mark.parametrize(
     ("age", "timeout", "command_timed_out"),
     [(0.1, {}, 0.0), (0.10005, {}, 1.0), (0.2, {"timeout": 0.2}, 0.0), (0.2001, {"timeout": 0.2}, 1.0)],

@@ -137,6 +137,20 @@ def test_bound_is_constant_without_an_input():
     np.testing.assert_array_equal(system.get_admitted_wrench_output_port().Eval(context), BOUND.numbers)
 
 
+@pytest.mark.parametrize("invalid", [np.nan, -1.0, -np.inf])
+def test_last_valid_limit_remains_in_force_when_one_is_invalid(invalid):
+    tank, zero, low = Tank(), np.zeros(6), 0.5 * BOUND.numbers
+    tank.step(zero, zero, low)
+    for _ in range(3):
+        np.testing.assert_array_equal(tank.step(zero, zero, np.full(8, invalid))[1], low)
+    mixed = np.r_[1.0, np.full(7, invalid)]
+    np.testing.assert_array_equal(tank.step(zero, zero, mixed)[1], np.r_[1.0, low[1:]])
+    np.testing.assert_array_equal(tank.step(zero, zero, np.zeros(8))[1], np.zeros(8))  # 0 is valid
+    tank.put(zero, zero, np.full(8, invalid))
+    Simulator(tank.system, tank.context).Initialize()
+    np.testing.assert_array_equal(tank.step(zero, zero, np.full(8, invalid))[1], np.zeros(8))
+
+
 def test_motion_refills_the_tank_up_to_its_capacity():
     tank = Tank(0.02)
     _, _, low = tank.step(np.r_[0.005, np.zeros(5)], np.zeros(6), BOUND.numbers)

@@ -1,0 +1,54 @@
+"""Bound of an impedance's wrench that is lowered at run time."""
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
+
+from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
+from guiderail.systems.support import declarations as declare
+
+
+class LastValidBound:
+    """Configured bound of a wrench, lowered to the numbers at an optional input port.
+
+    While a number at the port is NaN or negative, the last valid one remains in force, before the first one 0. It does
+    not count as 0: with a bound of 0 there is no damping either, and a moving arm would coast. The last valid numbers
+    are a discrete state, updated by a periodic event.
+
+    Args:
+        system: System under construction, in which a state and two events are declared.
+        bound: Configured bound.
+        max_wrench: Input port of the numbers, (8,) [N, Nm]; if it is not connected, the configured bound is in force.
+        period: Period at which the numbers are stored [s], positive.
+
+    Attributes:
+        sources: Values that `eval` depends on.
+
+    Raises:
+        InputError: If the period is out of range.
+    """
+
+    def __init__(self, system: LeafSystem, bound: WrenchBound, max_wrench: InputPort, *, period: float):
+        self._bound, self._max_wrench = bound, max_wrench
+        self._last = system.DeclareDiscreteState(MAX_WRENCH_SIZE)
+        self.sources: list[declare.Source] = [max_wrench, self._last]
+        declare.update(system, period, self._update, self._reset)
+
+    def eval(self, context: Context) -> WrenchBound:
+        """Return the bound in force; `context` is the system's."""
+        if not self._max_wrench.HasValue(context):
+            return self._bound
+        return self._bound.lowered_to(self._numbers(context, context.get_discrete_state().value(self._last)))
+
+    def _numbers(self, context: Context, last: np.ndarray) -> np.ndarray:
+        numbers = self._max_wrench.Eval(context)
+        is_valid = numbers >= 0.0  # False for NaN
+        return numbers if is_valid.all() else np.where(is_valid, numbers, last)
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._max_wrench.HasValue(context):
+            discrete_state.set_value(self._last, self._numbers(context, np.zeros(MAX_WRENCH_SIZE)))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._max_wrench.HasValue(context):
+            last = context.get_discrete_state().value(self._last)
+            discrete_state.set_value(self._last, self._numbers(context, last))
