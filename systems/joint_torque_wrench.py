@@ -10,6 +10,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
+MAX_TORQUE = 1e4  # torque to which samples are clipped [Nm]; no arm of this size has such a torque
+
 
 class JointTorqueWrench(LeafSystem):
     """Estimate the wrench of the environment on a tool from external joint torques, low-pass filtered.
@@ -32,7 +34,8 @@ class JointTorqueWrench(LeafSystem):
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,). ``wrench`` is (6,), at the tool center P in the axes of
     T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without direct feedthrough: one sample old, and zero in a
     default context. The first sample initializes the filter, because a filter that starts at zero would not have
-    reached the sensors' bias when it is tared. Samples that are not finite are skipped.
+    reached the sensors' bias when it is tared. Samples that are not finite are skipped, and torques are clipped to
+    `MAX_TORQUE`, so that the filter forgets a single false sample of any size within a few time constants.
 
     Args:
         plant: Model of the arm alone, finalized.
@@ -86,7 +89,7 @@ class JointTorqueWrench(LeafSystem):
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), target, target
         )
         # [torque, force], as the Jacobian's rows are [rotational, translational]
-        F = np.linalg.solve(J @ J.T + self._damping, J @ external_torque)
+        F = np.linalg.solve(J @ J.T + self._damping, J @ np.clip(external_torque, -MAX_TORQUE, MAX_TORQUE))
         newest = np.concatenate([F[3:], F[:3]])
         if context.get_discrete_state().value(self._has_sample)[0]:
             last = context.get_discrete_state().value(self._state)

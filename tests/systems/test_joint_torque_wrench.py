@@ -83,3 +83,20 @@ def test_sample_is_skipped_when_it_is_not_finite(arm, port):
     simulator.AdvanceTo(1.0)
     assert np.isfinite(system.get_wrench_output_port().Eval(context)).all()
     assert np.linalg.norm(system.get_wrench_output_port().Eval(context) - before) > 0.1
+
+
+@pytest.mark.parametrize("size", [1e5, 1e150, 1e308])
+def test_filter_forgets_a_false_sample_of_any_size(arm, size):
+    plant, model = arm
+    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.005, time_constant=0.02)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_positions_input_port().FixValue(context, READY_POSTURE)
+    torque = system.get_external_torque_input_port().FixValue(context, np.zeros(7))
+    simulator.AdvanceTo(0.012)
+    torque.GetMutableData().set_value(np.full(7, -size))
+    simulator.AdvanceTo(0.017)
+    assert np.linalg.norm(system.get_wrench_output_port().Eval(context)) > 1e3
+    torque.GetMutableData().set_value(np.zeros(7))
+    simulator.AdvanceTo(0.217)
+    assert np.linalg.norm(system.get_wrench_output_port().Eval(context)) < 10.0
