@@ -154,6 +154,7 @@ class DemonstrationRecorder:
     """Session in which an operator moves a station and records demonstrations.
 
     Attributes:
+        out: File of the demonstrations.
         demonstrations: Times (N,) [s] and commanded poses (N, 6) [m, rad] of each kept demonstration.
         successes: Success of each demonstration; None if the task does not define it by the pose.
         start: Pose at the start of a demonstration, (6,) [m, rad].
@@ -194,6 +195,7 @@ class DemonstrationRecorder:
         self._period = self.station.control_period
         self._pristine = self.simulator.get_context().Clone()
         self._is_slow = False
+        self._written: tuple[int, int] | None = None  # version of the file that this session has written
         view = set_camera(meshcat, self.task)
         self._gauge = None if view is None else ForceGauge(meshcat, view, self.task.collision.above)
         self.panel = MeshcatPanel(meshcat, SLIDERS, BUTTONS)
@@ -271,6 +273,9 @@ class DemonstrationRecorder:
     def keep(self) -> str:
         """Keep the demonstration, and write all demonstrations.
 
+        A file that this session has not written is not replaced: the demonstrations are written to a new file next to
+        it, which becomes `out`.
+
         Returns:
             A sentence on the demonstration.
 
@@ -282,13 +287,15 @@ class DemonstrationRecorder:
             raise InputError("nothing was shown yet: move the sliders or press the keys first")
         is_success = self.is_success()
         demonstrations = [*self.demonstrations, (self._period * np.arange(len(commands)), commands)]
-        _to_demonstrations(demonstrations).save(self.out)
-        self.demonstrations = demonstrations
+        out = self._unused_path()
+        _to_demonstrations(demonstrations).save(out)
+        note = "" if out == self.out else f", because another program has written {self.out}"
+        self.out, self._written, self.demonstrations = out, _file_version(out), demonstrations
         self.successes.append(is_success)
         end = {None: "", True: ", at the target", False: ", NOT at the target"}[is_success]
         duration = (self.steps - 1) * self._period
         lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s after rests were shortened"
-        return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {self.out}"
+        return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {self.out}{note}"
 
     def is_success(self) -> bool | None:
         """Return True if the workpiece is at its target; None if the task does not define success by its pose."""
@@ -330,6 +337,14 @@ class DemonstrationRecorder:
             "highest": bounds.upper[0].round(5).tolist(),
             "the mean alone succeeds": self.is_success(),
         }
+
+    def _unused_path(self) -> Path:
+        """Return `out`, or the path of a new file next to it if there is a file that this session has not written."""
+        path, number = self.out, 1
+        while (version := _file_version(path)) is not None and (path != self.out or version != self._written):
+            number += 1
+            path = self.out.with_stem(f"{self.out.stem}_{number}")
+        return path
 
     def _fix_command(self) -> None:
         port = self.simulator.get_system().GetInputPort("desired_pose")
@@ -377,6 +392,15 @@ class DemonstrationRecorder:
             self.panel.meshcat.SetLine(f"/guiderail/learned/{number}", points, 3.0 if number == 0 else 1.0, color)
 
 
+def _file_version(path: Path) -> tuple[int, int] | None:
+    """Return numbers that change when any program writes the file (time [ns] and size); None if there is no file."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
+
+
 def _to_demonstrations(recorded: list[tuple[np.ndarray, np.ndarray]]) -> Demonstrations:
     return Demonstrations([times for times, _ in recorded], [outputs for _, outputs in recorded], POSE_NAMES)
 
@@ -408,7 +432,7 @@ def record_demonstrations(
         log("ended")
     if not recorder.demonstrations:
         raise InputError("nothing was kept: press Enter at the end of each demonstration")
-    return {"out": str(out), **recorder.summarize()}
+    return {"out": str(recorder.out), **recorder.summarize()}
 
 
 class LiveView(EnvCallback):

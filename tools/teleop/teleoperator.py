@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -41,12 +42,16 @@ class Slider:
 
 
 class MeshcatPanel(Teleoperator):
-    """Sliders and buttons of a Meshcat page, each with keys; a gamepad moves the sliders."""
+    """Sliders and buttons of a Meshcat page, each with keys; a gamepad moves the sliders.
+
+    A value of a slider that is not finite is ignored: the slider returns to its last finite value.
+    """
 
     def __init__(self, meshcat: Any, sliders: Mapping[str, Slider], buttons: Mapping[str, str]):
         """Add sliders, and buttons with their keys, to a page."""
         self.meshcat = meshcat
         self._sliders: dict[str, Slider] = {}
+        self._values: dict[str, float] = {}  # last finite value of each slider
         self._clicks: dict[str, int] = {}
         for name, slider in sliders.items():
             self.add_slider(name, slider)
@@ -56,13 +61,21 @@ class MeshcatPanel(Teleoperator):
     def add_slider(self, name: str, slider: Slider) -> None:
         """Add a slider at zero; an existing slider is left as it is."""
         if name not in self._sliders:
-            self._sliders[name] = slider
+            self._sliders[name], self._values[name] = slider, 0.0
             self.meshcat.AddSlider(name, -slider.limit, slider.limit, slider.step, 0.0, *slider.keys)
 
     def read(self) -> np.ndarray:
         """Return the sliders' values in the units of the inputs, (n,)."""
         scales = np.array([slider.scale for slider in self._sliders.values()])
-        return scales * [self.meshcat.GetSliderValue(name) for name in self._sliders]
+        return scales * [self._value(name) for name in self._sliders]
+
+    def _value(self, name: str) -> float:
+        value = float(self.meshcat.GetSliderValue(name))
+        if math.isfinite(value):
+            self._values[name] = value
+        else:
+            self.meshcat.SetSliderValue(name, self._values[name])
+        return self._values[name]
 
     def set(self, values: np.ndarray | Sequence[float]) -> None:
         """Set the sliders to values in the units of the inputs, (n,)."""
@@ -81,7 +94,7 @@ class MeshcatPanel(Teleoperator):
         for (axis, sign), (name, slider) in zip(GAMEPAD_AXES, self._sliders.items(), strict=False):
             deflection = gamepad.axes[axis] if axis < len(gamepad.axes) else 0.0
             if slider.speed and abs(deflection) > DEAD_ZONE:
-                value = self.meshcat.GetSliderValue(name) + sign * deflection * slider.speed * period
+                value = self._value(name) + sign * deflection * slider.speed * period
                 self.meshcat.SetSliderValue(name, float(np.clip(value, -slider.limit, slider.limit)))
 
     def take_clicks(self, button: str) -> int:

@@ -238,6 +238,32 @@ def test_file_survives_an_interruption_while_writing(session, monkeypatch):
     assert Demonstrations.load(session.out).num_demonstrations == 1
 
 
+def test_sessions_with_the_same_file_keep_all_demonstrations(session):
+    other = DemonstrationRecorder("GridClamp", {}, session.out, meshcat=Page())
+    first = session.out
+    for one, expected in ((session, first), (session, first), (other, first.with_name("recorded_2.npz"))):
+        one.reset()
+        lead(one, "x [mm]", 2.0, 12)
+        assert str(expected) in one.keep()
+        assert one.out == expected
+    other.out.write_bytes(first.read_bytes())  # replaced by another program
+    assert f"recorded_2_2.npz, because another program has written {other.out}" in other.keep()
+    assert [Demonstrations.load(path).num_demonstrations for path in (first, other.out)] == [2, 2]
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_slider_value_that_is_not_finite_is_ignored(session, wrong):
+    session.reset()
+    lead(session, "x [mm]", 1.0, 20)
+    lead(session, "x [mm]", wrong, 1)
+    assert session.offset[0] == pytest.approx(1e-3)
+    session.panel.meshcat.SetSliderValue("x [mm]", wrong)
+    session.panel.meshcat.gamepad = SimpleNamespace(index=0, axes=[1.0])
+    session.step()
+    assert 1e-3 < session.offset[0] < 2e-3
+    assert np.isfinite(session.command).all()
+
+
 def test_buttons_keep_discard_and_end(session):
     messages = []
     page, step = session.panel.meshcat, session.step
