@@ -74,7 +74,7 @@ class ChunkReference(LeafSystem):
         self._reference_window_port = declare.output(
             self, "reference_window", (horizon + 1) * (outputs + outputs**2), self._window, [self._state]
         )
-        declare.update(self, period, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_observation_input_port = input_getter("observation", "observation of the base policy, (n,)")
     get_reference_window_output_port = output_getter("reference_window", "means and covariances, ((H+1)(O + O²),)")

@@ -12,7 +12,7 @@ class GripperCommand(LeafSystem):
     """Desired state of gripper joints: the last finite desired positions, with zero velocity.
 
     Desired positions are clipped to the joint limits. If a position is not finite, or the port is not connected, the
-    previous desired position remains in force, at first the initial opening.
+    previous desired position remains in force, after an initialization the initial opening.
 
     .. pydrake_system::
 
@@ -48,7 +48,7 @@ class GripperCommand(LeafSystem):
         self._desired_state_port = declare.output(
             self, "desired_state", 2 * num_joints, self._desired_state, [self._position_port, self._last_position]
         )
-        declare.update(self, period, self._update)
+        declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_position_input_port = input_getter("position", "desired positions, (n,); optional")
     get_desired_state_output_port = output_getter("desired_state", "desired positions and velocities, (2n,)")

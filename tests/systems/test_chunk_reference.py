@@ -63,6 +63,25 @@ def test_window_advances_along_a_chunk_and_is_planned_again():
     assert np.allclose(covariances, (0.5 * 0.01 + 0.02) * np.eye(2))
 
 
+@pytest.mark.parametrize("policy", [None, two_members])
+def test_initialization_restarts_the_window(policy):
+    system, observations = make(policy), np.arange(15.0).reshape(5, 3)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    port, output = system.get_observation_input_port(), system.get_reference_window_output_port()
+    episodes = []
+    for _ in range(2):
+        context.SetTime(0.0)
+        port.FixValue(context, observations[0])
+        simulator.Initialize()
+        episodes.append([output.Eval(context).copy()])
+        for step, observation in enumerate(observations):
+            port.FixValue(context, observation)
+            simulator.AdvanceTo(PERIOD * (step + 0.5))
+            episodes[-1].append(output.Eval(context).copy())
+    np.testing.assert_array_equal(*episodes)
+
+
 def test_simulation_stops_when_the_policy_returns_no_chunk():
     system = make(lambda observation: np.full((1, 2, 2), np.nan))
     with pytest.raises(PolicyError, match="finite chunks"):

@@ -50,12 +50,17 @@ def test_last_position_is_output_when_a_command_is_not_finite(bad):
         commanded.advance(0.05)
 
 
-def test_reset_restores_the_initial_opening():
+@pytest.mark.parametrize("is_initialized", [False, True])
+def test_reset_restores_the_initial_opening(is_initialized):
     commanded = Commanded()
     commanded.command([0.01, 0.2])
     commanded.advance(0.05)
     commanded.command([np.nan, np.nan])
-    commanded.system.SetDefaultContext(commanded.context)
+    if is_initialized:
+        commanded.context.SetTime(0.0)
+        commanded.simulator.Initialize()
+    else:
+        commanded.system.SetDefaultContext(commanded.context)
     np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
 
 
