@@ -19,7 +19,8 @@ class StatusWatchdog(LeafSystem):
     """Check each status of a robot, output the last accepted one, and report faults (`StateEstimator`).
 
     If the clock input is connected, delays of this program are not attributed to the robot, and a delay that is too
-    long is reported as a separate fault.
+    long is reported as a separate fault. An initialization does not change the state, because it does not change the
+    robot either: without the estimated velocity, an arm in motion could not be damped.
 
     .. pydrake_system::
 
@@ -81,7 +82,7 @@ class StatusWatchdog(LeafSystem):
         )
         self._fault_port = declare.part_output(self, "fault", self._estimate, lambda estimate: float(estimate.fault))
         self._age_port = declare.part_output(self, "age", self._estimate, lambda estimate: estimate.age)
-        declare.update(self, period, self._update, declare.reset_to_default(self))
+        declare.update(self, period, self._update)
 
     get_status_input_port = input_getter("status", "newest `JointStatus`; any other object counts as none")
     get_torque_input_port = input_getter("torque", "torques that are sent after this check, (n,) [Nm]")

@@ -83,7 +83,9 @@ class TorqueSafetyLimiter(LeafSystem):
     The velocity is estimated from several sources, and predicted while no status is accepted.
 
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
-    the start the limiter waits until no fault is present and then takes over without `resume`. The output is always
+    the start the limiter waits until no fault is present and then takes over without `resume`. An initialization while
+    the arm is controlled stops it with `Fault.INITIALIZED`, because a driver may repeat the last torque forever; it
+    does not end a stop. An earlier context must not be restored while the arm is controlled. The output is always
     finite and within the torque limits; at zero torque the robot only compensates its weight. After damping, zero
     torque is sent for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the driver can hold the arm
     by itself (brakes, position control), ``is_holding`` requests this after a fault of `STATUS_FAULTS`.
@@ -179,7 +181,7 @@ class TorqueSafetyLimiter(LeafSystem):
         self._not_following_port = declare.scalar_output(
             self, "not_following", self._not_following, [self._state, self._command_timed_out_port]
         )
-        declare.update(self, period, self._update, declare.reset_to_default(self))
+        declare.update(self, period, self._update, self._stop_at_initialization)
 
     get_torque_input_port = input_getter("torque", "commanded torques, (n,) [Nm]")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
@@ -251,6 +253,10 @@ class TorqueSafetyLimiter(LeafSystem):
         if not np.isfinite(self._torque_port.Eval(context)).all():
             return Fault.TORQUE_NOT_FINITE
         return Fault.NONE
+
+    def _stop_at_initialization(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if self._state_of(context)[_ARM_STATE] in (ArmState.RAMPING, ArmState.RUNNING):
+            discrete_state.set_value(self._state, [ArmState.DAMPING, Fault.INITIALIZED, 0.0, 0.0])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         arm_state, fault, state_time, blend_factor = self._state_of(context)

@@ -62,6 +62,7 @@ class Fault(IntEnum):
     DEADLINE_MISSED = 21, "the controller missed its deadline and sent no command in time"
     MONITOR_STOP = 22, "a safety monitor stopped the arm, or its heartbeat timed out"
     SECOND_COMMANDER = 23, "another program commands the arm as well"
+    INITIALIZED = 24, "the simulation was initialized while it controlled the arm"
 
 
 STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CLOCK_RATE)

@@ -398,12 +398,30 @@ def test_arm_waits_before_the_initialization(plant):
     np.testing.assert_array_equal(rig["safe_torque"], 0.0)
 
 
-def test_initialization_resets_the_arm_state(plant):
-    rig = Rig(plant)
-    rig.set(status_fault=[Fault.STALE])
-    rig.advance(PERIOD)
+@pytest.mark.parametrize("time", [None, 0.0])
+@pytest.mark.parametrize("arm_state", [ArmState.RAMPING, ArmState.RUNNING])
+def test_initialization_stops_an_arm_that_is_controlled(plant, arm_state, time):
+    """The driver may repeat the last torque forever, so silence is no stop."""
+    rig = Rig(plant, running=arm_state == ArmState.RUNNING)
+    if arm_state == ArmState.RAMPING:
+        rig.simulator.Initialize()
+        rig.advance(0.5 * LIMITS.ramp_time)
+    assert rig.arm_state == arm_state
+    rig.context.SetTime(rig.context.get_time() if time is None else time)
     rig.simulator.Initialize()
-    assert (rig.arm_state, rig["blend_factor"][0], rig["is_sending"][0]) == (ArmState.WAITING, 0.0, 0.0)
+    assert (rig.arm_state, rig.fault, rig["is_sending"][0]) == (ArmState.DAMPING, Fault.INITIALIZED, 1.0)
+    np.testing.assert_allclose(rig["safe_torque"], np.clip(rig.damping(), -20.0, 20.0), atol=1e-12)
+    rig.advance(LIMITS.damping_time + 2 * PERIOD)
+    assert (rig.arm_state, rig.fault) == (ArmState.OFF, Fault.INITIALIZED)
+
+
+def test_initialization_does_not_end_a_stop(plant):
+    rig = Rig(plant)
+    rig.system.stop(rig.context)
+    for arm_state in (ArmState.DAMPING, ArmState.OFF):
+        rig.simulator.Initialize()
+        assert (rig.arm_state, rig.fault, rig["blend_factor"][0]) == (arm_state, Fault.USER_STOP, 0.0)
+        rig.advance(LIMITS.damping_time + 2 * PERIOD)
 
 
 def test_ramping_damps_the_estimated_velocity(plant):

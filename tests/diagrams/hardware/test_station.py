@@ -371,3 +371,19 @@ def test_panda_commands_have_the_wall_clock_time():
     command = lcmt_panda_command.decode(find_driver("panda").encode(np.arange(7.0), 0.005))
     assert before <= command.utime <= time.time_ns() // 1000
     assert list(command.joint_torque) == list(range(7))
+
+
+def test_initialization_damps_an_arm_in_motion():
+    both = OneProcess()
+    plant = both.robot.plant
+    robot = plant.GetMyContextFromRoot(both.robot_simulator.get_context())
+    both.go(START + [0.10, 0.0, 0.08, 0.0, 0.0, 0.0], 0.2)
+    before = np.abs(plant.GetVelocities(robot)).max()
+    both.simulator.Initialize()
+    both.go(START, 0.1)
+    assert (both.arm_state, both.fault) == (ArmState.DAMPING, Fault.INITIALIZED)
+    assert np.abs(plant.GetVelocities(robot)).max() < 0.05 * before
+    both.go(START, 0.2)
+    both.station.resume(both.context)
+    both.go(START, 0.2)
+    assert both.arm_state == ArmState.RUNNING
