@@ -88,6 +88,7 @@ class RtdeDriver(PoseDriver):
         self._impedance: RobotImpedance | None = None
         self._status: JointStatus | None = None
         self._is_active = self._is_lost = False
+        self._is_zeroed = False  # the force sensor was zeroed on this connection
         self._has_failed_to_stop = False  # the controller may still apply the last wrench
         self._stopping: threading.Thread | None = None
         self._plant = MultibodyPlant(0.0)
@@ -99,11 +100,13 @@ class RtdeDriver(PoseDriver):
     def configure(self, impedance: RobotImpedance) -> None:
         """Set tool center and payload, zero the force sensor and start the controller's program; nothing moves.
 
-        Call it after `read` has returned a status. While poses are commanded, only the impedance is replaced.
+        Call it after `read` has returned a status. While poses are commanded, only the impedance is replaced. The force
+        sensor is zeroed once per connection, by the first call: later the tool may press on something, and a zeroed
+        sensor would hide that force from the controller, which would then add the bounded force to it.
 
         Raises:
-            InputError: If the robot cannot be connected, has not been read or refuses a setting, or if its force sensor
-                measures more than `MAX_ZEROED_FORCE`.
+            InputError: If the robot cannot be connected, has not been read or refuses a setting, or if at the first
+                call its force sensor measures more than `MAX_ZEROED_FORCE`.
         """
         self._check_connected()
         self._impedance, self._X_FlangeTool = impedance, impedance.X_FlangeTool
@@ -123,10 +126,13 @@ class RtdeDriver(PoseDriver):
             "payload",
         )
         self._check(self._control.setTcp(transform_to_vector(impedance.X_FlangeTool).tolist()), "tool center")
+        if self._is_zeroed:
+            return
         force = float(np.linalg.norm(self._receiver.getActualTCPForce()[:3]))
         if not force <= MAX_ZEROED_FORCE:  # refuses NaN
             raise InputError(f"the robot measures {force:.0f} N: free its tool before the force sensor is zeroed")
         self._check(self._control.zeroFtSensor(), "zeroing of the force sensor")
+        self._is_zeroed = True
 
     def read(self) -> JointStatus | None:
         """Return the newest status, malformed after a stop or a lost connection; None before the robot answers."""
@@ -190,7 +196,7 @@ class RtdeDriver(PoseDriver):
                 f"the robot's tool center is {1e3 * distance:.1f} mm from the model's",
                 distance <= MAX_POSE_DIFFERENCE,
             ),
-            Check("force sensor", "zeroed: the tool must have been free"),
+            Check("force sensor", "zeroed once, at the connection: the tool must have been free"),
             Check("motion", f"commands up to {speed:.2f} m/s, {acceleration:.1f} m/s² and {jerk:.0f} m/s³"),
             Check(
                 "untested",

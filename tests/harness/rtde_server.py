@@ -2,9 +2,9 @@
 
 The double follows Universal Robots' "Real-Time Data Exchange Guide" and "Dashboard Server" manual, and the commands of
 the client's program for the controller. It emulates that program's force mode, tool center, payload, zeroing of the
-force sensor and watchdog. In force mode the tool's speed is proportional to the sum of commanded and measured wrench,
-and a horizontal plane blocks the tool. Tests with this double show that messages arrive and have the documented meaning
-and signs. They do not show how a robot moves.
+force sensor and watchdog. In force mode the tool's speed is proportional to the sum of the commanded wrench and that of
+the sensor, and a horizontal plane blocks the tool. Tests with this double show that messages arrive and have the
+documented meaning and signs. They do not show how a robot moves.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class RtdeServer:
 
     Attributes:
         plane: Height of the plane [m].
-        bias: Error of the force sensor, (6,).
+        bias: Error of the force sensor, (6,). Zeroing makes it the opposite of the present force.
         calibration: Difference of the tool center's position from that of the published parameters, (3,) [m].
     """
 
@@ -136,6 +136,10 @@ class RtdeServer:
         return np.array([[*np.cross(z, tool[:3, 3] - X[:3, 3]), *z] for z, X in zip(axes, frames, strict=True)]).T
 
     def measured_force(self) -> np.ndarray:
+        """Return the wrench on the tool that the sensor shows in the controller's axes, (6,)."""
+        return self.contact_force() + self.bias
+
+    def contact_force(self) -> np.ndarray:
         """Return the wrench of the surroundings on the tool in the controller's axes, (6,)."""
         height = self.pose()[2]
         return np.array([0.0, 0.0, PLANE_STIFFNESS * max(0.0, self.plane - height), 0.0, 0.0, 0.0])
@@ -162,7 +166,7 @@ class RtdeServer:
             "actual_q": self.positions,
             "actual_qd": self.velocities,
             "actual_TCP_pose": self.pose(),
-            "actual_TCP_force": self.measured_force() + self.bias,
+            "actual_TCP_force": self.measured_force(),
             "robot_status_bits": 1 + 2 * self.is_running,
             "safety_status_bits": self.safety_bits,
             "runtime_state": 2 if self.is_running else 1,
@@ -295,7 +299,7 @@ class RtdeServer:
         elif command == END_FORCE_MODE:
             self.wrench = None
         elif command == ZERO_SENSOR:
-            self.bias = np.zeros(6)
+            self.bias = -self.contact_force()
         elif command == SET_TCP:
             self.tcp = np.array(real[:6])
         elif command == SET_PAYLOAD:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
-from rtde_server import END_FORCE_MODE, FORCE_MODE, DirectClient, RtdeProcess, RtdeServer
+from rtde_server import END_FORCE_MODE, FORCE_MODE, ZERO_SENSOR, DirectClient, RtdeProcess, RtdeServer
 
 from guiderail.diagrams.hardware import rtde
 from guiderail.diagrams.hardware.rtde import RtdeDriver
@@ -124,6 +124,22 @@ def test_wrench_is_that_of_the_spring_and_bounded(robot, driver, model, impedanc
     driver.write_pose(RigidTransform([5.0, 5.0, -5.0]) @ actual, 0.0)
     np.testing.assert_allclose(np.abs(robot.wrench[:3]), impedance.max_wrench[:3])
     assert (np.abs(robot.wrench) <= impedance.max_wrench + 1e-12).all()
+
+
+def test_sensor_is_not_zeroed_again_by_a_resume_in_contact(robot, driver, model, impedance):
+    robot.plane = robot.pose()[2] - 0.001
+    below = RigidTransform([0.0, 0.0, -0.05]) @ model_pose(model, driver)
+    for _ in range(2):
+        for _ in range(100):
+            robot.advance(0.004)
+            driver.read()
+            driver.write_pose(below, 0.0)
+        assert robot.contact_force()[2] == pytest.approx(impedance.max_wrench[2], rel=1e-3)
+        driver.stop()
+        driver._stopping.join()
+        driver.recover()
+        driver.configure(impedance)
+    assert robot.commands.count(ZERO_SENSOR) == 1
 
 
 @pytest.mark.parametrize(("share", "is_alive"), [(0.9, True), (1.2, False)])
