@@ -11,7 +11,8 @@ class CommandWatchdog(LeafSystem):
     """Output the desired pose while it is valid, otherwise the last valid one.
 
     This system is for robot controllers without a command timeout. A command is valid while it is finite, not older
-    than the timeout, and not more than one period in the future; see `LastValidPose`.
+    than the timeout, and not more than one period in the future; see `LastValidPose`. While the blend factor is zero,
+    the last valid pose is the measured one, so that a robot without a valid command is held where control begins.
 
     .. pydrake_system::
 
@@ -20,13 +21,15 @@ class CommandWatchdog(LeafSystem):
         - desired_pose
         - pose
         - command_time (optional)
+        - blend_factor (optional)
         output_ports:
         - safe_pose
         - command_timed_out
 
-    ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``command_time`` is (1,),
-    the time stamp of ``desired_pose`` [s]; if it is not connected, commands never time out. ``command_timed_out`` (1,)
-    is 1 while no valid command is available.
+    ``desired_pose``, ``pose`` (measured, read at initialization and while the blend factor is zero) and ``safe_pose``
+    are (O,). ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it is not connected, commands never
+    time out. ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`; if it is not connected, it counts as 1.
+    ``command_timed_out`` (1,) is 1 while no valid command is available.
 
     Args:
         period: Period of the check [s], positive; ideally the period of the commands.
@@ -44,8 +47,15 @@ class CommandWatchdog(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", pose_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
+        self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         self._followed_pose = LastValidPose(
-            self, self._desired_pose_port, self._command_time_port, self._pose_port.Eval, period=period, timeout=timeout
+            self,
+            self._desired_pose_port,
+            self._command_time_port,
+            self._pose_port.Eval,
+            period=period,
+            timeout=timeout,
+            blend_factor=self._blend_factor_port,
         )
         self._safe_pose_port = self.DeclareVectorOutputPort(
             "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._followed_pose.tickets
@@ -55,6 +65,7 @@ class CommandWatchdog(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
+    get_blend_factor_input_port = input_getter("blend_factor", "blend factor, (1,); 0 while the arm is not controlled")
     get_safe_pose_output_port = output_getter("safe_pose", "last valid desired pose, (O,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 

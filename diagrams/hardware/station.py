@@ -62,7 +62,8 @@ class HardwareStation(Station):
     `PoseDriver`, they are desired poses, and the robot's own program runs the impedance controller. The robot's own
     controller compensates gravity in torque mode, so this station does not. The wrench is estimated from the external
     joint torques; there is no wrist sensor. `start` waits for the first status. Nothing is sent until statuses have
-    been valid for the settling time; then the torques are blended in, and the arm stays where it is.
+    been valid for the settling time; then the torques are blended in, and the arm stays where it is until there is a
+    valid command.
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
     `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
@@ -194,7 +195,8 @@ class HardwareStation(Station):
         builder.Connect(limited_pose, (tank or controller).get_desired_pose_input_port())
         builder.Connect(pose, watchdog.get_pose_input_port())
         builder.Connect(pose, rate_limiter.get_pose_input_port())
-        builder.Connect(limiter.get_blend_factor_output_port(), rate_limiter.get_blend_factor_input_port())
+        for system in (watchdog, rate_limiter):
+            builder.Connect(limiter.get_blend_factor_output_port(), system.get_blend_factor_input_port())
         safe_torque, arm_state = limiter.get_safe_torque_output_port(), limiter.get_arm_state_output_port()
         if isinstance(self.driver, PoseDriver):
             X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
@@ -278,6 +280,8 @@ class HardwareStation(Station):
 
     def resume(self, context: Context) -> None:
         """End a stop, and continue from where the arm is; `context` is the root context.
+
+        Without a valid command the arm stays there, also if it was moved by hand during the stop.
 
         Raises:
             InputError: If the arm is not stopped, not yet at rest, or a fault persists.

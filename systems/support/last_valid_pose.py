@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 
@@ -52,7 +53,8 @@ class LastValidPose:
     evaluated for the time of the last check, not for the present time: outputs that depend on it are then computed
     again only when the command changes or an event occurs. A command becomes stale at the first event after its
     timeout; a new command is valid at once. Before the first valid command the pose is the one measured at
-    initialization.
+    initialization. While the blend factor is zero, the robot is not controlled, and the last valid pose is the measured
+    one: a robot without a valid command is held where control begins.
 
     Args:
         system: System under construction, in which two states and two events are declared.
@@ -61,6 +63,8 @@ class LastValidPose:
         measured_pose: Function of the system's context that returns the measured pose, (O,), for initialization.
         period: Period of the check [s], positive; ideally the period of the commands.
         timeout: Age above which a command is stale [s], positive and finite.
+        blend_factor: Input port of the blend factor, (1,), or None; if it is not connected, the robot is always
+            controlled.
 
     Attributes:
         tickets: Dependencies of `eval`.
@@ -78,8 +82,9 @@ class LastValidPose:
         *,
         period: float,
         timeout: float,
+        blend_factor: InputPort | None = None,
     ):
-        self._desired_pose, self._measured_pose = desired_pose, measured_pose
+        self._desired_pose, self._measured_pose, self._blend_factor = desired_pose, measured_pose, blend_factor
         self._validity = CommandValidity(desired_pose, command_time, period=period, timeout=timeout)
         self._last_pose = system.DeclareDiscreteState(desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
@@ -103,12 +108,20 @@ class LastValidPose:
     def _check(self, context: Context) -> bool:
         return self._validity.is_valid(context, context.get_discrete_state().value(self._check_time).item())
 
+    def _is_controlled(self, context: Context) -> bool:
+        port = self._blend_factor
+        return port is None or not port.HasValue(context) or port.Eval(context)[0] > 0.0
+
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last_pose, self._measured_pose(context))
         discrete_state.set_value(self._check_time, [context.get_time()])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if not self._is_controlled(context):
+            measured = self._measured_pose(context)
+            if is_finite(measured):
+                discrete_state.set_value(self._last_pose, measured)
         # Validity at the last check: the pose followed until now is stored, even if it becomes stale now.
-        if self._valid.Eval(context):
+        elif self._valid.Eval(context):
             discrete_state.set_value(self._last_pose, self._desired_pose.Eval(context))
         discrete_state.set_value(self._check_time, [context.get_time()])

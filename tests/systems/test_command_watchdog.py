@@ -153,6 +153,23 @@ def test_initialization_resets_the_last_valid_pose():
     rig.check(START, command_timed_out=1)
 
 
+@pytest.mark.parametrize(("blend_factor", "held"), [(0.0, SECOND), (0.5, FIRST), (1.0, FIRST)])
+def test_robot_that_was_not_controlled_is_held_where_it_is(blend_factor, held):
+    rig = Rig(FIRST)
+    factor = rig.system.get_blend_factor_input_port().FixValue(rig.context, [1.0])
+    rig.advance(2 * PERIOD)
+    factor.GetMutableData().set_value([blend_factor])
+    rig.command(np.full(6, np.nan))
+    for measured in (SECOND, np.full(6, np.nan)):
+        rig.system.get_pose_input_port().FixValue(rig.context, measured)
+        rig.advance(2 * PERIOD)
+    factor.GetMutableData().set_value([1.0])
+    rig.advance(2 * PERIOD)
+    rig.check(held, command_timed_out=1)
+    rig.command(START)
+    rig.check(START, command_timed_out=0)
+
+
 @pytest.mark.parametrize(("age", "command_timed_out"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
 def test_validity_uses_the_start_time_before_the_first_check(age, command_timed_out):
     rig, start = Rig(FIRST), 5.0 + 0.5 * PERIOD

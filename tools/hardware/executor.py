@@ -117,10 +117,9 @@ class SkillExecutor:
         """
         self._warm_up()
         self._simulator = start_simulator(self._station, self._clock)
-        pose = self._station.get_pose_output_port().Eval(self._simulator.get_context()).copy()
         log(f"taking over, and approaching the start at {SPEED / MM:.0f} mm/s")
         try:
-            outcome = self._approach(pose)
+            outcome = self._approach()
             if outcome is None:
                 log(f"executing {self._task.name}")
                 outcome = self._execute()
@@ -180,19 +179,20 @@ class SkillExecutor:
             return Outcome(Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", 0)
         return None
 
-    def _approach(self, pose: np.ndarray) -> Outcome | None:
-        """Take control at `pose`, (6,), and move to the start; return the outcome if the arm was stopped."""
+    def _approach(self) -> Outcome | None:
+        """Take control where the arm is, and move to the start; return the outcome if the arm was stopped."""
         station, context = self._station, self._simulator.get_mutable_context()
         desired_pose = station.get_desired_pose_input_port()
         elapsed = 0.0
+        # Until then there is no command, because the pose of a single status may be wrong: the station holds the arm.
         while station.get_arm_state_output_port().Eval(context)[0] != ArmState.RUNNING:
-            desired_pose.FixValue(context, pose)
             elapsed += self._skill.control_period
             if (outcome := self._step()) is not None:
                 return outcome
             if elapsed > BLEND_TIMEOUT:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
                 return Outcome(fault, f"could not take over: {describe_stop(fault, station.driver)}", 0)
+        pose = station.get_pose_output_port().Eval(context).copy()
         for command in slow_approach(pose, self._start, self._skill.control_period):
             desired_pose.FixValue(context, command)
             if (outcome := self._step()) is not None:

@@ -37,6 +37,7 @@ MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece
 HOLD_STEPS = 25  # control steps of a push
 ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
 RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
+NO_POSE = np.full(6, np.nan)  # no command: a station without one holds the arm where it took control
 
 
 class RobotStoppedError(Exception):
@@ -366,9 +367,9 @@ class RobotEnv(DiagramEnv):
         self._switch_to_transfer()
         if self._arm_state == ArmState.WAITING:
             self._clock.begin()  # no command was sent yet: the time since the last status must not count as a gap
-        pose, elapsed = self.pose, 0.0
+        elapsed = 0.0
         while self._arm_state != ArmState.RUNNING:
-            self._command(pose)
+            self._command(NO_POSE)  # the pose of a single status may be wrong: the station holds the arm
             elapsed += self.task.control_period
             if elapsed > RESUME_TIMEOUT:
                 reason = describe_stop(self._active_fault, self._station.driver)
@@ -390,7 +391,12 @@ class RobotEnv(DiagramEnv):
         self._advance_statuses(round((self._station.limits.damping_time + 0.1) / self._station.period))
 
     def _resume(self) -> None:
-        """If the arm is at rest after a stop, have the operator confirm, and resume."""
+        """If the arm is at rest after a stop, have the operator confirm, and resume.
+
+        Raises:
+            InputError: If the arm does not resume.
+            RobotStoppedError: If a stop is requested after the confirmation.
+        """
         if self._arm_state != ArmState.OFF:
             return
         if self._must_be_freed:
@@ -398,19 +404,20 @@ class RobotEnv(DiagramEnv):
             self._must_be_freed = ""
         else:
             self._confirm_resume(describe_stop(self._active_fault, self._station.driver))
+        self._keys.clear_stop()
         self._station.driver.recover()
         # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
         # accepted only after the settling time.
         self._clock.begin()
         settling_steps = math.ceil(self._station.status_limits.settling_time / self._station.period)
         self._advance_statuses(self._steps + settling_steps)
-        self._keys.clear_stop()
-        self._rejoin_return_path()
         if self._station is self._transfer_station:
             self._transfer_station.get_desired_pose_input_port().FixValue(
-                self._transfer_simulator.get_mutable_context(), self.pose
+                self._transfer_simulator.get_mutable_context(), NO_POSE
             )
         for _ in range(round(RESUME_TIMEOUT / self.task.control_period)):
+            if self._keys.is_stop_requested():
+                raise RobotStoppedError(Fault.USER_STOP)
             try:
                 self._station.resume(self._root_context)
             except InputError as error:
@@ -420,6 +427,7 @@ class RobotEnv(DiagramEnv):
                 break
         else:
             raise InputError(reason)
+        self._rejoin_return_path()
         self._log("resuming from here")
         self._switch_to_transfer()
         self._take_control()

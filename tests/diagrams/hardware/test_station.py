@@ -247,6 +247,19 @@ def test_stop_damps_the_arm():
     assert both["command_timed_out"][0] == 1.0
 
 
+def test_station_without_a_command_resumes_where_the_arm_is():
+    both, no_command = OneProcess(), np.full(6, np.nan)
+    both.station.stop(both.context)
+    both.go(no_command, 0.4)
+    moved = START + [0.06, 0.0, 0.05, 0.0, 0.0, 0.0]
+    both.robot.set_pose(both.robot_simulator.get_mutable_context(), moved)  # by hand
+    both.go(no_command, 0.6)
+    both.station.resume(both.context)
+    both.go(no_command, 0.6)
+    assert both.arm_state == ArmState.RUNNING
+    np.testing.assert_allclose(both["pose"], moved, atol=1e-3)
+
+
 def test_copy_state_from_continues_without_a_gap():
     both = OneProcess()
     goal = START + [0.005, 0.0, 0.0, 0.0, 0.0, 0.0]

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -151,6 +152,28 @@ def test_arm_rests_when_a_step_of_the_approach_raises(make_executor):
     assert commands[-1] == (0.0,) * 7
     velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
     assert np.abs(velocities).max() < 0.01
+
+
+def test_single_wrong_status_at_the_take_over_moves_nothing(make_executor, monkeypatch):
+    executor, clock = make_executor()
+    places, receive, turn = [], clock.receive, np.array([0.15, 0, 0, 0, 0, 0, 0])
+
+    def start_simulator(station, clock):
+        with monkeypatch.context() as patch:
+            status = station.driver.read()
+            patch.setattr(station.driver, "read", lambda: replace(status, positions=status.positions + turn))
+            return preflight.start_simulator(station, clock)
+
+    def watch():
+        places.append(
+            clock.robot.plant.GetPositions(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
+        )
+        receive()
+
+    monkeypatch.setattr(executing, "start_simulator", start_simulator)
+    monkeypatch.setattr(clock, "receive", watch)
+    assert executor.run(print).exit_code == 0
+    assert np.abs(np.array(places)[:, 0] - places[0][0]).max() < 0.1 * turn[0]
 
 
 def test_execution_ends_when_statuses_stop(make_executor):

@@ -1,6 +1,7 @@
 """Episodes and training on a robot, with both sides of the bus in one process."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -21,6 +22,7 @@ from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
+from guiderail.tools.hardware import preflight
 from guiderail.tools.hardware.connection import RobotConnection
 from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.operator import OperatorKeys
@@ -181,6 +183,41 @@ def test_operator_stop_truncates_and_reset_resumes(env):
     assert env.asked == []
     env.reset()
     assert env.asked == ["stop requested by the user"]
+
+
+def test_stop_requested_while_statuses_settle_is_asked_about_again(env, monkeypatch):
+    env.reset()
+    env.keys.request_stop()
+    env.step(np.zeros(2))
+    messages = []
+
+    def confirm(reason):
+        env.asked.append(reason)
+        if len(env.asked) == 1:
+            env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
+
+    monkeypatch.setattr(env, "_confirm_resume", confirm)
+    monkeypatch.setattr(env, "_log", messages.append)
+    env.reset()
+    assert (len(env.asked), messages) == (2, ["resuming from here"])
+
+
+def test_single_wrong_status_before_control_is_taken_moves_nothing(monkeypatch):
+    start = preflight.start_simulator
+
+    def start_simulator(station, clock):
+        with monkeypatch.context() as patch:
+            station.driver.receive()
+            status = station.driver.read()
+            wrong = replace(status, positions=status.positions + [0.15, 0, 0, 0, 0, 0, 0])
+            patch.setattr(station.driver, "read", lambda: wrong)
+            return start(station, clock)
+
+    monkeypatch.setattr(preflight, "start_simulator", start_simulator)
+    env = make(monkeypatch, START)
+    assert np.linalg.norm((env.pose - START)[:3]) > 0.05
+    env._take_control()
+    np.testing.assert_allclose(env.pose, START, atol=1e-3)
 
 
 def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
