@@ -67,8 +67,10 @@ class HardwareStation(Station):
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
     `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
-    reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. In addition to every station's ports
-    there are these outputs. As in Drake's own stations, the driver's name and a dot precede the names of joint ports:
+    reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. With a `PoseDriver` there is no
+    input ``max_wrench``, because the robot's own controller has the bound of the impedance. In addition to every
+    station's ports there are these outputs. As in Drake's own stations, the driver's name and a dot precede the names
+    of joint ports:
 
     =====================  =====  =====================================================================================
     output                 size   meaning
@@ -219,6 +221,10 @@ class HardwareStation(Station):
             tare = WrenchTare(period, *tare_steps(period))
             add_system(builder, "tare", tare, measured_wrench=measured_wrench)
             measured_wrench = tare.get_tared_wrench_output_port()
+        # A robot's own controller has the bound of the impedance, which cannot change.
+        max_wrench = None
+        if tank is not None and not isinstance(self.driver, PoseDriver):
+            max_wrench = tank.get_max_wrench_input_port()
         export_station_ports(
             builder,
             watchdog.get_desired_pose_input_port(),
@@ -228,7 +234,7 @@ class HardwareStation(Station):
             contact_force=impedance_monitor.get_contact_force_output_port(),
             saturation=controller.get_saturation_output_port(),
             command_timed_out=limiter.get_not_following_output_port(),
-            max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
+            max_wrench=max_wrench,
         )
         builder.ExportOutput(limiter.get_fault_output_port(), "fault")
         builder.ExportOutput(arm_state, "arm_state")

@@ -103,7 +103,7 @@ def make_phase_wrench_limit(
     if impedance is None or impedance.bound is None:
         raise InputError(
             f"state {limited[0]!r} of template {template.name!r} limits force or torque, and the impedance of this "
-            "station has no bound: choose another station or bounded_force=true, or remove the limit"
+            "station has no bound that can change: choose another station or bounded_force=true, or remove the limit"
         )
     # A state without limits has the station's bound, so that the ramp to another state's limits starts there.
     bounds = [impedance.bound.numbers] * len(template.states)

@@ -100,6 +100,9 @@ class InsertionTask(Task):
         In simulation, the signal `hidden_offset` (3,) is the fixture's offset: x, y [m] and turn [rad]. On hardware the
         workpiece's pose is estimated from the robot's own pose, if the task defines `observable_success`. If the force
         limit is sampled, it is the signal `force_limit` [N], and the signal `max_wrench` limits the station's force.
+
+        Raises:
+            InputError: If the force limit is sampled, and a station with a bounded impedance has no `max_wrench`.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -111,6 +114,12 @@ class InsertionTask(Task):
         limit = EpisodeConstant(builder, "force_limit", 1, np.array(sampled[:1]))
         self.episode_constants["force_limit"] = limit
         if not station.HasInputPort("max_wrench"):
+            impedance = self.impedance()
+            if impedance is not None and impedance.bound is not None and sampled[0] < sampled[1]:
+                raise InputError(
+                    f"force_limit_range changes the largest force, and station={self.config.station!r} has no input "
+                    f"'max_wrench' for it: give two equal forces or force_limit, not {brief(sampled)}"
+                )
             return {"force_limit": limit.port}
         bound = EpisodeConstant(builder, "max_wrench", MAX_WRENCH_SIZE, max_wrench(sampled[0]))
         self.episode_constants["max_wrench"] = bound

@@ -8,6 +8,7 @@ import pytest
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.hardware import fci as fci
 from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.fci import (
@@ -434,6 +435,18 @@ def test_station_sends_poses_from_the_measured_pose_on(robot):
     np.testing.assert_allclose(moved[-1] - moved[0], [0.01, 0.0, 0.0], atol=1e-6)
     speed = np.linalg.norm(np.diff(moved, axis=0), axis=1).max() / loop.station.period
     assert 0.0 < speed <= FciDriver.motion_limits.linear[0]
+
+
+def test_options_that_change_the_bounded_force_are_refused(robot, monkeypatch):
+    """The robot's own controller has one bound."""
+    assert not Loop(robot).station.HasInputPort("max_wrench")
+    monkeypatch.setattr(fci, "import_extra", lambda name: client(robot))
+    on_robot = {"station": "hardware", "driver": "fci", "robot": "panda", "robot_url": "192.0.2.1", "guidance": "kgrl"}
+    with pytest.raises(InputError, match=r"force_limit_range changes .* not \(8\.0, 25\.0\)"):
+        make_skill("BncConnector", lambda seen: np.zeros(2), force_limit_range=(8.0, 25.0), **on_robot)
+    skill = make_skill("BncConnector", lambda seen: np.zeros(2), force_limit_range=(12.0, 12.0), **on_robot)
+    limits = skill.diagram.GetSubsystemByName("station").impedance.limits
+    assert limits == Impedance().with_max_force(12.0).limits
 
 
 def test_station_stops_the_robot_after_a_reflex(robot):
