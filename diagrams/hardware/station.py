@@ -294,6 +294,11 @@ class HardwareStation(Station):
         """
         self._limiter.resume(self._limiter.GetMyMutableContextFromRoot(context))
 
+    def read_max_wrench(self, context: Context) -> np.ndarray | None:
+        """Return the value of the input ``max_wrench``, (8,), or None without one; `context` is this station's own."""
+        port = self.GetInputPort("max_wrench") if self.HasInputPort("max_wrench") else None
+        return port.Eval(context).copy() if port is not None and port.HasValue(context) else None
+
     def has_safety_monitor(self, context: Context) -> bool:
         """Return True if the safety monitor's heartbeat is received; `context` is this station's own."""
         return self._heartbeat.is_alive(self.GetSubsystemContext(self._heartbeat, context))

@@ -102,7 +102,10 @@ class SkillExecutor:
         self._station = self._skill_station.clone(task.workcell())
         self._steps = round(skill.control_period / self._skill_station.period)
         self._start = task.start_pose(np.random.default_rng(0))
-        self.preflight = PreflightChecks(self._station, clock, self._start, self._steps)
+        # The approach has the bound with which the skill begins.
+        context = self._skill_station.GetMyContextFromRoot(skill.diagram.CreateDefaultContext())
+        self._max_wrench = self._skill_station.read_max_wrench(context)
+        self.preflight = PreflightChecks(self._station, clock, self._start, self._steps, self._max_wrench)
         self._simulator = self.preflight.simulator
         self.trace = EpisodeTrace(skill.num_steps, 6, skill.control_period, SIGNALS)
         self._joints: dict[str, list[np.ndarray]] = {name: [] for name in JOINT_SIGNALS}
@@ -116,7 +119,7 @@ class SkillExecutor:
             InputError: If no robot answers.
         """
         self._warm_up()
-        self._simulator = start_simulator(self._station, self._clock)
+        self._simulator = start_simulator(self._station, self._clock, self._max_wrench)
         log(f"taking over, and approaching the start at {SPEED / MM:.0f} mm/s")
         try:
             outcome = self._approach()
@@ -153,7 +156,7 @@ class SkillExecutor:
         """
         station, root_context = self._active_station()
         context = station.GetMyContextFromRoot(root_context)
-        self._simulator = start_simulator(self._station, self._clock)
+        self._simulator = start_simulator(self._station, self._clock, self._max_wrench)
         self._station.copy_state_from(self._simulator.get_mutable_context(), station, context)
 
     def _active_station(self) -> tuple[HardwareStation, Context]:

@@ -86,14 +86,29 @@ class PreflightChecks:
         simulator: Simulator of the station, with the newest status.
     """
 
-    def __init__(self, station: HardwareStation, clock: Clock, start: np.ndarray, num_steps: int):
-        """Receive the first statuses; `num_steps` is the number of status periods of a control step.
+    def __init__(
+        self,
+        station: HardwareStation,
+        clock: Clock,
+        start: np.ndarray,
+        num_steps: int,
+        max_wrench: np.ndarray | None = None,
+    ):
+        """Receive the first statuses.
+
+        Args:
+            station: Station that controls the arm after the checks.
+            clock: Clock of the station.
+            start: Pose at which a skill starts, (6,).
+            num_steps: Number of status periods of a control step.
+            max_wrench: Largest wrench of the station, (8,), or None.
 
         Raises:
             InputError: If no robot answers.
         """
         self._station, self._clock, self._start, self._num_steps = station, clock, start, num_steps
-        self.simulator = start_simulator(station, clock)
+        self._max_wrench = max_wrench
+        self.simulator = start_simulator(station, clock, max_wrench)
         self._commands_before = station.driver.num_foreign_commands
         # Nothing is sent yet, and a safety monitor's first heartbeat may take a status or two.
         clock.advance(self.simulator, station, NUM_STATUSES)
@@ -122,19 +137,23 @@ class PreflightChecks:
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
         # A new simulator accepts the arm's position at once, even if it was moved by hand in the meantime.
-        self.simulator = start_simulator(self._station, self._clock)
+        self.simulator = start_simulator(self._station, self._clock, self._max_wrench)
         self._clock.advance(self.simulator, self._station, NUM_STATUSES)
         return self.run()
 
 
-def start_simulator(station: HardwareStation, clock: Clock) -> Simulator:
+def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:
     """Return an initialized simulator of a station that holds the arm where it is.
+
+    `max_wrench` is the value of the station's input of this name, (8,), or None if it has no value.
 
     Raises:
         InputError: If no robot answers.
     """
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
+    if max_wrench is not None:
+        station.GetInputPort("max_wrench").FixValue(simulator.get_mutable_context(), max_wrench)
     station.start(simulator)
     clock.begin()
     return simulator

@@ -59,6 +59,9 @@ class RobotEnv(DiagramEnv):
     reset, it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that
     was stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
 
+    Motions between episodes keep the bound of the force that was in force at the end of the episode; the first approach
+    has the bound with which an episode begins.
+
     A success by pose is confirmed by the task's `hold_tests`; if the workpiece gives way, `termination` is
     "did_not_hold". Episodes that end as "stopped" or "did_not_hold" must not be learned from.
 
@@ -116,7 +119,9 @@ class RobotEnv(DiagramEnv):
         self._hold_tests, self._snaps_in = hold_tests, snaps_in
         self._steps = round(task.control_period / station.period)
         self._station, self._is_stepping = transfer_station, False
-        self.preflight = PreflightChecks(transfer_station, clock, start, self._steps)
+        # The first approach has the bound with which an episode begins.
+        max_wrench = station.read_max_wrench(station.GetMyContextFromRoot(task.diagram.CreateDefaultContext()))
+        self.preflight = PreflightChecks(transfer_station, clock, start, self._steps, max_wrench)
         self._last_transfer: Simulator | None = None
         self._return_path: list[np.ndarray] = []  # poses (6,) of the way back; the last one is next
         self._must_be_freed = ""  # reason why the workpiece has to be released by hand before the arm resumes
@@ -166,9 +171,12 @@ class RobotEnv(DiagramEnv):
         self._station, self._is_stepping = station, False
 
     def _switch_to_new_transfer(self) -> None:
-        """Transfer control to the transfer station in a new simulator, which holds the present pose."""
-        pose, simulator = self.pose, Simulator(self._transfer_station)
-        self._transfer_station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), pose)
+        """Transfer control to the transfer station in a new simulator, which holds the present pose and bound."""
+        simulator, max_wrench = Simulator(self._transfer_station), self._station.read_max_wrench(self._context)
+        context = simulator.get_mutable_context()
+        self._transfer_station.get_desired_pose_input_port().FixValue(context, self.pose)
+        if max_wrench is not None:
+            self._transfer_station.GetInputPort("max_wrench").FixValue(context, max_wrench)
         self._switch_station(simulator, self._transfer_station)
 
     def _switch_to_transfer(self) -> None:

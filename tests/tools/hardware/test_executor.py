@@ -15,6 +15,7 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
 from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.stations.station import max_wrench
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, StatusLimits
 from guiderail.systems.policy_system import PolicyError
@@ -40,13 +41,14 @@ def make_executor(monkeypatch):
         num_steps=20,
         is_stop_requested=lambda: False,
         has_monitor=True,
+        **options,
     ):
         lcm = DrakeLcm("memq://")
         with monkeypatch.context() as patch:
             # The skill's station opens its bus by URL, and each bus in memory is another one.
             patch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
-            skill = make_skill("BncConnector", policy, **OPTIONS)
-        task = EnvConfig.resolve("BncConnector", OPTIONS).make_task()
+            skill = make_skill("BncConnector", policy, **OPTIONS, **options)
+        task = EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
         monkeypatch.setattr(task, "num_steps", num_steps)
         clock = Together(task.workcell(), lcm, start, has_monitor)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
@@ -158,11 +160,11 @@ def test_single_wrong_status_at_the_take_over_moves_nothing(make_executor, monke
     executor, clock = make_executor()
     places, receive, turn = [], clock.receive, np.array([0.15, 0, 0, 0, 0, 0, 0])
 
-    def start_simulator(station, clock):
+    def start_simulator(station, *arguments):
         with monkeypatch.context() as patch:
             status = station.driver.read()
             patch.setattr(station.driver, "read", lambda: replace(status, positions=status.positions + turn))
-            return preflight.start_simulator(station, clock)
+            return preflight.start_simulator(station, *arguments)
 
     def watch():
         places.append(
@@ -174,6 +176,22 @@ def test_single_wrong_status_at_the_take_over_moves_nothing(make_executor, monke
     monkeypatch.setattr(clock, "receive", watch)
     assert executor.run(print).exit_code == 0
     assert np.abs(np.array(places)[:, 0] - places[0][0]).max() < 0.1 * turn[0]
+
+
+def test_approach_has_the_bound_of_the_skill(make_executor):
+    executor, clock = make_executor(force_limit_range=(8.0, 25.0))
+    executor.preflight.repeat()
+
+    def read(simulator):
+        return executor._station.read_max_wrench(simulator.get_context())
+
+    bounds = [read(executor.preflight.simulator)]
+    clock.happens = {
+        clock.step + 50: lambda: bounds.append(read(executor._simulator)),
+        clock.step + 100: lambda: setattr(clock, "is_silent", True),
+    }
+    assert executor.run(print).fault == Fault.STALE
+    np.testing.assert_array_equal(bounds, [max_wrench(8.0)] * 2)
 
 
 def test_execution_ends_when_statuses_stop(make_executor):

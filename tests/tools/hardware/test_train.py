@@ -15,6 +15,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.stations.station import max_wrench
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE, MAX_HOLD_MOTION, HoldTest
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
@@ -205,19 +206,33 @@ def test_stop_requested_while_statuses_settle_is_asked_about_again(env, monkeypa
 def test_single_wrong_status_before_control_is_taken_moves_nothing(monkeypatch):
     start = preflight.start_simulator
 
-    def start_simulator(station, clock):
+    def start_simulator(station, *arguments):
         with monkeypatch.context() as patch:
             station.driver.receive()
             status = station.driver.read()
             wrong = replace(status, positions=status.positions + [0.15, 0, 0, 0, 0, 0, 0])
             patch.setattr(station.driver, "read", lambda: wrong)
-            return start(station, clock)
+            return start(station, *arguments)
 
     monkeypatch.setattr(preflight, "start_simulator", start_simulator)
     env = make(monkeypatch, START)
     assert np.linalg.norm((env.pose - START)[:3]) > 0.05
     env._take_control()
     np.testing.assert_allclose(env.pose, START, atol=1e-3)
+
+
+def test_motions_between_episodes_have_the_bound_of_the_episode(monkeypatch):
+    env = make(monkeypatch, START, force_limit_range=(8.0, 25.0))
+    np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
+    env.preflight.repeat()
+    np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
+    env.reset()
+    env.task.declaration.episode_constants["max_wrench"].set(env._root_context, max_wrench(11.0))
+    for _ in range(2):
+        env.idle()
+        assert env._station is env._transfer_station
+        np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(11.0))
+        env._switch_to_new_transfer()
 
 
 def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
