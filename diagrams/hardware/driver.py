@@ -17,7 +17,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry
 from guiderail.models.control.joint_status import Fault, Heartbeat, JointStatus, StatusLimits
 from guiderail.models.control.motion_constraints import MotionLimits
-from guiderail.models.robots.robot import Robot
+from guiderail.models.robots.mounting import add_robot
+from guiderail.models.robots.robot import Robot, find_robot
 from guiderail.systems.torque_safety_limiter import SafetyLimits
 
 STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers [s], 5 ms; a control period is an exact multiple
@@ -27,6 +28,8 @@ POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 # a share of its maximum.
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 TORQUE_TOLERANCE_SHARE = 0.02  # largest error of a joint torque by friction, gravity and sensor, relative to its limit
+
+MAX_DIFFERENCE = 0.02  # largest difference of an entry of a flange's pose from that of the driver's robot [m, 1]
 
 CommandCallback = Callable[[np.ndarray, float], None]
 
@@ -56,6 +59,9 @@ class Driver(ABC):
     """
 
     name: ClassVar[str]  # prefix of the joint ports of a hardware station, as in Drake's own stations
+    # Name of the registered robot that the driver moves; the robot of a station needs its joints and kinematics. Empty
+    # for a driver of any robot with as many joints as `torque_reflex_limits`.
+    robot: ClassVar[str] = ""
     # External torques at which the driver stops by itself under torque control, (n,) [Nm].
     torque_reflex_limits: ClassVar[tuple[float, ...]]
     has_command_timeout: ClassVar[bool]  # True if the driver brings the arm to rest when commands stop
@@ -205,6 +211,50 @@ def find_driver(robot: Robot | str) -> type[Driver]:
         InputError: If no driver has this name, or the name of the robot.
     """
     return DRIVERS.get(robot if isinstance(robot, str) else robot.name)
+
+
+def check_robot(driver: Driver, robot: Robot) -> None:
+    """Check that a robot has the joints and the kinematics of the robot that a driver moves.
+
+    Joints are compared by the motion of the flange in the base frame, with each joint turned alone. A `PoseDriver`
+    commands poses relative to flange and base, so for it the flange's pose in the world is compared as well.
+
+    Raises:
+        InputError: If they differ.
+    """
+    num_joints = len(driver.torque_reflex_limits)
+    if robot.num_joints != num_joints:
+        raise InputError(
+            f"robot={robot.name!r} has {robot.num_joints} joints, and {type(driver).__name__} moves an arm of "
+            f"{num_joints}: name the arm that is connected, and its driver"
+        )
+    if not driver.robot or robot is (own := find_robot(driver.robot)):
+        return
+    (flange, motions), (own_flange, own_motions) = (_calc_motions(one) for one in (robot, own))
+    pairs = list(zip(motions, own_motions, strict=True))
+    if isinstance(driver, PoseDriver):
+        pairs.append((flange, own_flange))
+    if not all(one.IsNearlyEqualTo(other, MAX_DIFFERENCE) for one, other in pairs):
+        raise InputError(
+            f"robot={robot.name!r} has other joints, or another flange or base, than {own.name!r}, the arm of "
+            f"{type(driver).__name__}: name the arm that is connected, and its driver"
+        )
+
+
+def _calc_motions(robot: Robot) -> tuple[RigidTransform, list[RigidTransform]]:
+    """Return the flange's pose at zero in the world, and its motion in the base frame for each joint at 1 rad."""
+    plant = MultibodyPlant(0.0)
+    flange = add_robot(plant, robot).flange
+    plant.Finalize()
+    context, base = plant.CreateDefaultContext(), plant.GetFrameByName(robot.base_frame)
+
+    def pose(positions: np.ndarray) -> RigidTransform:
+        plant.SetPositions(context, positions)
+        return flange.CalcPose(context, base)
+
+    n = plant.num_positions()
+    at_zero = pose(np.zeros(n))
+    return flange.CalcPoseInWorld(context), [pose(positions) @ at_zero.inverse() for positions in np.eye(n)]
 
 
 def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:

@@ -50,7 +50,7 @@ class FciDriver(PoseDriver):
     the robot brakes; if it hangs, the robot keeps the last desired pose with the bounded wrench.
     """
 
-    name = "panda"
+    name = robot = "panda"
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
     hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause

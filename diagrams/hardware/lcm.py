@@ -270,7 +270,7 @@ class LcmDriver(Driver):
 class IiwaDriver(LcmDriver):
     """Drake's driver of a KUKA LBR iiwa, in torque mode."""
 
-    name = "iiwa"
+    name, robot = "iiwa", "iiwa14"
     status_channel = "IIWA_STATUS"
     command_channel = "IIWA_COMMAND"
     status_type = lcmt_iiwa_status
@@ -296,7 +296,7 @@ class PandaDriver(LcmDriver):
     Franka's external torque is that of the arm on the surroundings. Reflex limits are those of libfranka's examples.
     """
 
-    name = "panda"
+    name = robot = "panda"
     status_channel = "PANDA_STATUS"
     command_channel = "PANDA_COMMAND"
     status_type = lcmt_panda_status

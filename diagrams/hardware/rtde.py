@@ -58,7 +58,7 @@ class RtdeDriver(PoseDriver):
     1 / `WATCHDOG_FREQUENCY`, the controller ends its program and the arm stops.
     """
 
-    name = "ur5e"
+    name = robot = "ur5e"
     torque_reflex_limits = EXTERNAL_TORQUE_LIMITS
     has_command_timeout = True
     hold_off = 0.25  # statuses are checked for this time before the first command [s]
@@ -92,7 +92,7 @@ class RtdeDriver(PoseDriver):
         self._has_failed_to_stop = False  # the controller may still apply the last wrench
         self._stopping: threading.Thread | None = None
         self._plant = MultibodyPlant(0.0)
-        self._flange = add_robot(self._plant, find_robot(self.name)).flange
+        self._flange = add_robot(self._plant, find_robot(self.robot)).flange
         self._plant.Finalize()
         self._context = self._plant.CreateDefaultContext()
         self._X_FlangeTool = RigidTransform()

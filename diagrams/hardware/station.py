@@ -15,6 +15,7 @@ from guiderail.diagrams.hardware.driver import (
     Driver,
     PoseDriver,
     RobotImpedance,
+    check_robot,
     find_driver,
     safety_limits,
     torque_tolerance,
@@ -85,7 +86,8 @@ class HardwareStation(Station):
     =====================  =====  =====================================================================================
 
     Attributes:
-        driver, period, control_period, limits, status_limits, impedance: As given to the constructor, or by default.
+        driver, robot, period, control_period, limits, status_limits, impedance: As given to the constructor, or by
+            default.
         controller_plant: The arm as the controller models it.
     """
 
@@ -129,14 +131,15 @@ class HardwareStation(Station):
             control_period: Time between commands of a skill [s], a whole multiple of `period`.
 
         Raises:
-            InputError: If the robot has no driver, the address is unusable, the settling time is shorter than the
-                driver's hold-off, or the control period is no multiple of `period`.
+            InputError: If the robot has no driver or does not fit it (`check_robot`), the address is unusable, the
+                settling time is shorter than the driver's hold-off, or the control period is no multiple of `period`.
         """
         super().__init__()
         robot = find_robot(robot)
         if not isinstance(driver, Driver):
             driver = find_driver(driver or robot)(robot_url)
-        self.driver = driver
+        check_robot(driver, robot)
+        self.driver, self.robot = driver, robot
         self.period = period = driver.period if period is None else period
         self.control_period = control_period
         whole_multiple(control_period, period)
@@ -149,7 +152,7 @@ class HardwareStation(Station):
                 f"the driver {driver.name} accepts no commands for {driver.hold_off:g} s: the settling time must be as "
                 f"long, not {self.status_limits.settling_time:g} s"
             )
-        self.impedance, self._robot, self._end_effector = impedance, robot, end_effector
+        self.impedance, self._end_effector = impedance, end_effector
         self._robot_timeout, self._wrench_time_constant, self._tare = robot_timeout, wrench_time_constant, tare
         self._build()
 
@@ -331,7 +334,7 @@ class HardwareStation(Station):
             self._wrench_time_constant,
             self._robot_timeout,
             self._end_effector,
-            robot=self._robot,
+            robot=self.robot,
             limits=self.limits,
             status_limits=self.status_limits,
             tare=self._tare,

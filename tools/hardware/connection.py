@@ -122,7 +122,8 @@ class RobotConnection:
 
     def __post_init__(self) -> None:
         if not self.robot:
-            object.__setattr__(self, "robot", find_driver(self.driver).name if self.driver else DEFAULT_ROBOT)
+            own = find_driver(self.driver) if self.driver else None
+            object.__setattr__(self, "robot", own.robot or own.name if own else DEFAULT_ROBOT)
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and (driver := self.driver or self.robot) not in SIMULATED:

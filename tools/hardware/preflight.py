@@ -196,7 +196,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     else:
         monitor = "no heartbeat: start guiderail safety-monitor on the driver's machine"
     return [
-        Check("robot", f"{driver.name}, {len(positions)} joints, {driver}", True),
+        Check("robot", f"{station.robot.name}, {len(positions)} joints, {driver}", True),
         Check("monitor", monitor, driver.has_command_timeout or has_monitor),
         Check(
             "joints",

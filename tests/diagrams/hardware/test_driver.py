@@ -1,17 +1,23 @@
 """A driver without messages: a robot in the same process that implements `read` and `write` only."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
-from guiderail.diagrams.hardware.driver import DRIVERS, Driver, find_driver, register_driver, safety_limits
+from guiderail.diagrams.hardware.driver import DRIVERS, Driver, PoseDriver, find_driver, register_driver, safety_limits
+from guiderail.diagrams.hardware.fci import FciDriver
+from guiderail.diagrams.hardware.lcm import IiwaDriver, PandaDriver
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
+from guiderail.diagrams.hardware.rtde import RtdeDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import JointStatus
+from guiderail.models.robots.robot import find_robot
 from guiderail.systems.torque_safety_limiter import ArmState
 
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
@@ -90,6 +96,31 @@ def test_driver_is_found_by_name_when_registered(registered):
     assert find_driver("direct_arm") is DirectDriver
     plant = ArmControllerPlant(BncWorkcell()).plant
     assert (np.array(safety_limits(plant, DirectDriver).torque) <= 0.9 * 60.0).all()
+
+
+IIWA = replace(find_robot("iiwa14"), name="mine", flange_frame="iiwa_link_7")  # a user's model of the same arm
+
+
+@pytest.mark.parametrize(
+    ("driver", "robot", "message"),
+    [
+        (IiwaDriver, "ur5e", "robot='ur5e' has 6 joints, and IiwaDriver moves an arm of 7"),
+        (RtdeDriver, "panda", "robot='panda' has 7 joints, and RtdeDriver moves an arm of 6"),
+        (PandaDriver, "iiwa14", "robot='iiwa14' has other joints, .* than 'panda', the arm of PandaDriver"),
+        (FciDriver, "iiwa14", "robot='iiwa14' has other joints, .* than 'panda', the arm of FciDriver"),
+        (FciDriver, replace(find_robot("panda"), flange_frame="panda_link7"), "another flange"),
+        (FciDriver, replace(find_robot("panda"), name="mine"), None),
+        (IiwaDriver, IIWA, None),
+    ],
+)
+def test_robot_that_does_not_fit_the_driver_is_refused(driver, robot, message):
+    connection = {"client": object()} if issubclass(driver, PoseDriver) else {}
+    driver = driver("192.0.2.1" if connection else "memq://", **connection)
+    if message is None:
+        HardwareStation(BncWorkcell(), driver, robot=robot)
+    else:
+        with pytest.raises(InputError, match=message):
+            HardwareStation(BncWorkcell(), driver, robot=robot)
 
 
 def test_safety_monitor_raises_when_commands_are_not_shown():

@@ -298,7 +298,7 @@ def test_external_torque_is_that_of_the_surroundings():
 
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
 def test_limits_are_below_the_drivers_reflex_limits(robot):
-    station = HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://")), robot=robot)
+    station = HardwareStation(WORKCELL, find_driver(robot)(DrakeLcm("memq://")), robot=robot)
     torque_reflex_limits = np.array(station.driver.torque_reflex_limits)
     assert (np.array(station.limits.torque) < torque_reflex_limits).all()
     assert (np.array(station.limits.external_torque) < torque_reflex_limits).all()

@@ -70,8 +70,8 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
 
 def test_simulated_franka_is_in_lockstep():
     assert RobotConnection(sim=True, robot="panda", driver="fci").synchronous
-    robots = {driver: RobotConnection(driver=driver, robot_url="192.0.2.1").robot for driver in ("fci", "rtde", "")}
-    assert robots == {"fci": "panda", "rtde": "ur5e", "": "iiwa14"}
+    expected = {"fci": "panda", "rtde": "ur5e", "iiwa14": "iiwa14", "": "iiwa14"}
+    assert {driver: RobotConnection(driver=driver, robot_url="192.0.2.1").robot for driver in expected} == expected
     assert not RobotConnection(robot="panda", driver="fci", robot_url="192.0.2.1").synchronous
     assert not RobotConnection(sim=True).synchronous
 

@@ -59,7 +59,9 @@ def make_executor(monkeypatch):
 
 def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path):
     executor, clock = make_executor(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert all(check.passed in (True, None) for check in executor.preflight.run())
+    checks = executor.preflight.run()
+    assert all(check.passed in (True, None) for check in checks)
+    assert checks[0].description.startswith("iiwa14, 7 joints")
     messages = []
     outcome = executor.run(messages.append)
     assert (outcome.description, outcome.steps, outcome.exit_code) == ("executed to its end", 20, 0)
@@ -262,6 +264,13 @@ def test_deploy_exits_with_2_when_there_is_no_run(capsys, tmp_path):
         main(["deploy", str(tmp_path), "--sim"])
     assert end.value.code == 2
     assert "not a run" in capsys.readouterr().err
+
+
+def test_deploy_exits_with_2_when_the_driver_moves_another_robot(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["deploy", "pretrained:connector", "--robot=ur5e", "--driver=iiwa14", "--robot-url=memq://", "--yes"])
+    assert end.value.code == 2
+    assert "robot='ur5e' has 6 joints" in capsys.readouterr().err
 
 
 def test_deploy_exits_with_2_when_given_another_policy(capsys):
