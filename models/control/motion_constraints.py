@@ -119,6 +119,10 @@ class MotionConstraintFilter:
     If the start is outside of the constraints (after a push, or because the constraints moved), the commands move back
     inside; from then on every command satisfies all constraints.
 
+    A motion that starts with a velocity (see `start`) is stopped before the constraints even if its acceleration is
+    then too large in the first step. If it is faster than the largest speed, it slows down within the largest
+    acceleration.
+
     Args:
         constraints: Constraints.
         period: Time between two commands h [s], positive.
@@ -142,9 +146,21 @@ class MotionConstraintFilter:
         self._has_acceleration = bool(np.isfinite(self._max_change).any())
         self._identity = np.eye(self.num_outputs)
 
-    def start(self, pose: np.ndarray) -> np.ndarray:
-        """Return the state (2 O,) at rest at a pose (O,): the last command and its displacement in one step."""
-        return np.concatenate([pose, np.zeros(self.num_outputs)])
+    def start(self, pose: np.ndarray, displacement: np.ndarray | None = None) -> np.ndarray:
+        """Return the state (2 O,) at a pose (O,): the last command and its displacement (O,) in one step, 0 by default.
+
+        If a motion cannot brake within the largest acceleration before it leaves the constraints, its displacement is
+        multiplied by a share below 1 with which it can: the acceleration limit gives way, once.
+        """
+        if displacement is None:
+            return np.concatenate([pose, np.zeros(self.num_outputs)])
+        safe, share = 0.0, 1.0
+        if not self._can_brake(pose, displacement):
+            for k in range(1, _BISECTIONS + 1):
+                share = safe + 0.5**k
+                safe = share if self._can_brake(pose, share * displacement) else safe
+            share = safe
+        return np.concatenate([pose, share * displacement])
 
     def apply(self, state: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the next state (2 O,), which begins with the command, and True if only braking was left.
@@ -197,6 +213,32 @@ class MotionConstraintFilter:
             safe, unsafe = (middle, unsafe) if is_safe(brake + middle * (nearest - brake)) else (safe, middle)
         command = brake + safe * (nearest - brake)
         return np.concatenate([command, command - last]), safe == 0.0
+
+    def _can_brake(self, pose: np.ndarray, displacement: np.ndarray) -> bool:
+        """Return True if braking from a pose (O,) keeps the constraints, or does not violate them more than the pose.
+
+        `displacement` (O,) is that of the step before.
+        """
+        brake, rest = (pose + share * displacement for share in self._braking(displacement))
+        constraints, rounding = self.constraints, -_PLANE[1]
+        G, c = constraints.linear.G, constraints.linear.c
+        if not (c - G @ rest <= np.maximum(c - G @ pose, rounding)).all():
+            return False
+        for shape in constraints.outside:
+            first, last = pose[: shape.num_dims], rest[: shape.num_dims]
+            normal, bound = shape.separate(first, last)
+            if not bound - min(normal @ first, normal @ last) <= max(-shape.distance(first), rounding):
+                return False
+        for shape in constraints.inside:
+            # The distance is convex: along a line that does not end inside, it decreases only if it does so at the end.
+            distance, normal = shape.surface(rest[: shape.num_dims])
+            if not (distance <= rounding or normal @ displacement[: shape.num_dims] <= 0.0):
+                return False
+        return all(
+            one.violation(each) <= max(one.violation(pose), rounding)
+            for one in constraints.state
+            for each in (brake, rest)
+        )
 
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
         """Return the braking displacements, of the next step and until rest, as shares of the last displacement (O,).

@@ -26,8 +26,9 @@ class Command:
         output: Command (O,).
         violation: Largest violation of the constraints, max(c − G y), or of the motion's constraints if there is a
             motion filter; negative if all constraints are slack, −inf without constraints.
-        is_fallback: True if no window within the constraints was found, or if the motion filter had to brake. Without a
-            window, the primitive's output is the point nearest to the last command within the constraints of its step.
+        is_fallback: True if no window within the constraints was found, or if the motion filter had to brake or, in the
+            first step, to exceed its largest acceleration. Without a window, the primitive's output is the point
+            nearest to the last command within the constraints of its step.
     """
 
     output: np.ndarray
@@ -46,7 +47,9 @@ class PrimitiveStepper:
         history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
             or is pushed by an operator.
         motion: Filter of the commands by constraints of the motion; none by default. The filter starts at the pose:
-            at rest, or with the velocity of the last two outputs if `pose` holds several.
+            at rest, or with the velocity of the last two outputs if `pose` holds several. If the motion cannot brake
+            within the filter's largest acceleration before it leaves the constraints, the first command exceeds that
+            acceleration.
 
     Raises:
         InputError: If an argument has the wrong shape or is not finite, or `motion` is no filter of O outputs.
@@ -81,9 +84,9 @@ class PrimitiveStepper:
         self._last = primitive.constraints.nearest(first)
         self._motion = motion
         if motion is not None:
-            self._state = motion.start(recent[-1])
-            if len(recent) > 1:
-                self._state[primitive.num_outputs :] = recent[-1] - recent[-2]
+            displacement = recent[-1] - recent[-2] if len(recent) > 1 else np.zeros(primitive.num_outputs)
+            self._state = motion.start(recent[-1], displacement)
+            self._is_slowed = not np.array_equal(self._state[primitive.num_outputs :], displacement)
 
     def step(self, action: ArrayLike, pose: ArrayLike | None = None) -> Command:
         """Compute the command of the next control step.
@@ -125,7 +128,8 @@ class PrimitiveStepper:
         if self._motion is not None:
             self._state, is_braking = self._motion.apply(self._state, self._last)
             self._last = self._state[: len(self._last)]
-            violation, is_fallback = self._motion.constraints.violation(self._last), is_fallback or is_braking
+            violation = self._motion.constraints.violation(self._last)
+            is_fallback, self._is_slowed = is_fallback or is_braking or self._is_slowed, False
         command = Command(self._last.copy(), violation, is_fallback)
         if not self._is_measured:
             self._append(self._last)

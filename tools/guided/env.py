@@ -43,7 +43,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     - `constraint_violation`: largest violation by the commands of the action. It is negative inside the constraints,
       0 inside those of a template, and −inf without constraints. It is at most 1e-9 for guidance that enforces the
       constraints, except while a motion that began outside `MotionConstraints` or outside a template moves inside.
-    - `fallback`: number of the action's steps without a solution, or in which only braking was left.
+    - `fallback`: number of the action's steps without a solution, in which only braking was left, or in which a segment
+      exceeded its largest acceleration because the motion was too fast to brake within its other constraints.
     - `phase`: phase of the motion, 0 to 1.
     - `command`: last command (O,) in the world.
     - `segment`: name of the segment or of the template's state.

@@ -40,8 +40,8 @@ class GuideCommand:
     output: np.ndarray  # command (O,) in the world
     # Violation of the segment's constraints, negative inside and −inf without constraints; of a template's, 0 inside.
     violation: float
-    # True if no command within the constraints was found, so that the command is the last one or near it, or if only
-    # braking was left.
+    # True if no command within the constraints was found, so that the command is the last one or near it, if only
+    # braking was left, or if a segment that began too fast exceeded its largest acceleration.
     is_fallback: bool
     extra: Any  # discrete output of the segment, for `to_action`
 

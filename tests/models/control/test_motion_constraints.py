@@ -105,6 +105,38 @@ def test_only_braking_is_left_when_a_wall_is_as_near_as_braking_takes():
         assert after[0] == pytest.approx(0.6, abs=1e-6)
 
 
+@pytest.mark.parametrize("dims", [1, 2, 3, 6])
+@pytest.mark.parametrize("kind", ["linear", "outside", "inside", "state"])
+def test_start_that_is_too_fast_to_brake_exceeds_only_the_acceleration(dims, kind):
+    """One output moves at 1 m/s and is 5 cm before its limit; at 2 m/s², it brakes within 25 cm."""
+    limit = LinearConstraints(-np.eye(dims)[:1], np.array([-0.05]))
+    shapes = {"outside": [Sphere(np.eye(dims)[0] * 0.15, 0.1)], "inside": [Sphere(np.zeros(dims), 0.05)]}
+    shapes["state"] = [FirstOutputLimit(limit)]
+    linear = limit if kind == "linear" else LinearConstraints.none(dims)
+    motion = MotionConstraints(linear, max_acceleration=[2.0] * dims, **{kind: shapes[kind]} if kind in shapes else {})
+    law, goal = MotionConstraintFilter(motion, PERIOD), np.eye(dims)[0]
+    slow, fast = 0.006 * goal, 0.02 * goal
+    np.testing.assert_array_equal(law.start(np.zeros(dims), slow), [*np.zeros(dims), *slow])
+    state, positions = law.start(np.zeros(dims), fast), []
+    for _ in range(40):
+        state, _ = law.apply(state, goal)
+        positions.append(state[0])
+        assert motion.violation(state[:dims]) <= 1e-9
+    assert 0.0 < positions[0] < 0.02 - 2.0 * PERIOD**2  # more than the largest acceleration
+    assert max(positions) == pytest.approx(0.05, abs=1e-4)
+    assert np.abs(np.diff(positions, 2)).max() <= 2.0 * PERIOD**2 * (1 + 1e-6)
+    beyond = law.start(goal, fast)[dims]  # farther outside, or away from the obstacle
+    assert beyond == 0.02 if kind == "outside" else beyond < 2.0 * PERIOD**2
+
+
+def test_start_outside_that_would_cross_the_inside_stops():
+    law = MotionConstraintFilter(
+        MotionConstraints(LinearConstraints.none(1), inside=[Sphere([0.0], 0.01)], max_acceleration=[2.0]), PERIOD
+    )
+    for speed, is_kept in ((0.004, True), (0.02, False)):
+        assert (law.start(np.array([-0.02]), np.array([speed]))[1] == speed) == is_kept
+
+
 def test_room_without_a_width_leaves_motion_along_it():
     """Constraints do not contradict each other at the last command, so that a next command exists."""
     walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
@@ -155,6 +187,19 @@ def test_constraints_raise_when_an_argument_is_out_of_range(arguments, match):
 def test_filter_raises_when_the_period_is_not_positive(period):
     with pytest.raises(InputError, match="period"):
         MotionConstraintFilter(MotionConstraints(LINEAR), period)
+
+
+class FirstOutputLimit:
+    """State constraint with the linear constraints of its argument."""
+
+    def __init__(self, linear):
+        self.linear = linear
+
+    def linearize(self, output):
+        return self.linear.G, self.linear.c
+
+    def violation(self, output):
+        return self.linear.violation(output)
 
 
 class AngleLimit:

@@ -142,3 +142,14 @@ def test_filter_starts_with_the_velocity_of_two_outputs(history):
     assert abs(first[0] - 0.02) <= PERIOD**2 * (1 + 1e-9)
     with pytest.raises(InputError, match="pose must be 2 finite numbers"):
         p.start([[0.0, 0.0], [0.01, 0.0]])
+
+
+def test_motion_that_cannot_brake_is_stopped_with_a_fallback():
+    p = primitive(0)
+    wall = LinearConstraints(np.array([[0.0, -1.0]]), np.array([-0.02]))
+    for speed, is_fallback in ((0.0004, False), (0.01, True)):
+        motion = MotionConstraintFilter(MotionConstraints(wall, max_acceleration=[1.0, 1.0]), PERIOD)
+        stepper = p.start([[0.0, -speed], [0.0, 0.0]], motion=motion)
+        commands = [stepper.step([0.0, 0.0]) for _ in range(3)]
+        assert commands[0].is_fallback == is_fallback
+        assert max(command.violation for command in commands) <= 1e-9

@@ -543,6 +543,22 @@ def test_acceleration_limit_holds_from_segment_to_segment(guidance, history):
     assert changes[at - 2 : at].max() <= 4.0 * (1 + 1e-6)
 
 
+@pytest.mark.parametrize("guidance", ["kgrl", "kmp", "skgrl"])
+def test_segment_that_begins_too_fast_stays_outside_of_an_obstacle(guidance):
+    first, second = (replace(part, frame=None, until=None, dwell=0) for part in two_segments())
+    env = guided(guidance, demonstrations=[first, second], constraints=None, frame=None, action_repeat=1)
+    plain = episode(env, lambda k: np.zeros(3))[1:]
+    at = next(k for k, info in enumerate(plain) if info["segment"] != plain[0]["segment"])
+    move = plain[at - 1]["command"] - plain[at - 2]["command"]
+    ball = Sphere(plain[at - 1]["command"] + 0.06 * move / np.linalg.norm(move), 0.05)
+    limits = MotionConstraints(LinearConstraints.none(3), [ball], max_acceleration=np.full(3, 0.2))
+    parts = [first, replace(second, constraints=limits)]
+    env = guided(guidance, demonstrations=parts, constraints=None, frame=None, action_repeat=1)
+    infos = episode(env, lambda k: np.zeros(3))[1:]
+    assert max(info["constraint_violation"] for info in infos[at:]) <= TOLERANCE
+    assert infos[at]["fallback"] == 1
+
+
 @pytest.mark.parametrize(("guidance", "last"), [("kgrl", 3.14), ("skgrl", 3.16)])
 def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
     def turning(first, last):
