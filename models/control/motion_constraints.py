@@ -21,6 +21,10 @@ from guiderail.models.primitives.qp import solve_least_norm
 # Distances from a shape and from the plane of a linear constraint: first the distance at which the QP aims, then the
 # smaller distance that every command keeps. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
+# Largest distance of a desired command from the last one [unit of the output]; one farther away counts as one at this
+# distance, because the command is their sum with a move that is rounded at their size.
+_REACH = 1e4
+_ROUNDING = 5e-7  # largest share of the width of the box of speed and acceleration by which the solver may leave it
 _CUTS = 4  # number of linearizations of the `inside` shapes
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
 
@@ -173,6 +177,7 @@ class MotionConstraintFilter:
         braking = np.concatenate([brake, brake - last]), True
         if not is_finite(desired):
             return braking
+        desired = np.minimum(np.maximum(desired, last - _REACH), last + _REACH)
         G, c = self._linearize(last, rest)
         slack = np.minimum(G @ last, G @ rest) - c
         is_shape = np.arange(len(c)) < len(self.constraints.outside) + len(self.constraints.inside)
@@ -190,6 +195,8 @@ class MotionConstraintFilter:
         nearest = next((command for command in attempts if command is not None), None)
         if nearest is None:
             return braking
+        if (np.maximum(lower - nearest, nearest - upper) > _ROUNDING * (upper - lower)).any():
+            nearest = np.minimum(np.maximum(nearest, lower), upper)
         inside = [(shape, max(-_SHAPE[1], shape.distance(rest[: shape.num_dims]))) for shape in self.constraints.inside]
         further = [(one, max(0.0, one.violation(rest))) for one in self.constraints.state]
 

@@ -57,6 +57,19 @@ def test_every_constraint_holds_for_any_desired_command(limits):
             np.testing.assert_allclose(np.abs(actual).max(axis=0), limit, rtol=1e-6)  # reached, and not exceeded
 
 
+@pytest.mark.parametrize("size", [1e8, 1e20, 1e150, 1e300])
+def test_every_constraint_holds_for_a_huge_desired_command(size):
+    motion = MotionConstraints(LinearConstraints.none(2), OUTSIDE, INSIDE, SPEED, ACCELERATION)
+    law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
+    state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
+    for k in range(200):
+        desired = rng.choice([size, -size, 1e9, 0.3], 2) if k % 8 == 0 else desired
+        last, (state, _) = state, law.apply(state, desired)
+        assert motion.violation(state[:2]) <= 1e-9
+        assert (np.abs(state[2:]) <= SPEED * PERIOD * (1 + 1e-6)).all()
+        assert (np.abs(state[2:] - last[2:]) <= ACCELERATION * PERIOD**2 * (1 + 1e-6)).all()
+
+
 def test_allowed_command_is_unchanged_and_another_one_is_nearest():
     law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE), PERIOD)
     state = law.start(np.array([0.3, 0.3]))
