@@ -23,8 +23,9 @@ class ChunkSafetyLimiter(LeafSystem):
     """Execute the chunks of a policy within bounds, velocity limits and jerk limits (`ChunkGuard`).
 
     Every ``replan_steps`` control steps, from the first one on, the chunk is limited as a continuation of the last
-    three commands. In between, the limited chunk is executed. The motion starts at rest, at the pose inside the bounds
-    that is nearest to the measured pose.
+    three commands. In between, the limited chunk is executed. The motion starts at rest at the measured pose. If it is
+    outside the bounds, the first command leads inside, or the pose is held, with a fallback, if no step within the
+    limits leads inside.
 
     .. pydrake_system::
 
@@ -84,8 +85,13 @@ class ChunkSafetyLimiter(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the rest of the previous chunk is executed, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        start = self._guard.constraints.nearest(declare.start_pose(self._pose_port, context))
-        discrete_state.set_value(np.append(np.tile(start, 3 + self._num_steps), np.zeros(3)))
+        measured = declare.start_pose(self._pose_port, context)
+        try:
+            first = self._guard.nearest_start(measured)
+        except InputError:  # too far outside
+            first = measured
+        motion = np.concatenate([np.tile(measured, 3), np.tile(first, self._num_steps)])
+        discrete_state.set_value(np.append(motion, np.zeros(3)))
 
     def _calc_plan(self, context: Context) -> _Plan:
         *motion, rate, fallback, step = context.get_discrete_state().value(self._state)

@@ -109,8 +109,17 @@ class ChunkGuard:
         The first command leads inside within the limits of velocity and jerk.
 
         Raises:
-            InputError: If the output has the wrong shape or is not finite, or one step within the limits does not lead
-            inside.
+            InputError: As `nearest_start`.
+        """
+        self.reset(self.nearest_start(measured))
+        self._past = np.tile(as_numbers(measured, "the measured start"), (3, 1))
+
+    def nearest_start(self, measured: np.ndarray) -> np.ndarray:
+        """Return the output (O,) inside the constraints to which the first step leads from rest at a measured one.
+
+        Raises:
+            InputError: If the measured output has the wrong shape or is not finite, or one step within the limits does
+                not lead inside.
         """
         measured, outputs = as_numbers(measured, "the measured start"), self.constraints.num_outputs
         if measured.shape != (outputs,) or not np.isfinite(measured).all():
@@ -124,8 +133,7 @@ class ChunkGuard:
                 f"number {number} of the measured start is {distance[number]:.4g} outside of the bounds, and one step "
                 f"within the limits leads at most {reach[number]:.4g} inside: move the robot, or widen the bounds"
             )
-        self.reset(inside)
-        self._past = np.tile(measured, (3, 1))
+        return inside
 
     def guard(self, chunk: np.ndarray, num_executed: int | None = None) -> GuardedChunk:
         """Return the chunk within the limits, and record its first `num_executed` steps as executed.

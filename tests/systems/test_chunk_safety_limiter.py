@@ -74,12 +74,18 @@ def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite(number, e
     assert (rate == 1.0 - fallback).all()
 
 
-def test_motion_starts_at_the_nearest_pose_inside_the_bounds():
-    inside, outside = [0.02, -0.03], [0.2, -0.03]
-    for pose, start in ((inside, inside), (outside, [0.05, -0.03])):
-        commands, *_ = run(np.tile(start, (REPLAN, STEPS, 1)), pose)
-        np.testing.assert_allclose(commands, np.tile(start, (REPLAN, 1)), atol=1e-5)
-        assert (np.abs(commands) <= BOUND).all()
+@pytest.mark.parametrize("chunk", [[0.05, -0.03], [0.0, np.nan]])
+@pytest.mark.parametrize(("x", "first"), [(0.02, 0.02), (0.0501, 0.05), (0.051, 0.051), (0.2, 0.2)])
+def test_motion_from_the_measured_pose_keeps_the_limits(x, first, chunk):
+    """One step leads at most 0.4 mm inside the bound at 50 mm; from farther outside the measured pose is held."""
+    commands, _, fallback = run(np.tile(chunk, (REPLAN, STEPS, 1)), [x, -0.03])
+    motion = np.concatenate([np.tile([x, -0.03], (3, 1)), commands])
+    assert (np.abs(np.diff(motion, axis=0)) <= VELOCITY * PERIOD).all()
+    assert (np.abs(np.diff(motion, n=3, axis=0)) <= JERK * PERIOD**3 * (1 + 1e-9)).all()
+    np.testing.assert_allclose(commands[0], [first, -0.03], atol=5e-4)
+    is_outside = first > BOUND[0]
+    assert fallback.all() == (is_outside or np.isnan(chunk[1]))
+    assert (commands == [x, -0.03]).all() if is_outside else (np.abs(commands) <= BOUND).all()
 
 
 def test_argument_is_refused_when_it_is_out_of_range():
