@@ -12,7 +12,12 @@ from guiderail.models.control.cartesian_impedance import JointTorques, impedance
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import (
+    effort_limits,
+    orientation_error,
+    pose_to_transform,
+    transform_to_pose,
+)
 from guiderail.systems.support.last_valid_bound import LastValidBound
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
@@ -94,12 +99,15 @@ class CartesianImpedanceController(LeafSystem):
     is not connected, commands never time out. ``max_wrench`` is (8,), limits of [fx fy fz tx ty tz] along the axes of
     the gains, of the norm of the force and of the norm of the torque [N, Nm]; it lowers the bound and cannot raise it.
     While one of its numbers is NaN or negative, the last valid one remains in force (`LastValidBound`).
-    ``generalized_force`` is (n,), joint torques [Nm]. ``impedance_wrench`` is (6,), force first, in the axes of T.
+    ``generalized_force`` is (n,), joint torques [Nm], in the order of the plant's velocities, as ``estimated_state``.
+    The actuation port of a plant has the order of its actuators; if this is another one, connect it by a `MatrixGain`
+    with the matrix ``plant.MakeActuationMatrix().T``. ``impedance_wrench`` is (6,), force first, in the axes of T.
     ``saturation`` (1,) is 1 while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid
     command is available.
 
     Args:
-        plant: Model of the arm and its payload alone, finalized; its kinematics and inertia are used.
+        plant: Model of the arm and its payload alone, finalized, with one actuator for each joint; its kinematics,
+            inertia and effort limits are used.
         target: Frame T, fixed in the world.
         tool_center: Frame P.
         gains: Impedance parameters.
@@ -110,7 +118,8 @@ class CartesianImpedanceController(LeafSystem):
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range, or the posture does not have n joints.
+        InputError: If an argument is out of range, the posture does not have n joints, or a joint has no actuator or
+            several.
     """
 
     def __init__(
@@ -132,7 +141,7 @@ class CartesianImpedanceController(LeafSystem):
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
         self._stiffness_frame = stiffness_frame
         self._compensate_gravity = compensate_gravity
-        self._torque_limits = plant.GetEffortUpperLimits()
+        self._torque_limits = effort_limits(plant)
 
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._estimated_state_port = self.DeclareVectorInputPort("estimated_state", 2 * num_joints)

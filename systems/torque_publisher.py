@@ -22,8 +22,8 @@ class TorquePublisher(LeafSystem):
         - is_sending
         - is_holding
 
-    ``torque`` is (n,) [Nm]. ``is_sending`` is (1,); no message is sent while it is 0. ``is_holding`` is (1,), 1 while
-    the driver has to hold the arm.
+    ``torque`` is (n,) [Nm], in the order that `write` takes. ``is_sending`` is (1,); no message is sent while it is 0.
+    ``is_holding`` is (1,), 1 while the driver has to hold the arm.
 
     Args:
         write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.

@@ -114,9 +114,9 @@ class TorqueSafetyLimiter(LeafSystem):
         - not_following
 
     ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,), ``external_torque`` (n,)
-    [Nm], ``wrench`` (6,), force first. ``pose`` and ``desired_pose`` are (6,); their positions are checked.
-    ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s], are outputs of a `StatusWatchdog`.
-    ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
+    [Nm], joints in the order of the plant's positions. ``wrench`` is (6,), force first. ``pose`` and ``desired_pose``
+    are (6,); their positions are checked. ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s],
+    are outputs of a `StatusWatchdog`. ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
 
     ``fault`` is (1,), the code of the `Fault` that stopped the arm, otherwise that of a present fault, or 0.
     ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are

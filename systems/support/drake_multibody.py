@@ -1,9 +1,11 @@
-"""Conversion between poses and Drake's rigid transforms, and joint dynamics of a plant."""
+"""Conversion between poses and Drake's rigid transforms, and joint dynamics and limits of a plant."""
 
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context
+
+from guiderail.models.common.errors import InputError
 
 
 class JointDynamics:
@@ -14,13 +16,36 @@ class JointDynamics:
     """
 
     def __init__(self, plant: MultibodyPlant):
-        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
-        self._plant, self._damping = plant, np.concatenate([joint.default_damping_vector() for joint in joints])
+        self._plant, self._damping = plant, np.zeros(plant.num_velocities())
+        for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
+            start = joint.velocity_start()  # joints are numbered in the order of the model file, velocities by the tree
+            self._damping[start : start + joint.num_velocities()] = joint.default_damping_vector()
 
     def evaluate(self, plant_context: Context) -> tuple[np.ndarray, np.ndarray]:
         """Return the mass matrix (n, n) and the torques of Coriolis forces and damping (n,) [Nm]."""
         drag = self._plant.CalcBiasTerm(plant_context) + self._damping * self._plant.GetVelocities(plant_context)
         return self._plant.CalcMassMatrix(plant_context), drag
+
+
+def effort_limits(plant: MultibodyPlant) -> np.ndarray:
+    """Return the effort limits of the joints of a plant, (n,) [Nm], in the order of its velocities.
+
+    `MultibodyPlant.GetEffortUpperLimits` has the order of the actuators, which may be another one.
+
+    Raises:
+        InputError: If a joint has no actuator or several.
+    """
+    limits = np.full(plant.num_velocities(), np.nan)
+    for actuator in (plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()):
+        limits[actuator.joint().velocity_start()] = actuator.effort_limit()
+    if np.isnan(limits).any() or plant.num_actuators() != len(limits):
+        joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+        names = ", ".join(joint.name() for joint in joints if joint.num_velocities())
+        raise InputError(
+            f"a plant whose joint torques are controlled needs one actuator for each of its joints ({names}), "
+            f"not {plant.num_actuators()} actuators"
+        )
+    return limits
 
 
 def pose_to_transform(pose: np.ndarray) -> RigidTransform:

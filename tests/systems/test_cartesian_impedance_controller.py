@@ -14,7 +14,13 @@ from pydrake.multibody.plant import (
     ExternallyAppliedSpatialForce,
     MultibodyPlant,
 )
-from pydrake.multibody.tree import FixedOffsetFrame, JacobianWrtVariable, SpatialInertia
+from pydrake.multibody.tree import (
+    FixedOffsetFrame,
+    JacobianWrtVariable,
+    PrismaticJoint,
+    RevoluteJoint,
+    SpatialInertia,
+)
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
@@ -442,6 +448,45 @@ def test_constructor_refuses_a_posture_of_another_arm():
     (model, arm), gains = controller_model(WORKCELL), ImpedanceGains(STIFFNESS, LIMITS, np.zeros(6))
     with pytest.raises(InputError, match="7 joints"):
         CartesianImpedanceController(model, arm.target, arm.tool_center, gains, period=0.005)
+
+
+def six_axes(motors):
+    """Return a plant of three prismatic and three revolute axes, and its tool; axis i is limited to i + 1."""
+    plant, axes = MultibodyPlant(0.0), []
+    tool = plant.world_body()
+    for index, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
+        child = plant.AddRigidBody(f"link{index}", SpatialInertia.SolidSphereWithMass(0.3, 0.05))
+        kind = PrismaticJoint if index < 3 else RevoluteJoint
+        axes.append(plant.AddJoint(kind(f"axis{index}", tool.body_frame(), child.body_frame(), axis)))
+        tool = child
+    for index in motors:
+        plant.AddJointActuator(f"motor{len(plant.GetJointActuatorIndices())}", axes[index], index + 1.0)
+    plant.Finalize()
+    return plant, tool
+
+
+def controller_of(plant, tool):
+    gains = ImpedanceGains(STIFFNESS, np.full(6, 1e6), np.zeros(6))
+    return CartesianImpedanceController(plant, plant.world_frame(), tool.body_frame(), gains, period=0.01)
+
+
+@pytest.mark.parametrize("motors", [range(6), (5, 4, 3, 2, 1, 0), (2, 0, 1, 5, 3, 4)])
+def test_each_joint_has_the_limit_of_its_own_motor(motors):
+    plant, tool = six_axes(motors)
+    controller = controller_of(plant, tool)
+    context = controller.CreateDefaultContext()
+    controller.get_desired_pose_input_port().FixValue(context, [5.0, 5.0, 5.0, 0.0, 0.0, 0.0])
+    controller.get_estimated_state_input_port().FixValue(context, np.r_[np.zeros(6), np.full(6, -100.0)])
+    torque = controller.get_generalized_force_output_port().Eval(context)
+    np.testing.assert_array_equal(torque, np.arange(1, 7))
+    # As documented, the transposed actuation matrix maps the torques to the order of the motors.
+    np.testing.assert_array_equal(plant.MakeActuationMatrix().T @ torque, [index + 1 for index in motors])
+
+
+@pytest.mark.parametrize("motors", [(), (0, 1), range(5), (0, 1, 2, 3, 4, 4), (0, 1, 2, 3, 4, 5, 5)])
+def test_plant_needs_one_motor_for_each_joint(motors):
+    with pytest.raises(InputError, match=rf"one actuator for each .*axis0, axis1, .*, not {len(motors)} actuators"):
+        controller_of(*six_axes(motors))
 
 
 def test_ports_and_feedthrough():
