@@ -11,7 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -97,7 +97,7 @@ class ActiveConstraintProjector(LeafSystem):
         self._measured_violation_port = declare.scalar_output(
             self, "measured_violation", self._measured_violation, [*constraints, self._pose_port]
         )
-        declare.update(self, period, self._update, self._start)
+        declare.update_after_start(self, period, self._update, self._start)
 
     get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
@@ -155,9 +155,8 @@ class ActiveConstraintProjector(LeafSystem):
         command = transform_to_pose(self._template.command(state, X_WE, X_WE, frames, self._period).X_WE)
         if not np.isfinite(command).all():
             raise InputError(f"the frames of the template {self._template.name} must be finite at the start")
-        discrete_state.set_value(np.concatenate([command, measured]))
+        discrete_state.set_value(self._last, np.concatenate([command, measured]))
 
-    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)
-        discrete_state.set_value(np.concatenate([command, measured]))
+        discrete_state.set_value(self._last, np.concatenate([command, measured]))

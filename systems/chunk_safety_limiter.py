@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.chunk_guard import MIN_STEPS, ChunkGuard
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class ChunkSafetyLimiter(LeafSystem):
         )
         self._rate_port = declare.part_output(self, "rate", self._plan, lambda plan: plan.rate)
         self._fallback_port = declare.part_output(self, "fallback", self._plan, lambda plan: plan.fallback)
-        declare.update(self, period, self._advance, self._reset)
+        declare.update_after_start(self, period, self._advance, self._reset)
 
     get_chunk_input_port = input_getter("chunk", "requested outputs, (K*O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,), read at initialization")
@@ -91,7 +91,7 @@ class ChunkSafetyLimiter(LeafSystem):
         except InputError:  # too far outside
             first = measured
         motion = np.concatenate([np.tile(measured, 3), np.tile(first, self._num_steps)])
-        discrete_state.set_value(np.append(motion, np.zeros(3)))
+        discrete_state.set_value(self._state, np.append(motion, np.zeros(3)))
 
     def _calc_plan(self, context: Context) -> _Plan:
         *motion, rate, fallback, step = context.get_discrete_state().value(self._state)
@@ -104,9 +104,8 @@ class ChunkSafetyLimiter(LeafSystem):
         limited = self._guard.limit(requested, past, rest)
         return _Plan(limited.outputs, limited.rate, float(limited.is_fallback))
 
-    @after_start
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
         state, plan = context.get_discrete_state().value(self._state), self._plan.Eval(context)
         past = state[self._outputs : 3 * self._outputs]
         values = [past, plan.outputs.ravel(), plan.outputs[-1], [plan.rate, plan.fallback, state[-1] + 1.0]]
-        discrete_state.set_value(np.concatenate(values))
+        discrete_state.set_value(self._state, np.concatenate(values))

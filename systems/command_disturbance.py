@@ -60,6 +60,7 @@ class CommandDisturbance(LeafSystem):
             self, "delivered_command", size, self._delivered, [self._is_lost, self._last_delivered, source]
         )
         declare.update(self, period, self._update, self._reset)
+        self._start = declare.start_time(self)
 
     get_command_input_port = input_getter("command", "command, (n,)")
     get_pose_input_port = input_getter("pose", "measured pose, (n,)")
@@ -84,8 +85,8 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state().value(self._count).item() + 1.0
         discrete_state.set_value(self._count, [count])
-        # At time zero no period has ended: the value of the port before this instant's updates is not a command.
-        has_ended = context.get_time() > 0
+        # At the start no period has ended: the value of the port before this instant's updates is not a command.
+        has_ended = declare.has_started(context, self._start)
         if has_ended:
             discrete_state.set_value(self._last_delivered, self._delivered(context))
         if has_ended and self._delay_line is not None:

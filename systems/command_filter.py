@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.control.command_filters import CommandLaw
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class CommandFilter(LeafSystem):
@@ -52,7 +52,7 @@ class CommandFilter(LeafSystem):
             self, "safe_pose", self._command, lambda command: command[:outputs], outputs
         )
         self._intervention_port = declare.part_output(self, "intervention", self._command, lambda command: command[-1])
-        declare.update(self, period, self._update, self._reset)
+        declare.update_after_start(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
@@ -60,11 +60,10 @@ class CommandFilter(LeafSystem):
     get_intervention_output_port = output_getter("intervention", "flag that the law intervened, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._law.start(declare.start_pose(self._pose_port, context)))
+        discrete_state.set_value(self._last, self._law.start(declare.start_pose(self._pose_port, context)))
 
-    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._command.Eval(context)[:-1])
+        discrete_state.set_value(self._last, self._command.Eval(context)[:-1])
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the next state, which begins with the safe command, and the intervention flag."""

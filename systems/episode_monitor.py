@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, after_start, check_takes, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_takes, output_getter
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
@@ -104,7 +104,7 @@ class EpisodeMonitor(LeafSystem):
         # The output and the event of the same instant share one evaluation.
         self._next = declare.cache(self, "next_state", self._calc_next, [*self._signals.tickets, self._state])
         self._termination_port = declare.part_output(self, "termination", self._next, lambda state: state[-1])
-        declare.update(self, period, self._update, declare.reset_to_default(self))
+        declare.update_after_start(self, period, self._update, declare.reset_to_default(self))
 
     get_signal_input_port = declare.get_signal_input_port
     get_termination_output_port = output_getter("termination", "index into `TERMINATIONS`, (1,)")
@@ -126,6 +126,5 @@ class EpisodeMonitor(LeafSystem):
                 state[-1] = self._indices[i]
         return state
 
-    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._next.Eval(context))
+        discrete_state.set_value(self._state, self._next.Eval(context))

@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class HistoryBuffer(LeafSystem):
@@ -51,7 +51,7 @@ class HistoryBuffer(LeafSystem):
         self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
         self._state = self.DeclareDiscreteState(length * num_outputs)
         self._history_port = self.DeclareStateOutputPort("history", self._state)
-        declare.update(self, period, self._shift, self._fill)
+        declare.update_after_start(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
     get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,); optional")
@@ -59,9 +59,8 @@ class HistoryBuffer(LeafSystem):
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
         initial = self._initial_output_port if self._initial_output_port.HasValue(context) else self._output_port
-        discrete_state.set_value(np.tile(initial.Eval(context), self._shape[0]))
+        discrete_state.set_value(self._state, np.tile(initial.Eval(context), self._shape[0]))
 
-    @after_start
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
         remaining = context.get_discrete_state().value(self._state)[self._shape[1] :]
-        discrete_state.set_value(np.concatenate([remaining, self._output_port.Eval(context)]))
+        discrete_state.set_value(self._state, np.concatenate([remaining, self._output_port.Eval(context)]))

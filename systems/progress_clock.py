@@ -38,15 +38,15 @@ class ProgressClock(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", num_outputs)
         self._time = self.DeclareDiscreteState(1)
         self._motion_time_port = self.DeclareStateOutputPort("motion_time", self._time)
-        declare.update(self, period, self._update, declare.reset_to_default(self))
+        reset = declare.reset_to_default(self)
+        self._start = declare.update_after_start(self, period, self._update, reset)
 
     get_command_input_port = input_getter("command", "last command, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_motion_time_output_port = output_getter("motion_time", "time of the motion, (1,) [s]")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        clock = round(context.get_time() / self._period)
-        if clock > 0:  # no command has been executed at time zero
-            step = round(context.get_discrete_state().value(self._time).item() / self._period)
-            command, pose = self._command_port.Eval(context), self._pose_port.Eval(context)
-            discrete_state.set_value([self._period * self._rule.next_step(step, clock, command, pose)])
+        clock = round(context.get_time() / self._period) - declare.start_step(context, self._start, self._period)
+        step = round(context.get_discrete_state().value(self._time).item() / self._period)
+        command, pose = self._command_port.Eval(context), self._pose_port.Eval(context)
+        discrete_state.set_value(self._time, [self._period * self._rule.next_step(step, clock, command, pose)])

@@ -33,7 +33,7 @@ class Recorder(LeafSystem):
 
     The sample at the instant k·period contains the values just before that instant: the command since (k−1)·period and
     the resulting motion, as one row of a demonstration. Recording stops after `num_samples` samples. The samples are
-    declared state, which a reset clears.
+    declared state, which a reset or an initialization clears.
 
     .. pydrake_system::
 
@@ -65,7 +65,7 @@ class Recorder(LeafSystem):
         self._count = self.DeclareDiscreteState(1)
         self._samples = self.DeclareDiscreteState(num_samples * self._width)
         self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)
-        declare.update(self, period, self._record)
+        self._start = declare.update_after_start(self, period, self._record, declare.reset_to_default(self))
 
     get_signal_input_port = declare.get_signal_input_port
     get_num_recorded_output_port = output_getter("num_recorded", "number of samples so far, (1,)")
@@ -77,14 +77,13 @@ class Recorder(LeafSystem):
         ends = np.cumsum(list(self._sizes.values()))
         columns = np.split(samples, ends[:-1], axis=1)
         return Recording(
-            times=np.arange(count) * self._period,
+            times=(np.arange(count) + declare.start_step(context, self._start, self._period)) * self._period,
             signals={name: column.copy() for name, column in zip(self._sizes, columns, strict=True)},
         )
 
     def _record(self, context: Context, discrete_state: DiscreteValues) -> EventStatus:
         count = int(context.get_discrete_state().value(self._count)[0])
-        # No step has ended at time zero. An event offset of one period cannot be used; see `declarations.after_start`.
-        if context.get_time() == 0 or count == self._num_samples:
+        if count == self._num_samples:
             return EventStatus.DidNothing()
         row = np.concatenate(list(self._signals.eval(context).values()))
         samples = discrete_state.get_mutable_value(self._samples)

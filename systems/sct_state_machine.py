@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import after_start, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -66,7 +66,7 @@ class SctStateMachine(LeafSystem):
         self._progress_port = declare.scalar_output(
             self, "progress", lambda context: template.progress(*self._state_pose_frames(context)), sources
         )
-        declare.update(self, period, self._update, self._start)
+        declare.update_after_start(self, period, self._update, self._start)
 
     get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
     get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
@@ -80,9 +80,8 @@ class SctStateMachine(LeafSystem):
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
-        discrete_state.set_value([float(self._template.state_at(X_WE, self.frames.eval(context)))])
+        discrete_state.set_value(self._state, [float(self._template.state_at(X_WE, self.frames.eval(context)))])
 
-    @after_start
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         state = self._template.next_state(*self._state_pose_frames(context), self._period)
-        discrete_state.set_value([float(state)])
+        discrete_state.set_value(self._state, [float(state)])

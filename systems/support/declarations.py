@@ -1,7 +1,7 @@
 """Declarations that systems share: periods, samples, cache entries, and ports with their getters."""
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import wraps
 from inspect import signature
 from typing import Any, TypeAlias
 
@@ -15,6 +15,7 @@ from pydrake.systems.framework import (
     DependencyTicket,
     DiscreteStateIndex,
     DiscreteValues,
+    EventStatus,
     InputPort,
     LeafSystem,
     OutputPort,
@@ -188,23 +189,6 @@ def start_pose(port: InputPort, context: Context) -> np.ndarray:
     return np.asarray(pose)
 
 
-def after_start(
-    update: Callable[[Any, Context, DiscreteValues], None],
-) -> Callable[[Any, Context, DiscreteValues], None]:
-    """Return a method of a system that updates the discrete state except at time zero, when no step has ended.
-
-    An event offset of one period cannot be used: period + k * period differs from (k + 1) * period in the last bit for
-    about a quarter of all k.
-    """
-
-    @wraps(update)
-    def update_after_start(self: Any, context: Context, discrete_state: DiscreteValues) -> None:
-        if context.get_time() > 0:
-            update(self, context, discrete_state)
-
-    return update_after_start
-
-
 def update(
     system: LeafSystem,
     period: float,
@@ -222,10 +206,61 @@ def update(
     system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, calc)
 
 
+_TIME_TOLERANCE = 1e-9  # tolerance of the start time [s], far above rounding errors after days, far below any period
+
+
+def start_time(system: LeafSystem) -> DiscreteStateIndex:
+    """Declare and return a discrete state (1,) with the time of the last initialization [s]; see `has_started`."""
+    state = system.DeclareDiscreteState(1)
+
+    def calc(context: Context, discrete_state: DiscreteValues) -> None:
+        discrete_state.set_value(state, [context.get_time()])
+
+    system.DeclareInitializationDiscreteUpdateEvent(calc)
+    return state
+
+
+def has_started(context: Context, start: DiscreteStateIndex) -> bool:
+    """Return False at the time of initialization, when no step has ended; `start` is a system's `start_time`.
+
+    Drake triggers the periodic events of the time of initialization, too. An event offset of one period cannot be used:
+    period + k * period differs from (k + 1) * period in the last bit for about a quarter of all k.
+    """
+    return bool(context.get_time() > context.get_discrete_state().value(start).item() + _TIME_TOLERANCE)
+
+
+def start_step(context: Context, start: DiscreteStateIndex, period: float) -> int:
+    """Return the number of the control step of a `period` [s], counted from time zero, in which a system started."""
+    time = context.get_discrete_state().value(start).item()
+    return math.floor((time + _TIME_TOLERANCE) / period)
+
+
+def update_after_start(
+    system: LeafSystem,
+    period: float,
+    calc: Callable[[Context, DiscreteValues], Any],
+    reset: Callable[[Context, DiscreteValues], Any] | None = None,
+) -> DiscreteStateIndex:
+    """Declare an `update` that is omitted at the time of initialization, when no step has ended.
+
+    Returns:
+        State with the `start_time`. It is declared here, so that the values of the other states need their indices.
+
+    Raises:
+        InputError: If the period is not positive and finite.
+    """
+
+    def calc_after_start(context: Context, discrete_state: DiscreteValues) -> Any:
+        return calc(context, discrete_state) if has_started(context, start) else EventStatus.DidNothing()
+
+    update(system, period, calc_after_start, reset)
+    start = start_time(system)  # after the reset, which may restore the default of every state
+    return start
+
+
 def reset_to_default(system: LeafSystem) -> Callable[[Context, DiscreteValues], None]:
-    """Return a reset that restores the defaults of the discrete states; call this after all are declared."""
-    default = system.AllocateDiscreteVariables()
-    return lambda context, discrete_state: discrete_state.SetFrom(default)
+    """Return a reset that restores the defaults of the discrete states."""
+    return lambda context, discrete_state: discrete_state.SetFrom(system.AllocateDiscreteVariables())
 
 
 def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:

@@ -138,7 +138,7 @@ def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
     system.get_pose_input_port().FixValue(context, [0.0, 0.0])
     simulator.Initialize()
     simulator.AdvanceTo(1.5 * PERIOD)
-    last = context.get_discrete_state_vector().value().copy()
+    last = system.get_safe_pose_output_port().Eval(context)
     desired.GetMutableData().set_value([0.0, bad])
     simulator.AdvanceTo(2.5 * PERIOD)
     np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), last)

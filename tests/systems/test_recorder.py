@@ -66,6 +66,18 @@ def test_reset_clears_the_samples(ramp):
     assert len(read(simulator, recorder).times) == 0
 
 
+def test_initialization_clears_the_samples_and_the_times_begin_there(ramp):
+    simulator, recorder = ramp
+    simulator.AdvanceTo(2.5 * PERIOD)
+    simulator.get_mutable_context().SetTime(8 * PERIOD)
+    simulator.Initialize()
+    assert len(read(simulator, recorder).times) == 0
+    simulator.AdvanceTo(10.5 * PERIOD)
+    recording = read(simulator, recorder)
+    np.testing.assert_array_equal(recording.times, [8 * PERIOD, 9 * PERIOD])
+    np.testing.assert_allclose(recording["measured"][:, 0], [9, 10])
+
+
 def test_recording_is_a_copy(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(2.5 * PERIOD)

@@ -1,0 +1,65 @@
+"""Systems that update at the end of a step behave alike for every start time that is a multiple of the period."""
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail import systems
+from guiderail.models.control.chunk_guard import ChunkGuard
+from guiderail.models.control.command_filters import BarrierFilter
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives.stepper import StateProgress
+
+PERIOD = 0.02
+BOX = LinearConstraints.box([-1.0], [1.0])
+
+
+def chunk_limiter():
+    return systems.ChunkSafetyLimiter(ChunkGuard(BOX, [1.0], [90.0], period=PERIOD, start=[0.0]), 8, 3, PERIOD)
+
+
+def command_filter():
+    return systems.CommandFilter(BarrierFilter(KeepOut(np.zeros((0, 1)), np.zeros((0, 1)), BOX, 0.0), 0.5), PERIOD)
+
+
+def monitor():
+    return systems.EpisodeMonitor([systems.TerminationTerm("success", {"x": 1}, lambda x: True, steps=3)], PERIOD)
+
+
+CASES = {
+    "history": (lambda: systems.HistoryBuffer(1, 3, PERIOD), {"output": [1.0], "initial_output": [9.0]}),
+    "filter": (command_filter, {"desired_pose": [5.0], "pose": [0.0]}),
+    "recorder": (lambda: systems.Recorder({"x": 1}, 9, PERIOD), {"x": [1.0]}),
+    "clock": (
+        lambda: systems.ProgressClock(StateProgress((0.01, 0.1), 2), 1, PERIOD),
+        {"command": [1.0], "pose": [0.0]},
+    ),
+    "chunk limiter": (chunk_limiter, {"chunk": np.full(8, 0.5), "pose": [0.0]}),
+    "disturbance": (lambda: systems.CommandDisturbance(1, PERIOD, 0.0, 2), {"command": [1.0], "pose": [0.0]}),
+    "monitor": (monitor, {"x": [1.0]}),
+}
+
+
+def run(make, inputs, start):
+    """Return the first output at initialization and in the middle of the control steps from `start` on."""
+    system = make()
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    context.SetTime(start)
+    for name, value in inputs.items():
+        system.GetInputPort(name).FixValue(context, value)
+    simulator.Initialize()
+    values = [system.get_output_port(0).Eval(context)]
+    for step in range(6):
+        simulator.AdvanceTo(start + (step + 0.5) * PERIOD)
+        values.append(system.get_output_port(0).Eval(context))
+    return values
+
+
+@pytest.mark.parametrize("steps", [1, 29, 50, 43210])
+@pytest.mark.parametrize("case", CASES)
+def test_start_at_a_multiple_of_the_period_is_a_start_at_zero(case, steps):
+    expected = run(*CASES[case], 0.0)
+    assert len(np.unique(expected, axis=0)) > 1
+    np.testing.assert_allclose(run(*CASES[case], steps * PERIOD), expected, rtol=0.0, atol=1e-9)
