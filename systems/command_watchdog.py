@@ -37,7 +37,7 @@ class CommandWatchdog(LeafSystem):
         pose_size: Number of coordinates O, at least 1.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):

@@ -33,7 +33,7 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,), in the order of the plant's joint positions. ``wrench``
     is (6,), at the tool center P in the axes of T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without
-    direct feedthrough: one sample old, and zero in a default context. The first sample initializes the filter, because
+    direct feedthrough: one sample old, and zero after an initialization. The first sample initializes the filter, because
     a filter that starts at zero would not have reached the sensors' bias when it is tared. Samples that are not finite
     are skipped, and torques are clipped to `MAX_TORQUE`, so that the filter forgets a single false sample of any size
     within a few time constants.
@@ -74,7 +74,7 @@ class JointTorqueWrench(LeafSystem):
         self._has_sample = self.DeclareDiscreteState(1)
         self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
         self._plant_context = declare.plant_context(self, plant, self._positions_port.Eval, [self._positions_port])
-        declare.update(self, period, self._sample)
+        declare.update(self, period, self._sample, declare.reset_to_default(self))
 
     get_positions_input_port = input_getter("positions", "measured joint positions, (n,) [rad]")
     get_external_torque_input_port = input_getter("external_torque", "external joint torques, (n,) [Nm]")

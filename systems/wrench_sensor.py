@@ -35,7 +35,7 @@ class WrenchSensor(LeafSystem):
         - wrench
 
     The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is a
-    discrete state without direct feedthrough: one sample old, and zero in the default context.
+    discrete state without direct feedthrough: one sample old, and zero after an initialization.
 
     Args:
         plant: Finalized plant, connected to this system.
@@ -93,7 +93,7 @@ class WrenchSensor(LeafSystem):
         )
         self._state = self.DeclareDiscreteState(6)
         self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
-        declare.update(self, period, self._sample)
+        declare.update(self, period, self._sample, declare.reset_to_default(self))
 
     def connect(self, builder: DiagramBuilder, plant: MultibodyPlant) -> None:
         """Connect all inputs to the output ports of the plant."""

@@ -183,7 +183,15 @@ def start_pose(port: InputPort, context: Context) -> np.ndarray:
     Raises:
         InputError: If the pose is not finite.
     """
-    pose = port.Eval(context)
+    return check_start_pose(port.Eval(context))
+
+
+def check_start_pose(pose: np.ndarray) -> np.ndarray:
+    """Return the measured pose (O,), which is the first command of a motion.
+
+    Raises:
+        InputError: If the pose is not finite.
+    """
     if not is_finite(pose):
         raise InputError(f"the first command is the measured pose: the measured pose must be finite, not {pose}")
     return np.asarray(pose)

@@ -37,13 +37,17 @@ class CommandValidity:
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
 
     def is_valid(self, context: Context, time: float) -> bool:
-        """Return True if the present command is valid at `time` [s]; `context` is the system's."""
+        """Return True if the present command is valid; `context` is the system's.
+
+        Its age is computed for `time` [s], the time of a check, and its lead for the time of the context, which may be
+        up to a period later.
+        """
         if not all(abs(number) <= _MAX_COORDINATE for number in self._desired_pose.Eval(context).tolist()):
             return False  # for NaN too
         if not self._command_time.HasValue(context):
             return True
-        age = time - float(self._command_time.Eval(context)[0])
-        return self._min_age <= age <= self._max_age
+        stamp = float(self._command_time.Eval(context)[0])
+        return time - stamp <= self._max_age and context.get_time() - stamp >= self._min_age
 
 
 class LastValidPose:
@@ -52,9 +56,10 @@ class LastValidPose:
     The last valid pose and the time of the last check are discrete states, updated by a periodic event. Validity is
     evaluated for the time of the last check, not for the present time: outputs that depend on it are then computed
     again only when the command changes or an event occurs. A command becomes stale at the first event after its
-    timeout; a new command is valid at once. Before the first valid command the pose is the one measured at
-    initialization. While the blend factor is zero, the robot is not controlled, and the last valid pose is the measured
-    one: a robot without a valid command is held where control begins.
+    timeout; a new command is valid at once, unless it is too far in the future at that time. Before the first valid
+    command the pose is the one measured at initialization, which must be finite. While the blend factor is zero, the
+    robot is not controlled, and the last valid pose is the measured one: a robot without a valid command is held where
+    control begins.
 
     Args:
         system: System under construction, in which two states and two events are declared.
@@ -113,7 +118,7 @@ class LastValidPose:
         return port is None or not port.HasValue(context) or port.Eval(context)[0] > 0.0
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._last_pose, self._measured_pose(context))
+        discrete_state.set_value(self._last_pose, declare.check_start_pose(self._measured_pose(context)))
         discrete_state.set_value(self._check_time, [context.get_time()])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

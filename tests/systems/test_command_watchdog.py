@@ -91,9 +91,13 @@ def test_command_is_ignored_when_it_is_in_the_future(phase):
     rig.check(FIRST, command_timed_out=1)
 
 
-def test_command_is_valid_when_it_leads_by_less_than_a_period():
+@pytest.mark.parametrize("phase", [0.0, 0.3, 0.9])
+def test_command_is_valid_when_it_leads_by_less_than_a_period(phase):
     rig = Rig(FIRST, time=0.5 * PERIOD)
     rig.check(FIRST, command_timed_out=0)
+    rig.advance((3 + phase) * PERIOD)
+    rig.command(SECOND, time=rig.context.get_time() + 0.9 * PERIOD)
+    rig.check(SECOND, command_timed_out=0)
 
 
 def test_command_is_ignored_when_its_time_stamp_is_not_finite():
@@ -116,6 +120,12 @@ def test_coordinate_is_checked_at_its_limit(sign, size, command_timed_out):
     command = np.array([0.0, 0.0, 0.0, sign * size, 0.0, 0.0])
     rig = Rig(command)
     rig.check(START if command_timed_out else command, command_timed_out)
+
+
+@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
+def test_measured_pose_must_be_finite_at_initialization(nonsense):
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        Rig(FIRST, start=np.full(6, nonsense))
 
 
 @pytest.mark.parametrize("nonsense", [np.nan, np.inf])

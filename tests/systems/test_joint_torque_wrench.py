@@ -57,6 +57,11 @@ def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
     torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
     simulator.AdvanceTo(0.055)  # events at 10, 20, 30, 40 and 50 ms
     np.testing.assert_allclose(output.Eval(context), first * (2.0 - np.exp(-0.5)), atol=1e-9)
+    context.SetTime(0.0)
+    simulator.Initialize()
+    np.testing.assert_array_equal(output.Eval(context), np.zeros(6))
+    simulator.AdvanceTo(0.005)  # the first sample initializes the filter again
+    np.testing.assert_allclose(output.Eval(context), 2.0 * first, atol=1e-9)
 
 
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}, {"damping": np.inf}])

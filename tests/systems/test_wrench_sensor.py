@@ -85,6 +85,8 @@ def test_filter_is_a_first_order_low_pass():
     samples = 51  # the events at 10 … 60 ms
     expected = 2.0 * (1.0 - np.exp(-samples * PERIOD / 0.05))
     assert np.linalg.norm(swinging.wrench[:3]) == pytest.approx(expected, rel=1e-6)
+    swinging.simulator.Initialize()
+    np.testing.assert_array_equal(swinging.wrench, np.zeros(6))
 
 
 def test_wrench_starts_at_zero_without_direct_feedthrough():
