@@ -33,10 +33,10 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,), in the order of the plant's joint positions. ``wrench``
     is (6,), at the tool center P in the axes of T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without
-    direct feedthrough: one sample old, and zero after an initialization. The first sample initializes the filter, because
-    a filter that starts at zero would not have reached the sensors' bias when it is tared. Samples that are not finite
-    are skipped, and torques are clipped to `MAX_TORQUE`, so that the filter forgets a single false sample of any size
-    within a few time constants.
+    direct feedthrough: one sample old, and zero after an initialization. The first sample initializes the filter,
+    because a filter that starts at zero would not have reached the sensors' bias when it is tared. Samples that are not
+    finite are skipped, and torques are clipped to `MAX_TORQUE`, so that the filter forgets a single false sample of any
+    size within a few time constants.
 
     Args:
         plant: Model of the arm alone, finalized.
