@@ -80,14 +80,17 @@ class BaselinePolicy(Callback):
     """Policy that ignores the observation, with a new random generator in every episode."""
 
     def __init__(self, factory: BaselineFactory, env: gymnasium.Env, seed: int = 0):
-        """Construct the policy with the action size of `env`; the generator of episode i has the seed [seed, i]."""
+        """Construct the policy with the action size of `env`; the generator of episode number i has the seed [seed, i].
+
+        The number is that of the last `start_episode` and counts on with every episode; without it, it begins at 0.
+        """
         self._factory, self._seed, self._episode = factory, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
-    def start_episode(self, index: int) -> None:
-        """Make `on_episode_start` begin episode `index`, whichever episodes this process has run before."""
-        self._episode = index - 1
+    def start_episode(self, number: int) -> None:
+        """Make `on_episode_start` begin episode `number`, whichever episodes this process has run before."""
+        self._episode = number - 1
 
     def on_episode_start(self) -> None:
         """Make the policy of the next episode."""

@@ -69,13 +69,14 @@ def evaluate_policies(
     labels: Mapping[str, str] | None = None,
     collect: Collect | None = None,
     processes: int | None = 1,
+    first_number: int | None = None,
 ) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
     """Evaluate several policies on the same held-out episodes of one environment.
 
     Episodes are distributed over forks of this process. The conditions of an episode depend only on its seed, so the
     results do not depend on the number of processes. A policy with internal state must reset it in
     `Callback.on_episode_start`. A policy that samples random numbers must seed its generator in a method
-    `start_episode(index)`, which is called before each episode.
+    `start_episode(number)`, which is called before each episode with a number that depends on the episode's seed.
 
     Args:
         env: Environment. Its values that are constant in a run do not change without the reset option `new_run`.
@@ -86,6 +87,8 @@ def evaluate_policies(
         labels: Labels of the progress bars on standard error, by policy name; no bar by default.
         collect: Function from the environment and an episode's row to the data to keep of the episode.
         processes: Largest number of processes; None for the number of cores.
+        first_number: Number for `start_episode` in the first episode, from which the others count on; by default
+            `seed` - `HELD_OUT_SEED`, modulo 2^32.
 
     Yields:
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
@@ -98,11 +101,12 @@ def evaluate_policies(
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     names = list(policies)
+    first = seed - HELD_OUT_SEED if first_number is None else first_number
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
         act, index = policies[names[number // episodes]], number % episodes
         if (start := getattr(act, "start_episode", None)) is not None:
-            start(index)
+            start((first + index) % 2**32)
         row = rollout(env, act, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 

@@ -289,7 +289,9 @@ def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
         rng, number = np.random.default_rng([eval_set.first_seed, done]), min(every, eval_set.episodes - done)
         sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in eval_set.sampled.items()}
         seed = eval_set.first_seed + done
-        rows = evaluate_run(config, policy, environment | sampled, episodes=number, seed=seed, options=eval_set.options)
+        how: dict[str, Any] = {"episodes": number, "seed": seed, "options": eval_set.options}
+        # Every set has the same random actions, from the run's seed alone, so that published tables stay as they are.
+        rows = evaluate_run(config, policy, environment | sampled, **how, first_number=0)
         tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
     return pd.concat(tables, ignore_index=True)
 

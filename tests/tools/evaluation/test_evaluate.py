@@ -24,12 +24,24 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import Run
 
 
-def test_episode_conditions_depend_on_its_seed_alone():
+@pytest.mark.parametrize("make_policy", [zero_policy, partial(BaselinePolicy, uniform_random)])
+def test_episode_depends_on_its_seed_alone(make_policy):
     env = make_environment("Bead", {})
-    four = evaluate_policy(env, lambda observation: np.zeros(2), episodes=4, seed=20)
+    four = evaluate_policy(env, make_policy(env), episodes=4, seed=20)
     assert four["return"].nunique() == 4
-    second = evaluate_policy(env, lambda observation: np.zeros(2), episodes=2, seed=22)
+    second = evaluate_policy(env, make_policy(env), episodes=2, seed=22)
     assert second["return"].tolist() == four["return"][2:].tolist()
+
+
+@pytest.mark.parametrize(("seed", "first"), [(HELD_OUT_SEED, 0), (HELD_OUT_SEED + 8, 8), (0, 2**32 - HELD_OUT_SEED)])
+def test_random_numbers_of_an_episode_are_seeded_by_its_seed(seed, first):
+    env, numbers = make_environment("Bead", {}), []
+    policy = zero_policy(env)
+    policy.start_episode = numbers.append
+    evaluate_policy(env, policy, episodes=2, seed=seed)
+    assert numbers == [first, first + 1]
+    evaluate_policy(env, policy, episodes=2, seed=seed, first_number=0)
+    assert numbers[2:] == [0, 1]
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
