@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ import scipy  # `scipy.stats` is imported on first use
 
 from guiderail.diagrams.envs.trace import EpisodeTrace, Metric, mean_jerk
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.arrays import find_streak
+from guiderail.models.common.arrays import as_whole, find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 
 CONFIDENCE = 0.95  # level of all confidence intervals
 RESAMPLES = 1000  # number of bootstrap resamples
+MEAN_RESAMPLES = 20_000  # the same for an interquartile mean, whose resamples take few distinct values
+MAX_ENUMERATED = 6  # number of seeds up to which all their resamples are used
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 REPORTS_SUCCESS = "reports_success"  # column of an outside environment: 1 if `info` had a success, true or not
@@ -44,17 +46,25 @@ def interquartile_mean(values: Sequence[float]) -> tuple[float, tuple[float, flo
     mean = float(scipy.stats.trim_mean(array, TRIMMED_FRACTION))
     if len(array) < 2:
         return mean, None
-    low, high = _bootstrap(array, lambda x, axis: scipy.stats.trim_mean(x, TRIMMED_FRACTION, axis=axis))
+    if np.ptp(array) == 0:  # SciPy warns if there is nothing to resample
+        return mean, (mean, mean)
+    size = len(array)
+    if size <= MAX_ENUMERATED:  # the interval is exact
+        means = scipy.stats.trim_mean(array[np.indices((size,) * size).reshape(size, -1)], TRIMMED_FRACTION, axis=0)
+        low, high = np.quantile(means, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE], method="inverted_cdf")
+    else:
+        trimmed = partial(scipy.stats.trim_mean, proportiontocut=TRIMMED_FRACTION)
+        low, high = _bootstrap(array, trimmed, MEAN_RESAMPLES)
     return mean, (float(low), float(high))
 
 
-def _bootstrap(values: np.ndarray, statistic: Any) -> tuple[Any, Any]:
+def _bootstrap(values: np.ndarray, statistic: Any, resamples: int = RESAMPLES) -> tuple[Any, Any]:
     """Return the ends of the 95 % percentile interval of a statistic over the first axis, by resampling."""
     if np.ptp(values, axis=0).max() == 0:  # SciPy warns if there is nothing to resample
         mean = statistic(values, axis=0)
         return mean, mean
     interval = scipy.stats.bootstrap(
-        (values,), statistic, axis=0, vectorized=True, confidence_level=CONFIDENCE, n_resamples=RESAMPLES,
+        (values,), statistic, axis=0, vectorized=True, confidence_level=CONFIDENCE, n_resamples=resamples,
         method="percentile", rng=np.random.default_rng(0),
     ).confidence_interval  # fmt: skip
     return interval.low, interval.high
@@ -172,7 +182,9 @@ COLUMNS = (
     Metric("return", "reward", "sum of all rewards, undiscounted", lambda e: e.total),
     Metric("success", "", "1 if the task was done", lambda e: int(bool(e.info["is_success"]))),
     Metric("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})", lambda e: e.termination),
-    Metric("steps", STEPS, "length", lambda e: len(e.trace)),
+    Metric(
+        "steps", STEPS, "length (actions in an outside environment that does not count them)", lambda e: len(e.trace)
+    ),
     Metric("peak_force", "N", "largest contact force of any control step", _statistic("peak_force")),
     Metric("mean_force", "N", "contact force, mean over control steps", _statistic("mean_force")),
     Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
@@ -205,8 +217,12 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
 
     `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step;
     without either in any step, the column `REPORTS_SUCCESS` is 0. The largest `constraint_violation` and
-    `contact_force` of any step are the columns `max_commanded_violation` and `peak_force`. `is_terminated` is False if
-    the episode was truncated.
+    `contact_force` of any step are the columns `max_commanded_violation` and `peak_force`. `steps` is the last
+    `control_steps`, which `GuidedEnv` counts, or without it the number of actions. `is_terminated` is False if the
+    episode was truncated.
+
+    Raises:
+        InputError: If `control_steps` is no whole number.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -214,7 +230,7 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
         "return": total,
         "success": int(success),
         "termination": "success" if success else "terminated" if is_terminated else "time_limit",
-        "steps": len(infos),
+        "steps": as_whole(infos[-1].get("control_steps", len(infos)), "control_steps in info"),
     }
     for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
         if values := [float(info[name]) for info in infos if name in info]:

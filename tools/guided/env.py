@@ -31,6 +31,7 @@ from guiderail.tools.guided.guide import (
 from guiderail.tools.guided.segment import Constraints, Segment
 
 OBSERVED = ("phase", "command")
+SUCCESSES = ("is_success", "success")  # entries of `info` that say whether the task is done
 
 
 class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -38,7 +39,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     The action is (A,) in [−1, 1], one entry for each of `action_dims` or each input of the template. It is applied for
     `action_repeat` steps of the environment, whose rewards are added up. An episode is truncated when the motion has
-    ended. `info` has these entries in addition to the environment's:
+    ended. `is_success` and `success` in `info` are true if they are true after any of the action's steps. `info` has
+    these entries in addition to the environment's:
 
     - `constraint_violation`: largest violation by the commands of the action. It is negative inside the constraints,
       0 inside those of a template, and −inf without constraints. It is at most 1e-9 for guidance that enforces the
@@ -48,6 +50,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     - `phase`: phase of the motion, 0 to 1.
     - `command`: last command (O,) in the world.
     - `segment`: name of the segment or of the template's state.
+    - `control_steps`: number of steps of `env` since the reset, unless its own `info` counts them.
 
     Args:
         env: Environment to wrap; its own action is what `to_action` returns.
@@ -69,7 +72,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         period: Duration of a step of `env` [s], positive; required for a template, for `MotionConstraints`, and unless
             every segment has `num_steps`.
         action_repeat: Steps of `env` for which an action is applied, at least 1.
-        action_scale: κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
+        action_scale: κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the
+            demonstrations; exactly so for a declared standard deviation (`prior_std`).
         action_dims: Indices of the outputs that an action moves; all by default.
         history: P, number of past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
@@ -156,6 +160,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._is_pending = False  # True if an error kept the environment from a step with `_command`
         self._observation: Any = None
         self._has_begun = False
+        self._num_steps = 0
         self._terminated = self._truncated = False
         self.action_space = Box(-1.0, 1.0, (self.guide.num_actions,), np.float32)
         self.observation_space = self._extended_space(env.observation_space)
@@ -169,6 +174,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._has_begun = False  # an error leaves no episode to continue
         self._observation, info = self.env.reset(seed=seed, options=options)
         self._terminated = self._truncated = self._is_pending = False
+        self._num_steps = 0
         measured = self._measured()
         self.guide.reset(self.env, self._observation, measured)
         self._has_begun = True
@@ -204,6 +210,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._action, self._count, self._reward = checked, 0, 0.0
         self._violation, self._fallbacks = -np.inf, 0
         self._info: dict[str, Any] = {}
+        self._successes: dict[str, Any] = {}
 
     @property
     def is_action_complete(self) -> bool:
@@ -233,14 +240,18 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._reward += float(reward)
         self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
         self._fallbacks += command.is_fallback
+        self._successes |= {name: self._info[name] for name in SUCCESSES if np.any(self._info.get(name, False))}
         self._count += 1
+        self._num_steps += 1
         self._truncated = bool(self._truncated) or (self.guide.is_finished and not self._terminated)
 
     def end_action(self) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Return observation, summed reward, terminated, truncated and info, as `step` does."""
         assert self._command is not None
         info = {
+            "control_steps": self._num_steps,
             **self._info,
+            **self._successes,
             "constraint_violation": self._violation,
             "fallback": self._fallbacks,
             "phase": self.guide.phase,
@@ -311,7 +322,8 @@ class GuidedVectorEnv(SyncVectorEnv):
         **keywords: Keywords of `GuidedEnv`.
 
     Raises:
-        InputError: As `GuidedEnv`, or if `env_fns` is empty or holds something else than functions.
+        InputError: As `GuidedEnv`, or if `env_fns` is empty, holds something else than functions, or two of them return
+            the same environment.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
@@ -327,6 +339,8 @@ class GuidedVectorEnv(SyncVectorEnv):
             return lambda: GuidedEnv(make(), guidance=first.guide.copy(), **own)
 
         super().__init__([lambda: first, *map(wrap, env_fns[1:])], autoreset_mode=AutoresetMode.NEXT_STEP)
+        if len({id(env.unwrapped) for env in self.envs}) < len(self.envs):
+            raise InputError("each of env_fns must return an environment of its own: two of them return the same one")
 
     def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos.

@@ -175,7 +175,7 @@ class GuideSettings:
         InputError: If `history` is not a whole number of at least 1; `PrimitiveGuide` checks the other settings.
     """
 
-    # κ; a constant action of ±1 displaces the motion by √3 κ standard deviations of the demonstrations.
+    # κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
     action_dims: Sequence[int] | None = None  # outputs that an action moves, one entry each; all by default
     history: int = 4  # P, number of past outputs that the motion of sKGRL passes through
@@ -360,6 +360,8 @@ def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> O
     """Return the orientation `given`, or else that of the outputs' names; refuse names that contradict it."""
     if given is not None:
         check_orientation(given)
+        if (number := segments[0].recorded.num_outputs) != POSE_SIZE:
+            raise InputError(f"orientation is that of poses of 6 outputs, and there are {number}: leave it out")
     orientation = given
     for segment in segments:
         stated = orientation_of_names(segment.recorded.names)

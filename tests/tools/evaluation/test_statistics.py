@@ -1,3 +1,5 @@
+import itertools
+
 import numpy as np
 import pytest
 
@@ -28,6 +30,13 @@ def test_interquartile_mean_omits_a_quarter_at_each_end():
     assert interval is not None
     assert interval[0] <= mean <= interval[1]
     assert interquartile_mean([5.0]) == (5.0, None)
+
+
+@pytest.mark.parametrize("scale", [1.0, -1.0])
+def test_interval_of_few_seeds_is_that_of_all_resamples(scale):
+    values = scale * np.array([-16.67216437, -15.0276135, -2.031366, 36.33370554, 52.79995048])
+    means = [np.sort(each)[1:4].mean() for each in itertools.product(values, repeat=5)]
+    np.testing.assert_allclose(interquartile_mean(values)[1], np.percentile(means, [2.5, 97.5]))
 
 
 def test_survival_censors_runs_that_never_converged():

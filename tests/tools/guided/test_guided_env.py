@@ -18,6 +18,7 @@ from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.models.primitives.poses import pose_rotation
 from guiderail.models.templates import load_template
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.guided import guide
 
 TOLERANCE = 1e-9
@@ -348,6 +349,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"observe": None}, "observe has some of phase, command, not None"),
         ({"kind": "dict_with_phase"}, "has an entry 'phase' already"),
         ({"guidance": "residual", "constraints": MotionConstraints(LIMIT, max_speed=np.ones(3))}, "enforce max_speed"),
+        ({"orientation": "euler_zyx"}, "orientation is that of poses of 6 outputs, and there are 3: leave it out"),
     ],
 )
 def test_wrong_argument_is_refused(keywords, message):
@@ -492,6 +494,36 @@ def test_vector_environment_refuses_other_numbers_of_actions(actions):
 def test_vector_environment_needs_functions(env_fns):
     with pytest.raises(InputError, match=r"at least one environment|env_fns are functions"):
         GuidedVectorEnv(env_fns, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+
+
+def test_vector_environment_refuses_one_environment_for_two():
+    env = PointEnv()
+    with pytest.raises(InputError, match="an environment of its own: two of them return the same one"):
+        GuidedVectorEnv([lambda: env] * 2, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+
+
+class Passing(gymnasium.Wrapper):
+    """Environment whose target is reached at the fourth step alone."""
+
+    def step(self, action):
+        self.count = getattr(self, "count", 0) + 1
+        return *self.env.step(action)[:4], {"is_success": self.count == 4}
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+def test_success_inside_an_action_is_reported(is_vector):
+    keywords = {"demonstrations": SHOWN, "pose": pose, "to_action": to_action, "period": PERIOD, "action_repeat": 3}
+    env = GuidedEnv(Passing(PointEnv()), **keywords)
+    if is_vector:
+        env = GuidedVectorEnv([lambda: Passing(PointEnv())] * 2, **keywords)
+    env.reset(seed=0)
+    infos = [env.step(np.zeros(env.action_space.shape))[-1] for _ in range(3)]
+    assert [bool(np.all(info["is_success"])) for info in infos] == [False, True, False]
+    assert [np.max(info["control_steps"]) for info in infos] == [3, 6, 9]
+    if not is_vector:
+        env = GuidedEnv(Passing(PointEnv()), **keywords)
+        row = rollout(env, lambda observation: np.zeros(3), seed=0)
+        assert (row["success"], row["steps"]) == (1, SHOWN.times[0].size)
 
 
 @pytest.mark.parametrize("reason", ["terminated", "truncated"])
