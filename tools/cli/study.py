@@ -42,7 +42,7 @@ def study(
     names = None if methods is None else [name.strip() for name in methods.split(",")]
     chosen = declared.subset(names, cli.parse_integers(seeds, "--seeds"))
     running = make_engine(engine or "process", processes, address)
-    result = study_command(chosen, out, running, declared.subset_name(chosen))
+    result = study_command(chosen, out, running, declared.subset_name(chosen), file=file)
     print_result(result, as_json)
     if "failed" in result:
         raise RunsFailedError(result["failed"], None)

@@ -181,7 +181,8 @@ class Study(_Strict):
     statistics: tuple[str, ...] = ()  # statistics of training in addition to the usual ones
     ratios: tuple[Ratio, ...] = ()  # ratios reported next to the table
     folder: RunName = "{method}-{seed}"  # folder of a run
-    imports: tuple[str, ...] = ()  # modules, files (.py) or task folders that register the task, the learner, …
+    # Modules, files (.py) or task folders that register the task, the learner, …; relative to the working directory.
+    imports: tuple[str, ...] = ()
 
     @property
     def eval_sets(self) -> tuple[EvalSet, ...]:
@@ -238,7 +239,8 @@ class Study(_Strict):
 def load_study(file: Path | str) -> Study:
     """Read a study's YAML file.
 
-    A task may be the path of a task folder, relative to the working directory, as in `guiderail train`.
+    A task may be the path of a task folder. It, and the paths in `imports`, are relative to the working directory, as
+    in `guiderail train`.
 
     Raises:
         InputError: If the file does not exist or is not a valid study, or if the task folder is not valid.
@@ -255,6 +257,11 @@ def load_study(file: Path | str) -> Study:
         raise InputError(f"{path}: {_sentence(error)}") from error
     task, folders = task_named(study.task)
     return study.model_copy(update={"task": task, "imports": (*study.imports, *folders)})
+
+
+def source_file(out: Path, study: str) -> Path:
+    """Return the file, in the folder `out` of a study, that tells from which file the study was run."""
+    return out / "logs" / f"{study}.json"
 
 
 def _sentence(error: ValidationError) -> str:

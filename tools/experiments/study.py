@@ -8,6 +8,7 @@ the engine.
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,11 @@ import pandas as pd
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.metrics import statistics_of, wilson_of_each
-from guiderail.tools.experiments.declaration import Ratio, Study, Sweep
+from guiderail.tools.experiments.declaration import Ratio, Study, Sweep, source_file
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, is_done, run_job
 from guiderail.tools.experiments.progress import StudyProgress
+from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import write_table
@@ -79,6 +81,8 @@ def study_command(
     engine: Engine | None = None,
     table: str | None = None,
     describe_differences: DescribeDifferences | None = None,
+    *,
+    file: Path | None = None,
 ) -> dict[str, Any]:
     """Run a study by `run_study`, write its table as `.csv` and `.md`, draw its sweeps, and return a summary.
 
@@ -88,6 +92,7 @@ def study_command(
         engine: As in `run_study`.
         table: Name of the table and the picture; by default that of the study.
         describe_differences: Function whose sentences the summary has as `differences`, by method.
+        file: File of the study, which a report names in the command that runs the study again.
 
     Returns:
         Summary: paths of the files, and results of each seed by label. `failed` has one sentence for each failed job,
@@ -103,6 +108,9 @@ def study_command(
         rows, result["failed"] = error.rows, error.sentences
         if not len(rows):
             return result
+    if file is not None:
+        source = {"file": str(file), "imports": bool(study.imports)}
+        write_atomically(source_file(out, study.name), json.dumps(source).encode())
     result["table"] = str(write_table(out / (table or study.name), rows.drop(columns="folder")))
     if study.sweeps:
         result["picture"] = str(draw_sweeps(study, rows, out / f"{table or study.name}.png"))

@@ -265,12 +265,12 @@ def _commands(data: ReportData) -> tuple[list[str], list[str]]:
 def _study_commands(counts: pd.DataFrame) -> list[str]:
     """Return the commands that reproduce the studies of a table."""
     commands = []
-    for name in dict.fromkeys(counts["study"]) if len(counts) else ():
+    for name in filter(None, dict.fromkeys(counts["study"]) if len(counts) else ()):  # not of single runs
         rows = counts[counts["study"] == name]
         methods, seeds = ([str(one) for one in dict.fromkeys(rows[column])] for column in ("method", "seed"))
-        study = str(rows["part_of"].iloc[0])
-        part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if study else ""
-        commands.append(f"guiderail study {study or name}.yaml{part} --out studies")
+        part_of, source = (str(rows[column].iloc[0]) for column in ("part_of", "source"))
+        part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if part_of else ""
+        commands.append(f"guiderail study {source}{part} --out studies")
     return commands
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -28,6 +30,7 @@ from guiderail.tools.evaluation.evaluation import (
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.step_log import read_step_log
+from guiderail.tools.experiments.declaration import source_file
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_columns, read_table
@@ -206,13 +209,22 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
         studies = _studies_of(file.stem, table)
         part_of = next((name for name in studies if name in tables), next(iter(studies), ""))
         evaluated = table[(table["eval_set"] != "") & table["success_rate"].notna()]
-        rows = _success_counts(evaluated.assign(study=file.stem, part_of=part_of), file)
+        of_study = {"study": file.stem, "part_of": part_of, "source": _source(folder, part_of or file.stem)}
+        rows = _success_counts(evaluated.assign(**of_study), file)
         for name, whole in tables.items():
             if name in studies:
-                same = list(whole.columns.drop(["study", "part_of"]))
+                same = list(whole.columns.drop(list(of_study)))
                 rows = rows[~rows[same].apply(tuple, axis=1).isin(set(whole[same].apply(tuple, axis=1)))]
         tables[file.stem] = rows
     return [rows for rows in tables.values() if len(rows)]
+
+
+def _source(folder: Path, study: str) -> str:
+    """Return the file from which a study was run, with the option that its imports need, as words of a command."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        source = json.loads(source_file(folder, study).read_bytes())
+        return shlex.quote(str(source["file"])) + " --trust-imports" * bool(source["imports"])
+    return f"{study}.yaml"
 
 
 def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
@@ -231,7 +243,7 @@ def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
 
 def _success_counts(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
     """Return the rows of a study's table with the number of successes instead of the success rate."""
-    rows = rows[["study", "part_of", *STUDY_COLUMNS]].copy()
+    rows = rows[["study", "part_of", "source", *STUDY_COLUMNS]].copy()
     episodes, rates = (as_numbers(rows[name], f"{name} in {file}") for name in ("episodes", "success_rate"))
     is_wrong = ~(
         (episodes >= 1) & (episodes < MAX_COUNT) & (episodes == np.rint(episodes)) & (rates >= 0) & (rates <= 1)
@@ -252,7 +264,7 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
     if episodes:
         _evaluate(run, episodes)
     counts: dict[str, dict[str, Any]] = {}
-    names = {"study": "", "part_of": "", "method": run.method}
+    names = {"study": "", "part_of": "", "source": "", "method": run.method}
     run_columns = {**names, "seed": run.config.seed, "after_episodes": len(run.episodes)}
     for name, rows in stored_episodes(RunFolder(run.path), run.config, HELD_OUT_SEED):
         policy = LEARNED if name == POLICY else name

@@ -12,7 +12,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.metrics import statistics_of, wilson
-from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study
+from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study, source_file
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.job import Job, check_job
 from guiderail.tools.experiments.study import (
@@ -252,7 +252,8 @@ def test_process_engine_gives_the_rows_of_this_process(tmp_path):
 
 def test_study_command_summarizes_each_seed(tmp_path, capsys):
     one = study(ratios=[{"of": "mean_return", "method": "learner", "against": "learner"}], after_episodes=[2])
-    result = study_command(one, tmp_path, make_engine(processes=1))
+    result = study_command(one, tmp_path, make_engine(processes=1), file=Path("first.yaml"))
+    assert json.loads(source_file(tmp_path, one.name).read_text())["file"] == "first.yaml"
     described = study_command(one, tmp_path, describe_differences=lambda config, *, learns=True: [config.task])
     assert described["differences"] == {"all methods": ["Bead"]}
     rows = read_table(tmp_path / "beads.csv")

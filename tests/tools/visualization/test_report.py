@@ -1,3 +1,4 @@
+import html
 import itertools
 import math
 import re
@@ -163,6 +164,22 @@ def test_other_files_in_the_folder_of_a_study_are_left_alone(text, studied, tmp_
 def test_report_of_nothing_is_refused():
     with pytest.raises(InputError, match="at least one run or study"):
         gather([])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        ('{"file": "my studies/first.yaml", "imports": true}', "'my studies/first.yaml' --trust-imports"),
+        ('{"file": "first.yaml", "imports": false}', "first.yaml"),
+        ("[1]", "beads.yaml"),
+    ],
+)
+def test_command_of_a_study_names_its_file(content, words, studied, tmp_path):
+    shutil.copy(studied / "beads.csv", tmp_path)
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "beads.json").write_text(content)
+    text = html.unescape(text_of(write_report([tmp_path], tmp_path / "page.html").read_text()))
+    assert f"guiderail study {words} --out studies" in text
 
 
 def test_study_named_like_another_one_is_whole(studied, tmp_path):
