@@ -10,6 +10,7 @@ import numpy as np
 from guiderail.models.common.arrays import as_number, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
+from guiderail.models.primitives.full_turns import without_jumps
 
 MAX_MAGNITUDE = 1e100  # largest absolute value: covariances are products of two outputs
 
@@ -17,7 +18,8 @@ MAX_MAGNITUDE = 1e100  # largest absolute value: covariances are products of two
 class Demonstrations:
     """M recordings of O outputs over time, each with its own length and rate.
 
-    Repeated samples (same time, same outputs) are dropped.
+    Repeated samples (same time, same outputs) are dropped. Angles and rotation vectors that jump by a full turn, as
+    between π and −π, are continued instead if their names say that they are angles (`without_jumps`).
 
     Args:
         times: One clock (N,) for all demonstrations, or M clocks (N_m,), strictly increasing [s or phase].
@@ -83,6 +85,7 @@ class Demonstrations:
                 raise InputError(f"an output can't be named {brief(name)}: use a short text that can be printed")
         if repeated := io.find_repeated(self.names):
             raise InputError(f"two outputs are called {brief(repeated)}: rename one")
+        self.outputs = without_jumps(self.outputs, self.names)
 
     def _drop_repeated_samples(self) -> None:
         """Drop the copies of a sample that a recorder logs if it runs faster than its robot."""

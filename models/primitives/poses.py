@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.full_turns import Orientation, continued_angles, continued_vectors
 
 # Importing scipy.spatial takes a fifth of a second, and a primitive does not need it.
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
-
-Orientation = Literal["euler_zyx", "rotation_vector"]
 
 SINGULAR = math.sin(math.radians(89.0))  # largest |sin Ry| of Euler angles [Rz Ry Rx]
 
@@ -24,14 +23,6 @@ POSE_NAMES: dict[str, tuple[str, ...]] = {
     "rotation_vector": ("x [m]", "y [m]", "z [m]", "r_x [rad]", "r_y [rad]", "r_z [rad]"),
 }
 """Names of the six outputs, by the representation of the orientation."""
-
-# Orientation by the names of the last three of six outputs, in lower case and without units. `guiderail dataset import`
-# names Euler angles Rz, Ry and Rx.
-_ANGLE_NAMES = {
-    ("psi_z", "psi_y", "psi_x"): "euler_zyx",
-    ("rz", "ry", "rx"): "euler_zyx",
-    ("r_x", "r_y", "r_z"): "rotation_vector",
-}
 
 
 def check_orientation(orientation: object) -> Orientation:
@@ -43,16 +34,6 @@ def check_orientation(orientation: object) -> Orientation:
     if not (isinstance(orientation, str) and orientation in POSE_NAMES):
         raise InputError(f"there is no orientation {brief(orientation)}: choose {' or '.join(POSE_NAMES)}")
     return cast(Orientation, orientation)
-
-
-def orientation_of_names(names: Sequence[str]) -> Orientation | None:
-    """Return the representation of the orientation that belongs to the names of six outputs.
-
-    Accepted names are those of `POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
-    `guiderail dataset import` writes them. The result is None for other names or another number of names.
-    """
-    plain = tuple(name.partition("[")[0].strip().lower() for name in names)
-    return cast("Orientation | None", _ANGLE_NAMES.get(plain[3:])) if len(plain) == 6 else None
 
 
 def pose_outputs(
@@ -103,8 +84,8 @@ def pose_outputs(
     if orientation == "euler_zyx":
         if np.abs(R_TE.as_matrix()[:, 2, 0]).max() > SINGULAR:
             raise InputError("ZYX Euler angles are singular in this motion: use orientation='rotation_vector'")
-        return np.hstack([p_TE, _continued(R_TE.as_euler("ZYX"), near)])
-    return np.hstack([p_TE, _continued_vectors(R_TE.as_rotvec(), near)])
+        return np.hstack([p_TE, continued_angles(R_TE.as_euler("ZYX"), near)])
+    return np.hstack([p_TE, continued_vectors(R_TE.as_rotvec(), near)])
 
 
 def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "euler_zyx") -> Rotation:
@@ -156,23 +137,3 @@ def pose_demonstrations(
         near = outputs[0][0, 3:] if outputs else None
         outputs.append(pose_outputs(p, q, target_p, target_q, orientation, near))
     return Demonstrations(times, outputs, POSE_NAMES[orientation])
-
-
-def _continued(angles: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Remove full-turn jumps from angles (N, 3), on the branch of `near`."""
-    angles = np.unwrap(angles, axis=0)
-    start = np.zeros(3) if near is None else near
-    return angles - 2 * np.pi * np.round((angles[0] - start) / (2 * np.pi))
-
-
-def _continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to its predecessor."""
-    vectors = np.array(vectors)
-    last = np.zeros(3) if near is None else near
-    for i, r in enumerate(vectors):
-        angle = np.linalg.norm(r)
-        # A rotation near zero has no axis of its own: use the previous one.
-        axis = r / angle if angle > 1e-9 else last / max(float(np.linalg.norm(last)), 1e-300)
-        turns = np.round((axis @ last - angle) / (2 * np.pi))
-        vectors[i] = last = (angle + 2 * np.pi * turns) * axis
-    return vectors

@@ -17,7 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.poses import Orientation, check_orientation
+from guiderail.models.primitives.full_turns import Orientation
+from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.tools.guided.guide import (
     PRIMITIVE_GUIDANCE,

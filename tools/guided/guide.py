@@ -18,8 +18,9 @@ from guiderail.models.control.motion_constraints import MotionConstraintFilter, 
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import MIN_DEMONSTRATIONS, Selection, fit
+from guiderail.models.primitives.full_turns import Orientation, orientation_of_names
 from guiderail.models.primitives.gains import authority_gains, check_action_scale, deviation, residual_gains
-from guiderail.models.primitives.poses import Orientation, check_orientation, orientation_of_names
+from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.tools.guided.segment import Frame, Segment, as_bool
 

@@ -204,3 +204,30 @@ def test_arguments_of_another_type_are_refused():
         with pytest.raises(InputError, match=r"must be a (whole )?number, not|bounded must be a list, not 0"):
             call()
     assert wavy().first(1.0).num_demonstrations == 1
+
+
+VECTOR, EULER = ("r_x", "r_y", "r_z"), ("Rz [rad]", "Ry [rad]", "Rx [rad]")
+
+
+@pytest.mark.parametrize("names", [VECTOR, ("rx [rad]", "ry [rad]", "rz [rad]"), EULER, ("a", "theta [rad]")])
+@pytest.mark.parametrize("half_turn", [np.pi, -np.pi])
+def test_angles_that_jump_at_half_a_turn_are_continued(names, half_turn):
+    """The demonstrations begin before or after the half turn; the first one determines the branch."""
+    is_pose, column = len(names) == 3, 0 if names == EULER else 1
+    axis = np.eye(len(names))[column]
+    paths = [np.outer(half_turn + np.linspace(start, start + 0.6, 40), axis) for start in (-0.3, 0.1, -0.1)]
+    wrapped = [(path + np.pi) % (2 * np.pi) - np.pi for path in paths]
+    outputs, before = ([np.hstack([np.zeros((40, 3)), y]) if is_pose else y for y in each] for each in (wrapped, paths))
+    result = Demonstrations(np.arange(40), outputs, (*"xyz", *names) if is_pose else names).outputs
+    offset = before[0][0] - result[0][0]
+    np.testing.assert_allclose(np.array(result) + offset, before, atol=1e-12)
+    np.testing.assert_array_equal(Demonstrations(np.arange(40), outputs).outputs, outputs)  # names without a meaning
+
+
+@pytest.mark.parametrize("names", [VECTOR, EULER])
+def test_outputs_without_a_jump_of_a_full_turn_are_unchanged(names):
+    turning = np.zeros((3, 40, 6))
+    turning[..., 3] = np.linspace(-5.0, 9.0, 40) + np.array([[0.0], [3.0], [13.0]])
+    turning[2, ::2, 4] = 5.0  # neither a full turn nor a small change
+    result = Demonstrations(np.arange(40), turning, (*"xyz", *names)).outputs
+    np.testing.assert_array_equal(result, turning)
