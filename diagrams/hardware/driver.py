@@ -220,7 +220,7 @@ def check_robot(driver: Driver, robot: Robot) -> None:
     commands poses relative to flange and base, so for it the flange's pose in the world is compared as well.
 
     Raises:
-        InputError: If they differ.
+        InputError: If they differ, or there is no registered robot `Driver.robot`.
     """
     num_joints = len(driver.torque_reflex_limits)
     if robot.num_joints != num_joints:
@@ -244,17 +244,18 @@ def check_robot(driver: Driver, robot: Robot) -> None:
 def _calc_motions(robot: Robot) -> tuple[RigidTransform, list[RigidTransform]]:
     """Return the flange's pose at zero in the world, and its motion in the base frame for each joint at 1 rad."""
     plant = MultibodyPlant(0.0)
-    flange = add_robot(plant, robot).flange
+    mounted = add_robot(plant, robot)
     plant.Finalize()
-    context, base = plant.CreateDefaultContext(), plant.GetFrameByName(robot.base_frame)
+    context = plant.CreateDefaultContext()
 
     def pose(positions: np.ndarray) -> RigidTransform:
         plant.SetPositions(context, positions)
-        return flange.CalcPose(context, base)
+        return mounted.flange.CalcPose(context, mounted.base)
 
     n = plant.num_positions()
     at_zero = pose(np.zeros(n))
-    return flange.CalcPoseInWorld(context), [pose(positions) @ at_zero.inverse() for positions in np.eye(n)]
+    in_world = mounted.flange.CalcPoseInWorld(context)
+    return in_world, [pose(positions) @ at_zero.inverse() for positions in np.eye(n)]
 
 
 def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:

@@ -29,6 +29,7 @@ class MountedRobot:
     """Robot in a plant."""
 
     model: ModelInstanceIndex  # model instance of its joints
+    base: Frame  # base frame
     flange: Frame  # frame to which a tool is mounted
     actuators: list[JointActuator]  # actuators in the order of its joints
 
@@ -61,7 +62,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     base = find("frame", robot.base_frame)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
-    return MountedRobot(model, find("frame", robot.flange_frame), _list_actuators(plant, joints, label))
+    return MountedRobot(model, base, find("frame", robot.flange_frame), _list_actuators(plant, joints, label))
 
 
 def add_end_effector(
