@@ -141,8 +141,18 @@ class Policy:
             ) from error
 
     def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
-        """Write `policy.safetensors` and `policy.json`; `write` is called with the path and the content of each."""
+        """Write `policy.safetensors` and `policy.json` into a folder, which is made if there is none.
+
+        `write` is called with the path and the content of each file.
+
+        Raises:
+            InputError: If the folder cannot be made.
+        """
         folder = Path(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{folder} cannot be made ({error.strerror}): name another folder") from error
         arrays: dict[str, np.ndarray] = {}
         for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):
             for index, (weight, bias) in enumerate(stored):

@@ -30,6 +30,7 @@ class Registry(Generic[Entry]):
         decorator: Name of the function that registers an entry under its first argument; its calls are found in the
             modules' source. Without it, all modules are imported at the first use.
         entry_points: Group of entry points of further entries.
+        check: Function of a name and an entry, called before the entry is added; it raises an `InputError`.
     """
 
     def __init__(
@@ -39,10 +40,11 @@ class Registry(Generic[Entry]):
         package: str | Sequence[str] = (),
         decorator: str | None = None,
         entry_points: str | None = None,
+        check: Callable[[str, Any], None] = lambda name, value: None,
     ):
         self.noun = noun
         self._packages = (package,) if isinstance(package, str) else tuple(package)
-        self._decorator, self._group = decorator, entry_points
+        self._decorator, self._group, self._check = decorator, entry_points, check
         self._entries: dict[str, Entry] = {}
         self._origins: dict[str, tuple[str, str]] = {}
 
@@ -55,11 +57,13 @@ class Registry(Generic[Entry]):
 
         Raises:
             InputError: If the name is no word, as for a decorator without parentheses, if an object that is defined
-                elsewhere has this name already, or a module of the package that is not imported yet declares it.
+                elsewhere has this name already, a module of the package that is not imported yet declares it, or the
+                registry's `check` refuses it.
         """
         self.check_name(name)
         if value is None:
             return lambda decorated: self.register(name, decorated)
+        self._check(name, value)
         origin = _origin(value)
         existing = self._origins.get(name, origin)
         is_used, place = name in self._entries and existing != origin, existing[0]

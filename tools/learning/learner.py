@@ -8,6 +8,8 @@ algorithm of Stable-Baselines3) that is registered by `register_learner` or by a
 from __future__ import annotations
 
 import hashlib
+import inspect
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -148,11 +150,25 @@ class Learner(Callback, ABC):
         """
 
 
+def _check_learner(name: str, learner: Any) -> None:
+    """Raise an InputError if a name cannot be that of a learner, or a class lacks what a learner needs."""
+    if not re.fullmatch(r"\w[\w.-]*", name):
+        raise InputError(f"the name of a learner has letters, digits, '_', '-' and '.', unlike {brief(name)}")
+    if not inspect.isclass(learner):
+        return
+    missing = sorted(getattr(learner, "__abstractmethods__", ()))
+    missing += [] if hasattr(learner, "Config") else ["Config"]
+    missing += [] if any("__init__" in vars(kind) for kind in learner.__mro__[:-1]) else ["__init__"]
+    if missing:
+        raise InputError(f"the learner {learner.__name__} has no {', '.join(missing)}: see `Learner`")
+
+
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
 # takes seconds to import: `LEARNERS.declared(name, "Config")` imports no module whose source shows the `Config`.
 LEARNERS: Registry[Any] = Registry(
-    "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners"
-)
+    "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners",
+    check=_check_learner,
+)  # fmt: skip
 register_learner = LEARNERS.register
 
 

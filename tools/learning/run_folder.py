@@ -65,8 +65,9 @@ class RunConfig:
         """
         current = task_content(self.task, self.environment, self.imports)
         if self.task_content and self.task_content != current:
+            imported = "".join(f" or {Path(module).name}" for module in self.imports if module.endswith(".py"))
             raise InputError(
-                f"the files of {self.task} are not those that the run in {path} began with: restore them, or "
+                f"the files of {self.task}{imported} are not those that the run in {path} began with: restore them, or "
                 f"{otherwise}"
             )
 

@@ -221,7 +221,10 @@ def _train(
             break
     learner.finish()
     learning_log.record(rows, learner.metrics, is_finished=True)
-    policy = learner.policy({"task": config.task, **described_observation(env)})
+    try:
+        policy = learner.policy({"task": config.task, **described_observation(env)})
+    except ValueError as error:
+        raise InputError(f"{type(learner).__name__}.policy failed: {error}") from error
     if not isinstance(policy, Policy):
         raise InputError(f"{type(learner).__name__}.policy must return a Policy, not {brief(policy)}")
     policy.save(folder.path, write=write_atomically)

@@ -231,6 +231,7 @@ def assert_refused(learner, words, folder, episodes):
         ([{"word": "good"}], Policy, "the column 'word' of an episode must be a number, not 'good'"),
         ([{"a": 1}, {"b": 1}], Policy, "the column 'a' is missing in some episodes"),
         ([{}, {}], None, "Odd.policy must return a Policy, not None"),
+        ([{}, {}], "no", "Odd.policy failed: a policy has no activation 'no'"),
     ],
 )
 def test_learner_that_returns_something_else_is_named(columns, policy, words, tmp_path):
@@ -239,9 +240,28 @@ def test_learner_that_returns_something_else_is_named(columns, policy, words, tm
             return columns[row["episode"]]
 
         def policy(self, description):
-            return super().policy(description) if policy else None
+            words = {"activation": policy} if isinstance(policy, str) else {}
+            return super().policy({**description, **words}) if policy else None
 
     assert_refused(Odd, words, tmp_path / "run", episodes=2)
+
+
+class Unfinished(Learner):
+    """Learner without any method."""
+
+
+@pytest.mark.parametrize(
+    ("name", "learner", "words"),
+    [
+        ("odd", Unfinished, "the learner Unfinished has no act, has_diverged, policy, restore, state, __init__: see"),
+        ("odd", type("Other", (), {}), "the learner Other has no Config, __init__"),
+        ("Bad Name/..", ZeroLearner, "the name of a learner has letters, digits, '_', '-' and '.', unlike 'Bad Name"),
+    ],
+)
+def test_learner_that_cannot_be_constructed_is_not_registered(name, learner, words):
+    with pytest.raises(InputError, match=words):
+        LEARNERS.register(name)(learner)
+    assert name not in LEARNERS.names()
 
 
 @pytest.mark.parametrize(

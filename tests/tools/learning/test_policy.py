@@ -137,6 +137,16 @@ def test_policy_refuses_a_bias_that_is_no_vector(shape):
         Policy([(np.ones((1, 3), np.float32), np.zeros(shape, np.float32))], description)
 
 
+def test_save_makes_its_folder(tmp_path):
+    description = {"observation_shape": [3], "action_low": [-1.0], "action_high": [1.0]}
+    policy = Policy([(np.ones((1, 3), np.float32), np.zeros(1, np.float32))], description)
+    policy.save(tmp_path / "new" / "folder")
+    assert Policy.load(tmp_path / "new" / "folder")(np.ones(3)) == policy(np.ones(3))
+    for file in ("policy.json", "policy.json/below"):
+        with pytest.raises(InputError, match=r"cannot be made \(.*\): name another folder"):
+            policy.save(tmp_path / "new" / "folder" / file)
+
+
 def test_load_names_a_missing_policy(tmp_path):
     with pytest.raises(InputError, match="holds no policy"):
         Policy.load(tmp_path)

@@ -454,7 +454,7 @@ def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
     config = RunFolder(out).config()
     before = episodes_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# now it is another one\n")
-    with pytest.raises(InputError, match="are not those that the run"):
+    with pytest.raises(InputError, match=f"the files of changes/Passage or {file.name} are not those that the run"):
         start_or_resume(None, out, environment={}, episodes=2, resume=True)
     assert episodes_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
