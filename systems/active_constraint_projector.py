@@ -12,7 +12,7 @@ from guiderail.models.common.transforms import pose_to_transform, transform_to_p
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.template_frames import TemplateFrames
+from guiderail.systems.support.template_frames import TemplateFrames, state_number
 
 
 class ActiveConstraintProjector(LeafSystem):
@@ -45,7 +45,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
     template's state. Each violation output is the largest violation of an active constraint, in meters or radians, and
-    0 inside the constraints.
+    0 inside the constraints. If ``state`` is not the number of a state, the last command is repeated with ``fallback``
+    1, and the violations are the largest of all states.
 
     Args:
         template: Shared control template.
@@ -109,16 +110,23 @@ class ActiveConstraintProjector(LeafSystem):
     get_measured_violation_output_port = output_getter("measured_violation", "violation of the measured pose, (1,)")
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
-        state = int(self._state_port.Eval(context)[0])
-        return self._template.violation(state, pose_to_transform(pose), self.frames.eval(context))
+        state, X_WE, frames = self._state(context), pose_to_transform(pose), self.frames.eval(context)
+        states = range(len(self._template.states)) if state is None else (state,)
+        return max(self._template.violation(one, X_WE, frames) for one in states)
+
+    def _state(self, context: Context) -> int | None:
+        return state_number(self._state_port, context, len(self._template.states))
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the command (6,) and, as the seventh number, the fallback flag."""
         value = context.get_discrete_state().value(self._last)
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
+        state = self._state(context)
+        if state is None:
+            return np.append(last, 1.0)
         if np.isfinite(requested).all() and np.isfinite(measured).all():
-            desired = self._constrained(context, last, requested)
+            desired = self._constrained(context, state, last, requested)
             tracking_error = math.dist(last[:3], measured[:3])
             reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
             is_waiting = tracking_error > self._max_tracking_error and not reduces_error
@@ -126,14 +134,14 @@ class ActiveConstraintProjector(LeafSystem):
                 return np.append(desired, 0.0)
         # Projecting a command that is already inside would move it by rounding errors at every step.
         if self._violation(context, last) > INSIDE:
-            inside = self._constrained(context, last, last)
+            inside = self._constrained(context, state, last, last)
             last = inside if np.isfinite(inside).all() else last
         return np.append(last, 1.0)
 
-    def _constrained(self, context: Context, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
+    def _constrained(self, context: Context, state: int, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
         """Return the allowed pose (6,) for a request, reachable in one period."""
         command = self._template.command(
-            int(self._state_port.Eval(context)[0]),
+            state,
             pose_to_transform(last),
             pose_to_transform(requested),
             self.frames.eval(context),

@@ -119,7 +119,7 @@ class CartesianImpedanceController(LeafSystem):
 
     Raises:
         InputError: If an argument is out of range, the posture does not have n joints, or a joint has no actuator or
-            several.
+            several. At an evaluation, if the estimated state is not finite.
     """
 
     def __init__(

@@ -84,17 +84,18 @@ class EpisodeMonitor(LeafSystem):
 
     Raises:
         InputError: If there is no term, the period is not positive, a signal has two sizes or a size below 1, or the
-            parameters of a function are not named like its signals.
+            parameters of a function are not named like its signals. At evaluation, if a condition is neither a truth
+            value nor one finite number.
     """
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
         super().__init__()
         if not terms:
             raise InputError("a monitor needs at least one condition")
-        of_task = f" of {task_name}" if task_name else ""
+        self._of_task = f" of {task_name}" if task_name else ""
         for term in terms:
             for function in filter(None, (term.condition, term.progress)):
-                check_takes(function, term.inputs, f"the condition {term.termination!r}{of_task}")
+                check_takes(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")
         self._terms = tuple(terms)
         self._indices = [TERMINATIONS.index(term.termination) for term in terms]
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
@@ -118,13 +119,24 @@ class EpisodeMonitor(LeafSystem):
                 progress = float(term.progress(**inputs))
                 if progress > state[2 * i + 1] + term.min_progress:
                     state[2 * i : 2 * i + 2] = 0.0, progress
-                elif term.condition(**inputs):
+                elif self._is_met(term, inputs):
                     state[2 * i] += 1
             else:
-                state[2 * i] = state[2 * i] + 1 if term.condition(**inputs) else 0.0
+                state[2 * i] = state[2 * i] + 1 if self._is_met(term, inputs) else 0.0
             if state[-1] == 0 and state[2 * i] >= term.steps:
                 state[-1] = self._indices[i]
         return state
+
+    def _is_met(self, term: TerminationTerm, inputs: Mapping[str, np.ndarray]) -> bool:
+        met = term.condition(**inputs)
+        if isinstance(met, bool | np.bool_):
+            return bool(met)
+        array = np.asarray(met)
+        if array.size != 1 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
+            raise InputError(
+                f"the condition {term.termination!r}{self._of_task} must be true or false, and it is {brief(met)}"
+            )
+        return bool(array.item())
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._state, self._next.Eval(context))

@@ -66,7 +66,8 @@ class ExternalTorqueSensor(LeafSystem):
         period: Period of noise and drift [s], positive.
 
     Raises:
-        InputError: If the period, the noise or the drift is out of range or has the wrong shape.
+        InputError: If the period, the noise or the drift is out of range or has the wrong shape. At an evaluation, if a
+            position is not finite.
     """
 
     def __init__(

@@ -24,8 +24,8 @@ POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy'
 class PoseMotionLimiter(LeafSystem):
     """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
 
-    While the blend factor is zero the output is the measured pose. When the factor becomes positive, the output moves
-    from the measured pose to the desired pose on the time-optimal trajectory within the limits. The trajectory is
+    While the blend factor is zero or NaN the output is the measured pose. When the factor becomes positive, the output
+    moves from the measured pose to the desired pose on the time-optimal trajectory within the limits. The trajectory is
     computed again in each period (Berscheid and Kröger, "Jerk-limited Real-time Trajectory Generation with Arbitrary
     Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
     (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
@@ -78,7 +78,7 @@ class PoseMotionLimiter(LeafSystem):
 
     def _calc_next_state(self, context: Context) -> np.ndarray:
         state = context.get_discrete_state().value(self._state).copy()
-        if self._blend_factor_port.Eval(context)[0] <= 0.0:
+        if not self._blend_factor_port.Eval(context)[0] > 0.0:  # NaN counts as 0
             measured = self._pose_port.Eval(context)
             if is_finite(measured):
                 return _at_rest(measured)

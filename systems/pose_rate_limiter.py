@@ -13,11 +13,11 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class PoseRateLimiter(LeafSystem):
     """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the blend factor is zero the output is the measured pose. While it is positive the output moves from there
-    towards the desired pose; if it is positive at initialization, the output starts from the pose measured then. In
-    each period the position moves along a straight line by at most speed times period; each angle turns separately, in
-    the shorter direction. A desired pose within the speed limits is output unchanged. A desired pose that is not finite
-    is ignored, and so is a measured pose: the last output is kept.
+    While the blend factor is zero or NaN the output is the measured pose. While it is positive the output moves from
+    there towards the desired pose; if it is positive at initialization, the output starts from the pose measured then.
+    In each period the position moves along a straight line by at most speed times period; each angle turns separately,
+    in the shorter direction. A desired pose within the speed limits is output unchanged. A desired pose that is not
+    finite is ignored, and so is a measured pose: the last output is kept.
 
     .. pydrake_system::
 
@@ -61,7 +61,7 @@ class PoseRateLimiter(LeafSystem):
 
     def _limited_pose(self, context: Context) -> np.ndarray:
         last = context.get_discrete_state().value(self._last_pose)
-        if self._blend_factor_port.Eval(context)[0] <= 0.0:
+        if not self._blend_factor_port.Eval(context)[0] > 0.0:  # NaN counts as 0
             measured = self._pose_port.Eval(context)
             return measured if is_finite(measured) else last
         desired = self._desired_pose_port.Eval(context)

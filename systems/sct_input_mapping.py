@@ -10,7 +10,7 @@ from guiderail.models.common.transforms import pose_to_transform, transform_to_p
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
-from guiderail.systems.support.template_frames import TemplateFrames
+from guiderail.systems.support.template_frames import TemplateFrames, state_number
 
 
 class SctInputMapping(LeafSystem):
@@ -18,8 +18,9 @@ class SctInputMapping(LeafSystem):
 
         H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
-    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input results in
-    a NaN pose, for which `ActiveConstraintProjector` repeats its last safe command.
+    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input, or a
+    ``state`` that is not the number of a state, results in a NaN pose, for which `ActiveConstraintProjector` repeats
+    its last safe command.
 
     .. pydrake_system::
 
@@ -64,8 +65,9 @@ class SctInputMapping(LeafSystem):
 
     def _requested_pose(self, context: Context) -> np.ndarray:
         action = self._action_port.Eval(context)
-        if not np.isfinite(action).all():
+        state = state_number(self._state_port, context, len(self._template.states))
+        if state is None or not np.isfinite(action).all():
             return np.full(6, np.nan)
-        state, X_WE = int(self._state_port.Eval(context)[0]), pose_to_transform(self._pose_port.Eval(context))
+        X_WE = pose_to_transform(self._pose_port.Eval(context))
         displacement = self._template.map(state, action, X_WE, self.frames.eval(context), self._period)
         return transform_to_pose(self._template.displace(X_WE, displacement))

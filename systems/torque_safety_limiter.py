@@ -116,7 +116,8 @@ class TorqueSafetyLimiter(LeafSystem):
     ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,), ``external_torque`` (n,)
     [Nm], joints in the order of the plant's positions. ``wrench`` is (6,), force first. ``pose`` and ``desired_pose``
     are (6,); their positions are checked. ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s],
-    are outputs of a `StatusWatchdog`. ``command_timed_out`` is (1,), the output of a `CommandWatchdog`.
+    are outputs of a `StatusWatchdog`; an unknown code counts as `Fault.MALFORMED`. ``command_timed_out`` is (1,), the
+    output of a `CommandWatchdog`.
 
     ``fault`` is (1,), the code of the `Fault` that stopped the arm, otherwise that of a present fault, or 0.
     ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are
@@ -230,7 +231,7 @@ class TorqueSafetyLimiter(LeafSystem):
     def _find_fault(self, context: Context) -> Fault:
         """Return the first fault that is present now; checks have the form `not value <= limit`, so that NaN fails."""
         limits, n = self._limits, self._num_joints
-        status_fault = Fault(int(self._status_fault_port.Eval(context)[0]))
+        status_fault = _fault_of(float(self._status_fault_port.Eval(context)[0]))
         if status_fault:
             return status_fault
         if np.isnan(self._status_age_port.Eval(context)[0]):
@@ -321,3 +322,8 @@ class TorqueSafetyLimiter(LeafSystem):
     def _not_following(self, context: Context) -> float:
         has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0
         return float(has_timed_out or self._state_of(context)[_ARM_STATE] != ArmState.RUNNING)
+
+
+def _fault_of(code: float) -> Fault:
+    """Return the fault of a code; an unknown code, such as NaN, is a fault as well."""
+    return next((fault for fault in Fault if fault == code), Fault.MALFORMED)

@@ -302,12 +302,15 @@ def plant_context(
 ) -> CacheEntry:
     """Declare a cache entry with a context of the finalized plant, from which kinematics and inertia are computed.
 
-    `state` computes the joint positions, or the positions followed by the velocities, from `sources`.
+    `state` computes the joint positions, or the positions followed by the velocities, from `sources`. An evaluation
+    with numbers that are not finite raises an `InputError`.
     """
     num_positions = plant.num_positions()
 
     def calc(context: Context, value: AbstractValue) -> None:
         numbers, plant_context = state(context), value.get_mutable_value()
+        if not is_finite(numbers):  # Drake would end the process
+            raise InputError(f"joint positions and velocities must be finite, not {numbers}")
         if len(numbers) == num_positions:
             plant.SetPositions(plant_context, numbers)
         else:

@@ -1,15 +1,21 @@
-"""Poses of a template's objects as numeric parameters of a system."""
+"""State of a template at an input port, and poses of its objects as numeric parameters of a system."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
+
+
+def state_number(port: InputPort, context: Context, count: int) -> int | None:
+    """Return the number of a template's state at a port (1,), or None if it is not one of `count` states."""
+    number = float(port.Eval(context)[0])
+    return int(number) if 0.0 <= number < count and number.is_integer() else None
 
 
 class TemplateFrames:

@@ -133,6 +133,18 @@ def test_projector_repeats_the_last_command_for_a_nan_request():
         np.testing.assert_array_equal(desired, before)
 
 
+@pytest.mark.parametrize("state", [-1.0, -0.5, 0.99, float(len(TEMPLATE.states)), np.nan, np.inf])
+def test_projector_repeats_the_last_command_for_an_unknown_state(state):
+    rig = Rig()
+    before, _ = rig.step(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+    desired, fallback = rig.step(START, state=state)
+    assert fallback == 1.0
+    np.testing.assert_array_equal(desired, before)
+    X_WE = pose_to_transform(START)
+    largest = max(TEMPLATE.violation(one, X_WE, FRAMES) for one in range(len(TEMPLATE.states)))
+    assert rig.value("measured_violation") == largest
+
+
 def test_command_waits_when_the_tracking_error_is_too_large():
     rig = Rig(max_tracking_error=0.02)
     for _ in range(100):

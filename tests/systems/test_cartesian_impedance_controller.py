@@ -489,6 +489,18 @@ def test_plant_needs_one_motor_for_each_joint(motors):
         controller_of(*six_axes(motors))
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+@pytest.mark.parametrize("index", [0, 6])
+def test_estimated_state_that_is_not_finite_is_refused(index, number):
+    """Drake would end the process."""
+    controller = controller_of(*six_axes(range(6)))
+    context = controller.CreateDefaultContext()
+    controller.get_desired_pose_input_port().FixValue(context, np.zeros(6))
+    controller.get_estimated_state_input_port().FixValue(context, np.where(np.arange(12) == index, number, 0.0))
+    with pytest.raises(InputError, match="joint positions and velocities must be finite"):
+        controller.get_generalized_force_output_port().Eval(context)
+
+
 def test_ports_and_feedthrough():
     model, arm = controller_model(WORKCELL)
     system = CartesianImpedanceController(

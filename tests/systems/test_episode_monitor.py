@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
@@ -126,6 +127,19 @@ def test_function_is_refused_when_its_parameters_are_not_the_signals(functions, 
     term = TerminationTerm(**{"termination": "blocked", "inputs": {"u": 1}, "condition": lambda u: True} | functions)
     with pytest.raises(InputError, match=f"condition {words}"):
         EpisodeMonitor([term], PERIOD, name)
+
+
+@pytest.mark.parametrize("met", [np.nan, np.inf, np.array([True, True]), np.array([]), None, "yes"])
+@pytest.mark.parametrize("parameters", [{}, {"progress": lambda u: -np.inf}])
+def test_condition_is_refused_when_it_is_no_truth_value(met, parameters):
+    episode = Episode(TerminationTerm("success", {"u": 1}, lambda u: met, **parameters))
+    with pytest.raises(InputError, match="the condition 'success' must be true or false"):
+        episode.step(0.0)
+
+
+@pytest.mark.parametrize("met", [True, np.True_, 1, 0.5, np.array([True])])
+def test_condition_may_be_one_number(met):
+    assert Episode(TerminationTerm("blocked", {"u": 1}, lambda u: met)).step(0.0) == BLOCKED
 
 
 def test_each_term_has_its_own_count():

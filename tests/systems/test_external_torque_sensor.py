@@ -51,6 +51,13 @@ def test_contact_torques_are_measured_without_errors(arm):
     np.testing.assert_allclose(measured(arm)[0], CONTACT, atol=1e-12)
 
 
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_position_that_is_not_finite_is_refused(arm, number, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.HOME", [*HOME[:6], number])
+    with pytest.raises(InputError, match="joint positions and velocities must be finite"):
+        measured(arm)
+
+
 def test_gain_acts_on_gravity_too(arm):
     """A sensor measures the whole torque of its joint, including the weight of the arm."""
     gain = 0.01 * np.arange(7)

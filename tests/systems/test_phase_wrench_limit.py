@@ -92,7 +92,7 @@ def test_lower_limit_of_task_applies_at_once():
     np.testing.assert_array_equal(rig.run(1)[0], np.minimum(HIGH, mixed))
 
 
-@pytest.mark.parametrize("state", [-1.0, 2.0, np.nan, np.inf])
+@pytest.mark.parametrize("state", [-1.0, -0.5, 0.5, 2.0, np.nan, np.inf])
 def test_unknown_state_has_the_lowest_limits(state):
     mixed = np.r_[LOW[:3], HIGH[3:6], LOW[6], HIGH[7]]
     rig = Rig(state, limits=(np.r_[HIGH[:3], LOW[3:6], HIGH[6], LOW[7]], mixed))

@@ -118,8 +118,10 @@ def test_motion_reaches_the_desired_pose():
     assert_close(loop.run(400)[-1], desired, 1e-9)
 
 
-def test_motion_starts_at_the_measured_pose():
-    loop = Loop(blend_factor=0.0)
+@pytest.mark.parametrize("blend_factor", [0.0, np.nan])
+def test_motion_starts_at_the_measured_pose(blend_factor):
+    loop = Loop(blend_factor=blend_factor)
+    loop.set(START + 0.05, blend_factor)
     measured = START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0]
     loop.system.get_pose_input_port().FixValue(loop.context, measured)
     assert_close(loop.run(3)[-1], measured, 1e-12)

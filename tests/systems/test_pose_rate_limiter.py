@@ -36,8 +36,9 @@ class Rig:
         return self
 
 
-def test_measured_pose_is_output_while_blend_factor_is_zero():
-    rig = Rig(np.zeros(6))
+@pytest.mark.parametrize("blend_factor", [0.0, np.nan])
+def test_measured_pose_is_output_while_blend_factor_is_zero(blend_factor):
+    rig = Rig(np.zeros(6), blend_factor)
     np.testing.assert_array_equal(rig.advance(3), np.tile(MEASURED, (3, 1)))
     pushed = MEASURED + 0.05
     rig.pose.GetMutableData().set_value(pushed)

@@ -75,6 +75,11 @@ def test_input_mapping_returns_nan_for_a_nan_action(system, bad):
     assert np.isnan(requested(system, np.array([0.0, bad, 0.0]), 1)).all()
 
 
+@pytest.mark.parametrize("state", [-1.0, -0.5, 0.99, 3.0, np.nan, np.inf])
+def test_input_mapping_returns_nan_for_an_unknown_state(system, state):
+    assert np.isnan(requested(system, np.zeros(3), state)).all()
+
+
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])
 def test_input_mapping_refuses_invalid_arguments(template, period):
     with pytest.raises(InputError, match="period"):

@@ -118,6 +118,15 @@ WRONG = {
 }
 
 
+@pytest.mark.parametrize("code", [np.nan, np.inf, -1.0, 0.5, 99.0])
+def test_unknown_status_fault_stops_the_arm(plant, code):
+    rig = Rig(plant, can_hold=True)
+    rig.set(status_fault=[code])
+    assert rig.fault == Fault.MALFORMED
+    rig.advance(2 * PERIOD)
+    assert (rig.arm_state, rig.fault, rig["is_holding"][0]) == (ArmState.DAMPING, Fault.MALFORMED, 1.0)
+
+
 @pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
 def test_fault_stops_the_arm_at_once_until_resume(plant, fault):
     rig = Rig(plant)
