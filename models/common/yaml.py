@@ -71,8 +71,8 @@ def check_yaml(text: str, where: str, tags: Collection[str]) -> None:
     """Check that documents are within the limits of `parse_yaml`, and that they have only tags in `tags`.
 
     Raises:
-        InputError: As `parse_yaml`, except for several documents, duplicate keys, unknown aliases, wrong merges (`<<`)
-            and integers of thousands of digits.
+        InputError: As `parse_yaml`, except for several documents, unknown aliases, wrong merges (`<<`) and integers of
+            thousands of digits.
     """
     with _refusals(text, where):
         for _ in _make_yaml(tags).parse(text):
@@ -90,10 +90,9 @@ def _refusals(text: str, where: str) -> Iterator[None]:
     except ReaderError as error:
         raise InputError(f"{where} is not YAML: it holds a character that can't be printed") from error
     except MarkedYAMLError as error:
-        problem = str(error.problem).partition(" with value ")[0]  # the values of a duplicate key are left out
         mark = error.problem_mark or error.context_mark
         line = f" in line {mark.line + 1}" if mark is not None else ""
-        words = shorten(", ".join(part for part in (error.context, problem) if part), 200)
+        words = shorten(", ".join(part for part in (error.context, error.problem) if part), 200)
         raise InputError(f"{where} is not YAML: {words}{line}") from error
     except ValueError as error:  # an integer of more digits than Python reads
         raise InputError(f"{where} holds a number of thousands of digits: shorten it") from error
@@ -128,6 +127,7 @@ class _Collection:
     def __init__(self, event: Any):
         self.anchor, self.is_mapping = event.anchor, isinstance(event, MappingStartEvent)
         self.children, self.entries, self.levels = 0, 1, 1
+        self.keys: set[str] = set()
 
 
 class _Parser(Parser):
@@ -154,13 +154,13 @@ class _Parser(Parser):
             if any(parent.anchor == event.anchor for parent in self._parents):
                 _refuse(f"{brief(event.anchor)} contains itself: leave this alias out", event)
             if is_key and event.anchor in self._anchored:
-                _check_key(self._anchored[event.anchor], self.resolver, event)
+                self._check_key(self._anchored[event.anchor], event)
             entries, levels = self._sizes.get(event.anchor, (1, 1))
             self._num_entries += entries
         elif isinstance(event, ScalarEvent | CollectionStartEvent):
             _check_node(event, self.resolver, self.tags)
             if is_key:
-                _check_key(event, self.resolver, event)
+                self._check_key(event, event)
             self._anchored[event.anchor] = event
             self._num_entries += 1
             if isinstance(event, CollectionStartEvent):
@@ -177,20 +177,22 @@ class _Parser(Parser):
             parent.levels = max(parent.levels, levels + 1)
         return event
 
+    def _check_key(self, node: Any, event: Any) -> None:
+        """Refuse a node as a key of the innermost mapping; `event` is the node's own, or that of an alias."""
+        kind, keys = _kind(node, self.resolver), self._parents[-1].keys
+        if kind not in ("str", "merge"):
+            key = "a list or a mapping" if kind == "collection" else brief(node.value)
+            _refuse(f"the key {key} is not text: put it in quotes", event)
+        if node.value in keys:  # readers differ in which of the two values counts
+            _refuse(f'duplicate key "{brief(node.value)[1:-1]}": leave one of the two out', event)
+        keys.add(node.value)
+
 
 def _check_node(event: Any, resolver: Any, tags: Collection[str]) -> None:
     if event.tag is not None and event.tag not in tags:
         _refuse(f"the tag {brief(event.tag)} has no meaning here: leave it out", event)
     if _kind(event, resolver) == "timestamp":
         _refuse(f"{brief(event.value)} is a date, or a subtraction: put it in quotes", event)
-
-
-def _check_key(node: Any, resolver: Any, event: Any) -> None:
-    """Refuse a node as a key; `event` is the node's own, or that of an alias."""
-    kind = _kind(node, resolver)
-    if kind not in ("str", "merge"):
-        key = "a list or a mapping" if kind == "collection" else brief(node.value)
-        _refuse(f"the key {key} is not text: put it in quotes", event)
 
 
 def _kind(event: Any, resolver: Any) -> str:

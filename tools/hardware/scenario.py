@@ -111,6 +111,10 @@ def load_scenario(path: Path) -> Scenario:
     if len(scenario.model_drivers) != 1:
         raise InputError(f"{path}: exactly one robot has a driver, not {len(scenario.model_drivers)}")
     driver = scenario.model_drivers[scenario.robot]
+    expected = {"iiwa14": IiwaDriver, "panda": PandaDriver}.get(scenario.robot)
+    if expected is not None and not isinstance(driver, expected):
+        tags = f"!{expected.__name__}, not !{type(driver).__name__}"
+        raise InputError(f"{path}: the driver of {scenario.robot} has the tag {tags}")
     if driver.control_mode != "torque_only":
         raise InputError(
             f"{path}: the impedance controller sends torques, so the driver must accept them: set "

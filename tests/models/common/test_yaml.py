@@ -6,7 +6,7 @@ import warnings
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.yaml import load_yaml, parse_yaml
+from guiderail.models.common.yaml import check_yaml, load_yaml, parse_yaml
 
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
@@ -107,6 +107,15 @@ def test_invalid_document_is_refused_in_one_line(text, said):
     assert "\n" not in str(refused.value)
     assert len(str(refused.value)) < 300
     assert peak < 30e6
+
+
+@pytest.mark.parametrize(
+    "text", ["a: 1\nb: 2\na: 3", "- {a: 1, 'a': 2}", "x: &k a\ny: {a: 1, *k : 2}", "a: 1\n---\nb: {c: 1, c: 1}"]
+)
+def test_duplicate_key_is_refused_before_another_reader_reads_the_text(text):
+    with pytest.raises(InputError, match=r'duplicate key "[ac]": leave one of the two out'):
+        check_yaml(text, "scenario.yaml", ())
+    check_yaml("a: {b: &x {d: 1}}\nc: {<<: *x, d: 2}", "scenario.yaml", ())
 
 
 def test_file_with_a_byte_order_mark_is_read(tmp_path):

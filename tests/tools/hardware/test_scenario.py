@@ -52,6 +52,8 @@ def test_shipped_scenario_has_a_simulated_driver():
     ("text", "message"),
     [
         ("station: both\n", "hardware or simulation"),
+        (SHIPPED.read_text() + "station: hardware\n", 'line 1[0-9]: duplicate key "station"'),
+        ("model_drivers: {iiwa14: !PandaDriver {}}\n", "the driver of iiwa14 has the tag !IiwaDriver, not"),
         ("{}\n", "exactly one robot"),
         ("model_drivers: {iiwa14: !IiwaDriver {control_mode: position_only}}\n", "must accept them"),
         (DRIVER, "does not define"),
