@@ -28,6 +28,8 @@ MAX_NUMBERS = 2_000_000  # numbers in one file, such as four minutes of six outp
 MAX_DEMONSTRATIONS = 1_000
 MAX_LINES = 400_000  # lines of one text file, or samples of one folder: six minutes at a kilohertz
 MAX_FILE_SIZE = 32_000_000  # size of one file, or of all files of a folder [bytes]
+# Largest step to the last number of a file without a last line end, relative to the largest step before it.
+MAX_LAST_STEP = 3.0
 _MAX_LINE_LENGTH = 100_000  # [characters]
 _MAX_HEADER_SIZE = 1_000  # largest header of an array [bytes]; NumPy writes 118
 _MAX_NAMES_SIZE = 1_000_000  # [bytes]
@@ -282,10 +284,27 @@ def _read_csv(data: bytes) -> Recording:
     except (csv.Error, UnicodeDecodeError) as error:
         raise InputError(f"it is not a table of numbers: {error}") from error
     samples = np.frombuffer(values, dtype=float).reshape(-1, len(header))
+    if not data.endswith((b"\n", b"\r")):
+        of_last = slice(None) if not is_numbered or not len(samples) else samples[:, 0] == samples[-1, 0]
+        _check_last_value(samples[of_last, -1])
     if not is_numbered:
         return Recording([samples[:, 0]], [samples[:, 1:]], header[1:])
     parts = _split_samples(samples)
     return Recording([part[:, 1] for part in parts], [part[:, 2:] for part in parts], header[2:])
+
+
+def _check_last_value(values: np.ndarray) -> None:
+    """Raise an InputError if the last number of a file without a last line end seems to be cut.
+
+    Some programs write no last line end; so the number is refused only if it jumps from the values (N,) before it.
+    """
+    with np.errstate(invalid="ignore"):  # a later check refuses NaN and infinite numbers
+        steps = np.abs(np.diff(values))
+    if len(steps) > 1 and steps[-1] > MAX_LAST_STEP * steps[:-1].max():
+        raise InputError(
+            f"the last line has no line end, and its last number {values[-1]:g} is far from {values[-2]:g} before it: "
+            "restore what is missing, or end the line"
+        )
 
 
 def find_repeated(names: Iterable[str]) -> str:

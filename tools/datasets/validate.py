@@ -12,6 +12,7 @@ import yaml
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.part.file import Bounds, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import visible_files
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
@@ -24,6 +25,8 @@ from guiderail.tools.files import (
     write_atomically,
 )
 
+JUMP_RATIO = 150.0  # larger ratios of an output's largest and median speed indicate a jump
+GAP_RATIO = 10.0  # larger ratios of the longest and the median period indicate missing samples
 UNIT_RATIO = 20.0  # larger ratios of two motions' sizes indicate another unit: mm instead of m gives 1000, cm gives 100
 
 
@@ -184,7 +187,8 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         draw_demonstrations(common, draw)
         summary["picture"] = str(draw)
     summary |= fitted
-    remarks = [*_other_units(outputs), *([summary["remark"]] if "remark" in summary else [])]
+    remarks = [*_other_units(outputs), *_irregularities(demonstrations), *_unended(file)]
+    remarks = [*remarks, *([summary["remark"]] if "remark" in summary else [])]
     return summary | ({"remark": "; ".join(remarks)} if remarks else {})
 
 
@@ -199,6 +203,39 @@ def _other_units(outputs: np.ndarray) -> list[str]:
         f"demonstration {index} extends over {length:.3g} and the median one over {median:.3g}: check its unit"
         for index, length in enumerate(lengths)
         if max(length, median) > UNIT_RATIO * min(length, median)
+    ]
+
+
+def _irregularities(demonstrations: Demonstrations) -> list[str]:
+    """Return a sentence for each gap in time, and for each output of a demonstration with a jump."""
+    remarks = []
+    for index, (times, outputs) in enumerate(zip(demonstrations.times, demonstrations.outputs, strict=True)):
+        periods = np.diff(times)
+        k = int(periods.argmax())
+        if periods[k] > GAP_RATIO * np.median(periods):
+            remarks.append(
+                f"demonstration {index} has a gap of {periods[k]:.3g} after the time {times[k]:.4g}, and a median "
+                f"period of {np.median(periods):.3g}: check that no samples are missing"
+            )
+        speeds = np.abs(np.diff(outputs, axis=0)) / periods[:, None]  # so a gap is no jump
+        for name, speed, values in zip(demonstrations.names, speeds.T, outputs.T, strict=True):
+            k = int(speed.argmax())
+            if speed.any() and speed[k] > JUMP_RATIO * np.median(speed[speed > 0.0]):
+                remarks.append(
+                    f"{name} of demonstration {index} jumps from {values[k]:.4g} to {values[k + 1]:.4g} after the time "
+                    f"{times[k]:.4g}: check this sample"
+                )
+    return remarks
+
+
+def _unended(file: Path) -> list[str]:
+    """Return a sentence for each file whose last line has no line end, and which may therefore be cut."""
+    files = visible_files(file, (".csv",)) if file.is_dir() else [file] if file.suffix == ".csv" else []
+    ends = ((one, one.read_bytes()[-1:]) for one in files)
+    return [
+        f"the last line of {one} has no line end: check that the file is whole"
+        for one, end in ends
+        if end not in (b"\n", b"\r")
     ]
 
 

@@ -314,3 +314,17 @@ def test_folder_of_too_large_files_is_named_as_a_whole(tmp_path, monkeypatch):
         (tmp_path / f"{name}.csv").write_text("time,x\n0,0\n1,1\n")
     monkeypatch.setattr("guiderail.models.primitives.io.MAX_FILE_SIZE", 25)
     assert refused(tmp_path) == f"the files of the folder '{tmp_path}' have more than 25 bytes: thin the samples out"
+
+
+@pytest.mark.parametrize(("header", "number"), [("t,x", ""), ("demonstration,time,x", "7,")])
+@pytest.mark.parametrize("end", ["", "\n"])
+def test_cut_number_at_the_end_is_refused_if_the_file_may_be_cut(tmp_path, header, number, end):
+    rows = [f"{number}{0.1 * n},{0.7 + 0.01 * n}" for n in range(6)]
+    (tmp_path / "whole.csv").write_text("\n".join([header, *rows]) + end)
+    assert Demonstrations.load(tmp_path / "whole.csv").num_demonstrations == 1
+    (tmp_path / "cut.csv").write_text("\n".join([header, *rows, f"{number}0.6,0."]) + end)
+    if end:
+        assert Demonstrations.load(tmp_path / "cut.csv").outputs[0][-1] == 0.0
+        return
+    with pytest.raises(InputError, match=r"no line end, and its last number 0 is far from 0\.75 before it"):
+        Demonstrations.load(tmp_path / "cut.csv")

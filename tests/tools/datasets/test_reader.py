@@ -71,6 +71,20 @@ def test_validate_names_the_demonstration_in_another_unit(tmp_path):
     assert "extends over" not in validate_demonstrations(tmp_path).get("remark", "")
 
 
+def test_validate_remarks_on_jumps_gaps_and_a_missing_line_end(tmp_path):
+    t = np.linspace(0.0, 2.0, 101)
+    file = tmp_path / "a.csv"
+    np.savetxt(file, np.column_stack([t, np.sin(t)]), delimiter=",", header="time,x", comments="")
+    assert not {"jumps", "gap", "line end"} & set(validate_demonstrations(file).get("remark", "").split())
+    lines = file.read_text().splitlines()
+    lines[41] = lines[41].split(",")[0] + ",9.0"
+    file.write_text("\n".join(lines[:60] + lines[80:]))
+    remark = validate_demonstrations(file)["remark"]
+    assert "demonstration 0 has a gap of 0.42 after the time 1.16, and a median period of 0.02" in remark
+    assert "x of demonstration 0 jumps from" in remark
+    assert f"the last line of {file} has no line end" in remark
+
+
 @pytest.mark.parametrize("read", [validate_demonstrations, load_demonstrations, fit_bounds])
 @pytest.mark.parametrize("ending", ["", ".csv", ".npz"])
 def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):
