@@ -29,6 +29,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import changed_environment, check_environment
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.pretrained import find_run
 from guiderail.tools.tables import write_table
 
 GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
@@ -52,7 +53,7 @@ def certify_skill(
     """Write a certificate and check it in a separate process.
 
     Args:
-        subject: Folder of a run, or name of a task.
+        subject: Folder of a run, `pretrained:NAME`, or name of a task.
         environment: Options that replace options of the run's or the task's environment.
         out: Folder to write; `certificate` in the run's folder by default.
         start_within: Largest start offset of the robot in any output [unit of the output]; by default the task's
@@ -75,7 +76,7 @@ def certify_skill(
     signing_key = _read_key(key)
     if out is None:
         if not Path(subject).is_dir():
-            raise InputError("name the folder of a task's certificate with --out")
+            raise InputError("name the folder of the certificate of a task, or of pretrained:NAME, with --out")
         out = Path(subject) / "certificate"
     loop, primitive = skill.loop, skill.loop.primitive
     budget = None
@@ -124,7 +125,7 @@ def verify_certificate(
     the search for the worst corrections, which must not exceed the budget.
 
     Args:
-        subject: Folder of a run, or name of a task.
+        subject: Folder of a run, `pretrained:NAME`, or name of a task.
         environment: As in `certify_skill`.
         folder: Folder of the certificate.
         start_within: As in `certify_skill`.
@@ -145,6 +146,8 @@ def verify_certificate(
         files = {name: (folder / name).read_bytes() for name in (CERTIFICATE, *checker.ARRAYS)}
         different = compare_subject(files, skill.loop, skill.stiffness, skill.limits, skill.about)
         if different is not None:
+            if different == "about":
+                different = _different_option(json.loads(files[CERTIFICATE])["about"], skill.about)
             verdict = f"no: its {different} is not that of {subject}"
         elif (budgeted := json.loads(files[CERTIFICATE])["budgeted"]) is not None:
             worst = _search_budget(skill.loop)
@@ -297,14 +300,24 @@ def _used_share(spent: np.ndarray, budget: np.ndarray) -> float:
 
 def _find_subject(subject: str, environment: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Return the task, the options of its environment, and the description of a certificate's subject."""
-    if not Path(subject).is_dir():
+    folder = find_run(subject)
+    if not folder.is_dir():
         about = {"task": subject, "environment": {key: str(value) for key, value in environment.items()}}
         return subject, dict(environment), about
-    config = RunFolder(Path(subject)).config()
-    config.refuse_changed_task(Path(subject), "certify the task by its name")
-    content = (Path(subject) / "config.yaml").read_bytes()
+    config = RunFolder(folder).config()
+    config.refuse_changed_task(folder, "certify the task by its name")
+    content = (folder / "config.yaml").read_bytes()
     about = {"task": config.task, "config.yaml": hashlib.sha256(content).hexdigest()}
     return config.task, changed_environment(config.task, config.environment, environment), about
+
+
+def _different_option(claimed: Mapping[str, Any], own: Mapping[str, Any]) -> str:
+    """Return the name of the first difference between the descriptions of two subjects."""
+    for a, b in ((claimed, own), (claimed.get("environment", {}), own.get("environment", {}))):
+        for name in sorted({*a, *b} - {"environment"}):
+            if a.get(name) != b.get(name):
+                return name
+    return "about"
 
 
 def _extremes(bounds: Bounds) -> dict[str, list[float | None]]:

@@ -2,10 +2,10 @@
 
 Started by `python -m guiderail.tools.env_server TASK_OR_RUN [OPTIONS]`; OPTIONS is a JSON object of environment
 options. It reads requests from standard input and answers on standard output, and ends when its input ends. Requests
-are `{"reset": SEED}`, with null to continue the random stream, and `{"action": [...]}`. The first line and every answer
-have `observation`, `pose`, `wrench`, `is_done`, `is_success` and `termination`. The first line also has `action_size`
-and `period`, the duration of an action [s]. A refused request is answered with `error` alone, and the simulation does
-not advance.
+are `{"reset": SEED}`, with null to continue the random stream, and `{"action": [...]}`; an action is clipped to
+[-1, 1]. The first line and every answer have `observation`, `pose`, `wrench`, `is_done`, `is_success` and
+`termination`. The first line also has `action_size` and `period`, the duration of an action [s]. A refused request is
+answered with `error` alone, and the simulation does not advance.
 """
 
 from __future__ import annotations

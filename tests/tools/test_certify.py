@@ -9,7 +9,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
 from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.common.errors import InputError
-from guiderail.tools.certify import _declared_start, certify_skill, verify_certificate
+from guiderail.tools.certify import _declared_start, _find_subject, certify_skill, verify_certificate
 
 COARSE = {"control_period": 0.05}  # 160 steps instead of 400: a certificate takes a third of the time
 
@@ -38,9 +38,9 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
     monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
-    for other in ({"action_scale": 2.0}, {"guidance": "kgrl"}):
-        verdict = verify_certificate("NarrowPassage", environment | other, folder)["checker"]
-        assert verdict == "no: its about is not that of NarrowPassage"
+    for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
+        verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
+        assert verdict == f"no: its {name} is not that of NarrowPassage"
     assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
     for excess in (9.0, np.nan):
         needed = SimpleNamespace(excess=np.full((2, 2), excess), residue=np.zeros((2, 2)))
@@ -177,3 +177,10 @@ def test_via_points_move_the_motion_but_not_its_start(tmp_path):
     with np.load(tmp_path / "primitive.npz") as primitive:
         assert np.abs(primitive["means"][0] - via[1:]).max() < 0.01
         np.testing.assert_array_equal(primitive["start"], reference_trajectory().means[0])
+
+
+def test_pretrained_policy_is_certified_like_a_run():
+    task, environment, about = _find_subject("pretrained:passage", {})
+    assert (task, environment["guidance"], set(about)) == ("NarrowPassage", "skgrl", {"task", "config.yaml"})
+    with pytest.raises(InputError, match="or of pretrained:NAME, with --out"):
+        certify_skill("pretrained:passage", {})

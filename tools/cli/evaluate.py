@@ -188,7 +188,10 @@ def robustness(
 
 @cli.command("certify runs/passage --attack 1000000")
 def certify(
-    subject: Annotated[str, argument("Folder of a run; or a task, with --out: {tasks}.", "RUN or TASK")],
+    subject: Annotated[
+        str,
+        argument("Folder of a run; or with --out pretrained:NAME ({pretrained}) or a task: {tasks}.", "RUN or TASK"),
+    ],
     env: cli.Env = None,
     out: Annotated[Path | None, option("Folder to write.  [default: certificate in the run]")] = None,
     start_within: Annotated[

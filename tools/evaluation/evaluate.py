@@ -14,6 +14,7 @@ import pandas as pd
 
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import POSE_NAMES, POSE_SIZE
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
@@ -392,5 +393,6 @@ def _save_demonstrations(motions: Sequence[tuple[np.ndarray, np.ndarray] | None]
     """Write the motions of successful episodes, if there are any; return their number."""
     successful = [motion for motion in motions if motion is not None]
     if successful:
-        Demonstrations([times for times, _ in successful], [poses for _, poses in successful]).save(file)
+        names = POSE_NAMES if successful[0][1].shape[1] == POSE_SIZE else None
+        Demonstrations([times for times, _ in successful], [poses for _, poses in successful], names).save(file)
     return len(successful)

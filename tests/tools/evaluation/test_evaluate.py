@@ -9,11 +9,13 @@ from gymnasium.envs.registration import EnvSpec
 from point_env import PointEnv
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.evaluate import (
+    _save_demonstrations,
     evaluate,
     evaluate_policy,
 )
@@ -317,3 +319,10 @@ def test_hidden_offset_is_resampled_only_with_new_run():
     for options, number in (({}, 1), ({"new_run": True}, 3)):
         sampled = [env.reset(seed=seed, options={"held_out": True} | options)[1]["jack_offset"] for seed in (7, 8, 9)]
         assert len({tuple(offset) for offset in sampled}) == number
+
+
+@pytest.mark.parametrize(("size", "names"), [(6, POSE_NAMES), (2, ("y1", "y2"))])
+def test_saved_poses_have_their_names(tmp_path, size, names):
+    motion = np.arange(3.0), np.arange(3.0 * size).reshape(3, size)
+    assert _save_demonstrations([None, motion], tmp_path / "saved.csv") == 1
+    assert Demonstrations.load(tmp_path / "saved.csv").names == names
