@@ -6,7 +6,7 @@ import gc
 import os
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from numbers import Real
 from typing import TYPE_CHECKING
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from guiderail.diagrams.hardware.station import HardwareStation
 
 REALTIME_PRIORITY = 20  # priority under SCHED_FIFO
+MIN_RATE = 1e-3  # smallest rate of a simulated robot's clock: a status period of 5 ms takes 5 s
 BIN_WIDTH = 1e-4  # width of a histogram's bin [s]
 
 
@@ -28,9 +29,13 @@ class Clock(ABC):
     """Clock that advances a hardware station together with its robot.
 
     A subclass sets `_period`, the status period of the station [s].
+
+    Attributes:
+        check_robot: Function that is called before each step; it raises an error if the robot's program has ended.
     """
 
     _period: float
+    check_robot: Callable[[], object] | None = None
 
     @abstractmethod
     def begin(self) -> None:
@@ -42,6 +47,8 @@ class Clock(ABC):
         start = context.get_time()
         for step in range(steps):
             time_of_status = self._wait_for_step()
+            if self.check_robot is not None:
+                self.check_robot()
             # Events of this instant are still pending in Drake, and belong to the previous status.
             simulator.AdvancePendingEvents()
             station.receive(context, time_of_status)
@@ -56,10 +63,10 @@ def check_rate(rate: float) -> None:
     """Check the rate of the robot's clock relative to the wall clock.
 
     Raises:
-        InputError: If `rate` is not a number, not positive, or above 1.
+        InputError: If `rate` is not a number, below `MIN_RATE`, or above 1.
     """
-    if not isinstance(rate, Real) or not 0.0 < rate <= 1.0:
-        raise InputError(f"the rate of a simulated robot's clock is positive and at most 1, not {brief(rate)}")
+    if not isinstance(rate, Real) or not MIN_RATE <= rate <= 1.0:
+        raise InputError(f"the rate of a simulated robot's clock is from {MIN_RATE:g} to 1, not {brief(rate)}")
 
 
 class IntervalHistogram:

@@ -265,7 +265,11 @@ Synchronous = Annotated[
     option("With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"),
 ]
 Rate = Annotated[
-    float | None, option("With --sim: speed of the simulated robot's clock relative to real time.  [default: 0.2]")
+    float | None,
+    option(
+        "With --sim, without --synchronous: speed of the simulated robot's clock relative to real time, from 0.001 to "
+        "1.  [default: 0.2]"
+    ),
 ]
 Scenario = Annotated[Path | None, option("Hardware: scenario file with the robot, its bus and its surroundings.")]
 Yes = Annotated[bool, option("Hardware: answer all pre-flight questions with yes.", "--yes")]

@@ -77,7 +77,9 @@ def train(
     rate: cli.Rate = None,
     scenario: cli.Scenario = None,
     yes: cli.Yes = False,
-    resume: Annotated[bool, option("Resume the run in --out.", "--resume")] = False,
+    resume: Annotated[
+        bool, option("Resume the run in --out; one with a simulated driver needs --sim again.", "--resume")
+    ] = False,
     imports: cli.Imports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,

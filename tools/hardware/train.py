@@ -57,12 +57,13 @@ def train_on_robot(
         given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
         settings: Settings of the learner by name.
         resume: Continue a run from its last episode. The address of the robot may differ.
-        assume_yes: Skip the confirmation of the checks and, with a simulated driver, of resuming after a stop.
+        assume_yes: Skip the confirmation of the checks; resuming after a stop is always confirmed.
         log: Function that shows a message.
 
     Raises:
         InputError: If the task cannot be trained on hardware, a setting is invalid or needs demonstrations, the folder
-            exists or, with `resume`, contradicts an argument, no robot answers, or a check fails or is not confirmed.
+            exists or, with `resume`, contradicts an argument or the kind of driver, no robot answers, or a check fails
+            or is not confirmed.
     """
     folder = RunFolder(out)
     options = connection.environment_options(str(environment["station"]))
@@ -70,6 +71,9 @@ def train_on_robot(
         kept = {name: value for name, value in environment.items() if name != "robot_url"}
         choices = {name: value for name, value in given.items() if name != "imports"}
         config = resumed_config(folder, task, kept, choices, settings)
+        if config.simulated_driver not in (None, connection.sim):
+            instead = "a simulated driver: give --sim" if config.simulated_driver else "a robot: leave --sim out"
+            raise InputError(f"the run in {out} was trained with {instead}, or train again in another folder")
         config = replace(config, environment={**config.environment, **options})
     elif task is None:
         raise InputError("training needs a task: name a task, such as guiderail train BncConnector --out RUN")
@@ -78,6 +82,7 @@ def train_on_robot(
         config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
+    config = replace(config, simulated_driver=connection.sim)
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
         folder.write_config(config)
         try:

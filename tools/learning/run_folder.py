@@ -27,6 +27,8 @@ from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
+# Options that may change within a run: via points are added during a supervised one, and a robot has another address.
+CHANGING = ("via_points", "robot_url", "robot_timeout")
 _version = cache(metadata.version)  # cached, because it reads files
 
 
@@ -45,6 +47,7 @@ class RunConfig:
     step_log: bool = True  # True if every control step is written to the step log
     task_content: str = ""  # digest of the files that define the task; empty if there are none
     human_in_the_loop: bool = False  # True if a supervisor corrects the policy; see the option via_points
+    simulated_driver: bool | None = None  # on a hardware station: True for a simulated driver, False for a robot
 
     @property
     def action_repeat(self) -> int:
@@ -54,8 +57,7 @@ class RunConfig:
     @property
     def identity(self) -> str:
         """Text of all that determines an episode; a resumed run may differ in the rest, such as `episodes`."""
-        # Via points are added during a supervised run.
-        environment = {name: value for name, value in self.environment.items() if name != "via_points"}
+        environment = {name: value for name, value in self.environment.items() if name not in CHANGING}
         return json.dumps([self.task, self.seed, environment, config_values(self.learner)], sort_keys=True)
 
     def refuse_changed_task(self, path: Path, otherwise: str = "train again in another folder") -> None:
@@ -161,6 +163,8 @@ class RunFolder:
         """Replace `config.yaml`."""
         values = asdict(config) | {"learner": config_values(config.learner)}
         values["imports"] = list(config.imports)
+        if config.simulated_driver is None:
+            del values["simulated_driver"]
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
     def config(self) -> RunConfig:
