@@ -7,8 +7,8 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 
@@ -122,6 +122,43 @@ def path_exists(path: Path) -> bool:
         return path.exists()
     except OSError as error:
         raise InputError(f"the path {brief(str(path))} cannot be read ({error.strerror}): check it") from error
+
+
+def check_room(path: Path, size: int) -> None:
+    """Raise an InputError if the file system of a file or a new folder has room for less than `size` bytes."""
+    try:
+        room = shutil.disk_usage(next(one for one in path.absolute().parents if one.exists())).free
+    except OSError as error:
+        raise write_error(path, error) from error
+    if room < size:
+        raise InputError(
+            f"{path.parent} has room for {room:,} bytes, and the record may need {size:,}: choose a folder with room"
+        )
+
+
+def write_record(path: Path, write: Callable[[Path], object]) -> tuple[Path, str]:
+    """Write a record that cannot be repeated; if that fails, write it into a temporary folder or the home folder.
+
+    Args:
+        path: File to write.
+        write: Function that writes the file of a path.
+
+    Returns:
+        The path of the written file, and a sentence on the failure, empty if there was none.
+
+    Raises:
+        InputError: If the record cannot be written to any of these folders.
+    """
+    try:
+        write(path)
+    except (InputError, OSError) as error:
+        for parent in (None, os.path.expanduser("~")):
+            with suppress(InputError, OSError):
+                other = Path(tempfile.mkdtemp(prefix="guiderail-", dir=parent)) / path.name
+                write(other)
+                return other, f"{path} cannot be written, so the record is in {other}"
+        raise InputError(f"{error}; the record could not be written to another folder either") from error
+    return path, ""
 
 
 def check_new(out: Path, what: str) -> None:

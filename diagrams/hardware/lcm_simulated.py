@@ -38,6 +38,7 @@ from guiderail.models.robots.robot import EndEffector
 
 ACKNOWLEDGED = "_TAKEN"  # suffix of the channel on which a `LockstepClock` acknowledges a status
 REPEAT_INTERVAL = 0.05  # wall clock time after which an unacknowledged status is sent again [s]
+CHECK_INTERVAL = 1.0  # wall clock time after which a silent robot's program is checked again [s]
 
 
 class SimulatedIiwa(Diagram):
@@ -143,7 +144,9 @@ class LockstepClock(Clock):
         self._acknowledge()
         while statuses.head == self._used and (left := end - time.monotonic()) > 0.0:
             repeats = statuses.repeats
-            self._driver.receive(left)
+            self._driver.receive(min(left, CHECK_INTERVAL))
+            if self.check_robot is not None:
+                self.check_robot()
             if statuses.head == self._used and statuses.repeats > repeats:
                 self._acknowledge()  # the acknowledgement may have been lost
         self._has_timed_out = statuses.head == self._used

@@ -10,18 +10,23 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.hardware.clock import Clock, WallClock, check_rate
 from guiderail.diagrams.hardware.driver import find_driver
 from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
 from guiderail.diagrams.hardware.lcm import LcmDriver
-from guiderail.diagrams.hardware.lcm_simulated import LockstepClock
+from guiderail.diagrams.hardware.lcm_simulated import LockstepClock, SimulatedIiwa
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.robots import DEFAULT_ROBOT
+from guiderail.models.robots.robot import find_robot
 from guiderail.tools.hardware.scenario import load_scenario
 
 MILLISECOND = 0.001  # [s]
@@ -55,6 +60,21 @@ def subprocess_tied_to_parent(code: str) -> Iterator[subprocess.Popen[Any]]:
         process.stdin.close()
 
 
+class DriverEndedError(InputError):
+    """Error for a simulated driver whose process has ended."""
+
+
+def watch_process(clock: Clock, process: subprocess.Popen[Any] | None) -> None:
+    """Let a clock raise `DriverEndedError` when the process of a simulated driver, if there is one, has ended."""
+    if process is not None:
+        clock.check_robot = partial(_refuse_ended, process)
+
+
+def _refuse_ended(process: subprocess.Popen[Any]) -> None:
+    if process.poll() is not None:
+        raise DriverEndedError(f"the simulated driver has ended (exit code {process.returncode}): start again")
+
+
 def check_simulation(driver: str, scenario: Path | None, joint_friction: float | None) -> None:
     """Check the options of a simulated robot.
 
@@ -83,7 +103,7 @@ class RobotConnection:
     """Connection to the robot driver.
 
     Raises:
-        InputError: If the options contradict each other, the driver is unknown or has no simulated robot, or the rate
+        InputError: If the options contradict each other, driver or robot is unknown or has no simulation, or the rate
             or the joint friction is out of range.
     """
 
@@ -94,7 +114,7 @@ class RobotConnection:
     # Run station and simulated driver in lockstep instead of by the wall clock. Always True for the simulated robot of
     # the driver fci, because at 1 kHz it is slower than real time on most machines.
     synchronous: bool = False
-    rate: float = DEFAULT_RATE  # rate of a simulated robot's clock relative to the wall clock
+    rate: float | None = None  # rate of a simulated robot's clock by the wall clock; `DEFAULT_RATE` by default
     scenario: Path | None = None  # scenario file with robot, address and surroundings
     joint_friction: float | None = None  # friction of each joint of a simulated Franka [Nm], for experiments
 
@@ -126,6 +146,8 @@ class RobotConnection:
             object.__setattr__(self, "robot", own.robot or own.name if own else DEFAULT_ROBOT)
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
+        if self.sim and not self.driver:
+            find_robot(self.robot)
         if self.sim and (driver := self.driver or self.robot) not in SIMULATED:
             raise InputError(f"these drivers have a simulated robot: {', '.join(SIMULATED)}, not {driver}")
         check_simulation(self.driver if self.sim else "", self.scenario, self.joint_friction)
@@ -134,9 +156,20 @@ class RobotConnection:
                 "a simulated driver has a bus of its own, so that no real driver receives its messages: leave "
                 "--robot-url out"
             )
-        check_rate(self.rate)
         if self.sim and self.driver == FCI:
             object.__setattr__(self, "synchronous", True)
+        if self.rate is None:
+            return
+        check_rate(self.rate)
+        if not self.sim:
+            raise InputError("a real robot's clock has its own rate: --rate is for a simulated driver, --sim")
+        if self.synchronous:
+            raise InputError("driver and controller that wait for each other have no rate: leave --rate out")
+
+    @property
+    def clock_rate(self) -> float:
+        """Rate of the robot's clock relative to the wall clock: 1 for a real robot."""
+        return (self.rate or DEFAULT_RATE) if self.sim else 1.0
 
     def environment_options(self, station: str) -> dict[str, Any]:
         """Return the environment options of a hardware station on this connection."""
@@ -151,7 +184,7 @@ class RobotConnection:
 
     def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:
         """Return a station's clock and a wall clock; they are the same object unless in lockstep."""
-        wall_clock = WallClock(station.driver, station.period, self.rate if self.sim else 1.0)
+        wall_clock = WallClock(station.driver, station.period, self.clock_rate)
         if not self.synchronous:
             return wall_clock, wall_clock
         if not isinstance(station.driver, LcmDriver):
@@ -164,7 +197,7 @@ class RobotConnection:
             return {}
         return {
             "milliseconds_between_statuses": {
-                "period": station.period / (self.rate if self.sim else 1.0) / MILLISECOND,
+                "period": station.period / self.clock_rate / MILLISECOND,
                 "99 %": clock.intervals.quantile(0.99) / MILLISECOND,
                 "longest": clock.intervals.longest / MILLISECOND,
             }
@@ -177,20 +210,32 @@ class RobotConnection:
         """Run the simulated driver of an arm in front of a task's fixture; for a real robot, do nothing and yield None.
 
         The driver listens at `url` and imports the modules `imports`.
+
+        Raises:
+            InputError: If the surroundings of the scenario file cannot be simulated.
         """
         if not self.sim:
             yield None
             return
-        rate = None if self.synchronous else self.rate
+        rate = None if self.synchronous else self.clock_rate
         scenario = None if self.scenario is None else str(self.scenario.resolve())
+        if self.scenario is not None and (directives := load_scenario(self.scenario).directives):
+            SimulatedIiwa(
+                EnvConfig.resolve(task, {}).make_task().workcell(), DrakeLcm("memq://"), directives=directives
+            )
         code = (
+            "import sys\n"
             "from pathlib import Path\n"
+            "from guiderail.models.common.errors import InputError\n"
             "from guiderail.tools.imports import import_modules\n"
             "from guiderail.tools.hardware import sim_driver\n"
-            f"import_modules({list(imports)!r})\n"
-            f"sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
+            "try:\n"
+            f"    import_modules({list(imports)!r})\n"
+            f"    sim_driver.run_sim_driver({url!r}, {MAX_DURATION!r}, {COMMAND_TIMEOUT!r}, {task!r}, rate={rate!r}, "
             f"scenario={scenario!r} and Path({scenario!r}), driver={self.driver!r}, "
-            f"joint_friction={self.joint_friction!r})"
+            f"joint_friction={self.joint_friction!r})\n"
+            "except InputError as error:\n"
+            "    sys.exit(f'guiderail: {error}')\n"
         )
         with subprocess_tied_to_parent(code) as process:
             yield process

@@ -15,7 +15,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, PolicyFn, rollout
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import write_atomically, write_record
 from guiderail.tools.hardware.connection import Log, RobotConnection
 from guiderail.tools.hardware.executor import hardware_environment, recordings_folder
 from guiderail.tools.hardware.session import robot_session
@@ -85,9 +85,8 @@ def evaluate_on_robot(
     path = (out or recordings_folder(run)) / f"episodes{'-' * bool(policy)}{policy}.csv"
     rows: list[dict[str, Any]] = []
 
-    def write(rows: list[dict[str, Any]]) -> None:
-        if rows:
-            write_atomically(path, table_text(pd.DataFrame(rows)).encode())
+    def write(file: Path) -> None:
+        write_atomically(file, table_text(pd.DataFrame(rows)).encode())
 
     with RunFolder(path.parent).locked():
         if path.exists():
@@ -105,7 +104,7 @@ def evaluate_on_robot(
                         seed = HELD_OUT_SEED + index
                         rows.append(rollout(env, act, index=index, seed=seed, held_out=connection.sim))
                         env.idle()
-                        write(rows)
+                        write(path)
                         env.idle()
                         progress.update(rows[-1])
                         env.pause()
@@ -113,6 +112,9 @@ def evaluate_on_robot(
                     try:
                         env.rest()
                     finally:
-                        write(rows)  # includes the last episode, even if resuming after it was not confirmed
+                        if rows:  # includes the last episode, even if resuming after it was not confirmed
+                            path, failure = write_record(path, write)
+                            if failure:
+                                log(f"the motion was executed, but {failure}")
     stopped = sum(row["termination"] == "stopped" for row in rows)
     return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS), "stopped": stopped}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,8 +32,14 @@ from guiderail.models.control.joint_status import Fault
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
-from guiderail.tools.files import check_writable, write_atomically
-from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection
+from guiderail.tools.files import check_room, check_writable, write_atomically, write_record
+from guiderail.tools.hardware.connection import (
+    NO_REALTIME_PRIORITY,
+    DriverEndedError,
+    Log,
+    RobotConnection,
+    watch_process,
+)
 from guiderail.tools.hardware.operator import operator_keys
 from guiderail.tools.hardware.preflight import (
     SPEED,
@@ -60,6 +67,7 @@ SIGNALS = {
 # Recorded signals of the joints, of size n each.
 JOINT_SIGNALS = ("position_measured", "velocity_estimated", "torque_external", "torque_commanded")
 MAX_WARM_UP_TIME = 0.1  # longest duration of the warm-up [s]
+MAX_JOINTS = 7  # largest number of joints, for the estimated size of a recording
 BLEND_TIMEOUT = 5.0  # longest time until the controller has full authority [s]
 COMPLETED = "executed to its end"
 
@@ -250,31 +258,55 @@ class SkillExecutor:
             "fault": outcome.fault.name,
             "steps": outcome.steps,
         }
+        where = ""
         if outcome.steps:
             distance, angle = pose_distance(self.trace.measured[-1], np.zeros(6))
             metadata |= {"millimeters_from_target": distance / MM, "degrees_from_target": angle / DEGREE}
             metadata["peak_force"] = float(self.trace.force.max())
-            log(f"ended {distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees from the nominal target")
-        log(f"{outcome.description}, after {outcome.steps} control steps: {self.write(folder, metadata)}")
+            where = f"ended {distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees from the nominal target"
+        # The record is written before anything is shown: SIGHUP closes the terminal.
+        path, failure = self.write(folder, metadata)
+        if where:
+            log(where)
+        log(f"{outcome.description}, after {outcome.steps} control steps: {path}")
+        if failure:
+            log(f"the motion was executed, but {failure}")
 
-    def write(self, folder: Path, metadata: Mapping[str, Any]) -> Path:
-        """Write the control steps with joint signals as Parquet, the metadata as JSON; return the Parquet path."""
-        folder.mkdir(parents=True, exist_ok=True)
-        # The number is above those of all existing files, because either file of a recording may have been removed.
-        matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
-        number = max((int(match.group(1)) for match in matches if match), default=-1) + 1
+    def write(self, folder: Path, metadata: Mapping[str, Any]) -> tuple[Path, str]:
+        """Write the control steps with joint signals as Parquet, and the metadata as JSON.
+
+        Returns:
+            As `write_record`: the path of the Parquet file, and a sentence if it is in another folder.
+        """
+        number = _next_number(folder)
         steps = table(self.trace, number)
         num_joints = self._station.controller_plant.plant.num_positions()
         for name, values in self._joints.items():
             columns = np.reshape(values[: len(self.trace)], (len(self.trace), num_joints)).T
             for joint, column in enumerate(columns):
                 steps = steps.append_column(f"{name}_{joint}", pa.array(column))
-        path = step_log_file(folder, number)
-        write_step_log(path, steps)
         # NaN and infinite numbers, such as statistics of no statuses, are null: JSON does not have them.
         values = json.loads(json.dumps(dict(metadata)), parse_constant=lambda name: None)
-        write_atomically(path.with_suffix(".json"), json.dumps(values, indent=2).encode() + b"\n")
-        return path
+
+        def write(path: Path) -> None:
+            write_step_log(path, steps)
+            write_atomically(path.with_suffix(".json"), json.dumps(values, indent=2).encode() + b"\n")
+
+        return write_record(step_log_file(folder, number), write)
+
+
+def _record_size(num_steps: int) -> int:
+    """Return an upper estimate of the size of the recording of `num_steps` control steps [bytes]."""
+    columns = 16 + sum(SIGNALS.values()) + len(JOINT_SIGNALS) * MAX_JOINTS
+    return 200_000 + 10 * columns * num_steps
+
+
+def _next_number(folder: Path) -> int:
+    """Return a number above those of all recordings in a folder; either file of a recording may have been removed."""
+    with suppress(OSError):
+        matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
+        return max((int(match.group(1)) for match in matches if match), default=-1) + 1
+    return 0
 
 
 def deploy(
@@ -303,8 +335,9 @@ def deploy(
         The exit code: 0 if the skill was executed to its end, 1 if it was stopped or did not reach the start.
 
     Raises:
-        InputError: If the task is no insertion, the policy cannot be executed or recorded, the force limit is above
-            that of the training, no robot answers, or a check fails or is not confirmed.
+        InputError: If the task is no insertion, the policy cannot be executed or recorded, the folder has no room for
+            the recording, the force limit is above that of the training, no robot answers, a check fails or is not
+            confirmed, or a signal arrives before the arm may move.
     """
     folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
     config, policy = folder.config(), Policy.load(folder.path)
@@ -315,6 +348,7 @@ def deploy(
     task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no start pose for an arm: deploy the policy of an insertion")
+    check_room(step_log_file(recordings, 0), _record_size(task.num_steps))
     if force_limit is not None:
         if not force_limit <= task.collision.above:
             raise InputError(
@@ -327,10 +361,11 @@ def deploy(
     skill = make_skill(config.task, policy, **environment)
     skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
     with (
-        connection.simulated_driver(config.task, environment["robot_url"], config.imports),
+        connection.simulated_driver(config.task, environment["robot_url"], config.imports) as process,
         operator_keys() as keys,
     ):
         clock, wall_clock = connection.clocks(skill_station)
+        watch_process(clock, process)
         log(f"waiting for {connection.robot} on {skill_station.driver}")
         executor = SkillExecutor(task, skill, clock, keys.is_stop_requested)
         checks = confirm_checks(executor.preflight, log, assume_yes=assume_yes)
@@ -344,9 +379,12 @@ def deploy(
             "sim": connection.sim,
             "checks": {check.name: check.description for check in checks},
         }
+        keys.is_moving = True
         with garbage_collection_disabled():
             try:
                 outcome = executor.run(log)
+            except DriverEndedError as error:
+                outcome = Outcome(Fault.STALE, str(error), len(executor.trace))
             except BaseException as error:
                 outcome = Outcome(Fault.NONE, f"failed: {type(error).__name__}: {error}", len(executor.trace))
                 raise

@@ -110,8 +110,7 @@ class PreflightChecks:
         self._max_wrench = max_wrench
         self.simulator = start_simulator(station, clock, max_wrench)
         self._commands_before = station.driver.num_foreign_commands
-        # Nothing is sent yet, and a safety monitor's first heartbeat may take a status or two.
-        clock.advance(self.simulator, station, NUM_STATUSES)
+        self._receive_statuses()
 
     @property
     def error(self) -> str:
@@ -133,13 +132,24 @@ class PreflightChecks:
         return check_robot(self._station, self.simulator.get_context(), self._start, num_commands)
 
     def repeat(self) -> list[Check]:
-        """Receive new statuses after a pause in which none were received, and repeat the checks."""
+        """Receive new statuses after a pause in which none were received, and repeat the checks.
+
+        Raises:
+            InputError: If no statuses arrive any more.
+        """
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
         # A new simulator accepts the arm's position at once, even if it was moved by hand in the meantime.
         self.simulator = start_simulator(self._station, self._clock, self._max_wrench)
-        self._clock.advance(self.simulator, self._station, NUM_STATUSES)
+        self._receive_statuses()
         return self.run()
+
+    def _receive_statuses(self) -> None:
+        """Receive `NUM_STATUSES`; nothing is sent, and a safety monitor's first heartbeat may take a status or two."""
+        driver, before = self._station.driver, self._station.driver.num_statuses
+        self._clock.advance(self.simulator, self._station, NUM_STATUSES)
+        if driver.num_statuses == before:
+            raise InputError(f"no statuses arrive any more on {driver}: start its driver again")
 
 
 def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:

@@ -21,7 +21,7 @@ from guiderail.diagrams.hardware.lcm import LcmDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection
+from guiderail.tools.hardware.connection import NO_REALTIME_PRIORITY, Log, RobotConnection, watch_process
 from guiderail.tools.hardware.operator import confirm, operator_keys
 from guiderail.tools.hardware.preflight import confirm_checks
 from guiderail.tools.hardware.robot_env import RobotEnv
@@ -44,12 +44,13 @@ def robot_session(
 ) -> Iterator[RobotSession]:
     """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the session.
 
-    With a simulated driver, a reset samples the offsets of the parts as in simulation. With `assume_yes`, the checks
-    need no confirmation; if the driver is also simulated, resuming after a stop needs none either.
+    With a simulated driver, a reset samples the offsets of the parts as in simulation, and the fixture is taken away
+    where the operator of a robot releases the workpiece. With `assume_yes`, the checks need no confirmation; resuming
+    after a stop always does.
 
     Raises:
-        InputError: If the task has no observable success, its reward needs simulation state, no robot answers, or a
-            check fails or is not confirmed.
+        InputError: If the task has no observable success, its reward needs simulation state, no robot answers, a check
+            fails or is not confirmed, or a signal arrives before the arm may move.
     """
     task = EnvConfig.resolve(config.task, config.environment).make_task()
     if not isinstance(task, InsertionTask) or task.observable_success() is None:
@@ -63,10 +64,11 @@ def robot_session(
     diagram = build_task_diagram(task, station, make_guidance(task, station))
     start = task.start_pose(np.random.default_rng(0))
     with (
-        connection.simulated_driver(config.task, station.driver.url, config.imports),
+        connection.simulated_driver(config.task, station.driver.url, config.imports) as process,
         operator_keys() as keys,
     ):
         clock, wall_clock = connection.clocks(station)
+        watch_process(clock, process)
         log(f"waiting for {connection.robot} on {station.driver}")
 
         randomize_parts = None
@@ -76,12 +78,14 @@ def robot_session(
             randomize_parts = PartRandomizer(task, partial(publish_part_offsets, station.driver), config.seed)
 
         def ask(reason: str, question: str) -> None:
-            log(f"the arm is at rest: {reason}")
-            if not (assume_yes and connection.sim):
-                confirm(question)
+            log(f"the motion is stopped: {reason}")
+            if keys.must_end:
+                raise InputError("stopped by a signal: the arm does not move again")
+            confirm(question, has_yes=False)
 
         def free_workpiece(reason: str) -> None:
-            ask(reason, "Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
+            if randomize_parts is None or keys.is_stop_requested():
+                ask(reason, "Release the workpiece by hand, put the parts back, and keep clear. May the arm move?")
             if randomize_parts is not None:
                 randomize_parts.remove_fixture()
 
@@ -104,4 +108,5 @@ def robot_session(
         if not connection.synchronous and not set_realtime_priority():
             log(NO_REALTIME_PRIORITY)
         log(keys.describe(has_pauses=True))
+        keys.is_moving = True
         yield RobotSession(env, lambda: connection.timing(station, wall_clock))

@@ -96,7 +96,13 @@ def run_sim_driver(
     reset = None if offset is None else validate_options(insertion.Reset, {"offset": tuple(offset)}, "a robot")
     start = START if task == DEFAULT_TASK else insertion.start_pose(np.random.default_rng(0)) + START_OFFSET
     if driver == FCI:
-        from guiderail.diagrams.hardware import fci_simulated  # needs franky-sim
+        try:
+            from guiderail.diagrams.hardware import fci_simulated
+        except ModuleNotFoundError as error:
+            name = (error.name or "").partition(".")[0]
+            raise InputError(
+                f'the simulated Franka needs {name}: pip install "guiderail[fci,mujoco]" franky-sim'
+            ) from error
 
         parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
         friction = fci_simulated.RESIDUAL_FRICTION if joint_friction is None else joint_friction

@@ -32,7 +32,7 @@ from guiderail.systems.meshcat_device import MeshcatDevice
 from guiderail.systems.support.drake_multibody import transform_to_vector
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
-from guiderail.tools.files import check_new
+from guiderail.tools.files import check_new, check_room, write_record
 from guiderail.tools.teleop.teleoperator import GAMEPAD_AXES, KEY_PAIRS, MeshcatPanel, Slider, page_address, set_camera
 
 PATH = "/guiderail/force"
@@ -117,6 +117,7 @@ SLOW_RATE = 0.25  # rate of slow motion relative to real time
 UNDO_TIME = 1.0  # motion that one undo takes back [s]
 MAX_UNDOS = 60  # largest number of consecutive undos; each needs a copy of the simulation's state
 FORCE_STEPS = 5  # control steps between updates of the gauge: more frequent updates would delay the page
+MIN_ROOM = 1_000_000  # room for the file of demonstrations [bytes], such as two minutes in a .csv file
 MIN_STEPS = 10  # smallest number of control steps of a demonstration
 MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
 
@@ -174,11 +175,12 @@ class DemonstrationRecorder:
 
         Raises:
             InputError: If the task is no insertion, the station is hardware, or the file exists, has another ending or
-                cannot be written.
+                cannot be written, or there is no room for it.
         """
         check_new(out, "file")
         if out.suffix not in (".npz", ".csv"):
             raise InputError(f"{out} must end in .npz or .csv")
+        check_room(out, MIN_ROOM)
         self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
         if self.task.workcell_kind != "insertion":
             raise InputError(f"{task} has no tool that an operator can move: demonstrate a task that inserts a part")
@@ -280,7 +282,8 @@ class DemonstrationRecorder:
             A sentence on the demonstration.
 
         Raises:
-            InputError: If the demonstration is too short, has no motion or cannot be written; it is then not kept.
+            InputError: If the demonstration is too short, has no motion, or can be written neither to the file nor to a
+                temporary folder or the home folder; it is then not kept.
         """
         commands = np.array(self.recording.commands)
         if self.steps < MIN_STEPS or not np.ptp(commands, axis=0).any():
@@ -288,14 +291,14 @@ class DemonstrationRecorder:
         is_success = self.is_success()
         demonstrations = [*self.demonstrations, (self._period * np.arange(len(commands)), commands)]
         out = self._unused_path()
-        _to_demonstrations(demonstrations).save(out)
         note = "" if out == self.out else f", because another program has written {self.out}"
-        self.out, self._written, self.demonstrations = out, _file_version(out), demonstrations
+        self.out, failure = write_record(out, _to_demonstrations(demonstrations).save)
+        self._written, self.demonstrations = _file_version(self.out), demonstrations
         self.successes.append(is_success)
         end = {None: "", True: ", at the target", False: ", NOT at the target"}[is_success]
         duration = (self.steps - 1) * self._period
         lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s after rests were shortened"
-        return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {self.out}{note}"
+        return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {failure or f'{self.out}{note}'}"
 
     def is_success(self) -> bool | None:
         """Return True if the workpiece is at its target; None if the task does not define success by its pose."""

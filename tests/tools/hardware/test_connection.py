@@ -7,15 +7,27 @@ import sys
 from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
-from guiderail.tools.hardware.connection import SIMULATED, RobotConnection, _loopback_address, subprocess_tied_to_parent
+from guiderail.tools.hardware.connection import (
+    SIMULATED,
+    DriverEndedError,
+    RobotConnection,
+    _loopback_address,
+    subprocess_tied_to_parent,
+    watch_process,
+)
 from guiderail.tools.hardware.executor import recordings_folder
 
 MINE = """
@@ -82,7 +94,7 @@ def test_simulated_franka_is_in_lockstep():
         ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "no other surroundings than the task's"),
         ({"driver": "fci", "joint_friction": -0.1}, "joint_friction must be at least 0 and finite, not -0.1"),
         ({"joint_friction": "0.1"}, "joint_friction must be at least 0 and finite, not '0.1'"),
-        ({"rate": "0.2"}, "the rate .* is positive and at most 1, not '0.2'"),
+        ({"rate": "0.2"}, "the rate .* is from 0.001 to 1, not '0.2'"),
     ],
 )
 def test_connection_refuses_what_the_simulated_driver_would_refuse(options, words):
@@ -98,6 +110,25 @@ def test_recordings_are_in_a_folder_of_the_run(run, folder):
 def test_simulated_driver_has_an_address_of_its_protocol():
     urls = [RobotConnection(sim=True, driver=name).environment_options("hardware")["robot_url"] for name in SIMULATED]
     assert [url.partition(":")[0] for url in urls] == ["udpm", _loopback_address(os.getpid())]
+
+
+def test_clock_raises_when_the_simulated_driver_has_ended():
+    clock = WallClock(IiwaDriver("memq://"))
+    with subprocess_tied_to_parent("raise SystemExit(3)") as process:
+        watch_process(clock, process)
+        process.wait()
+        with pytest.raises(DriverEndedError, match=r"the simulated driver has ended .exit code 3.: start again"):
+            clock.advance(Simulator(ConstantVectorSource([0.0])), SimpleNamespace(), 1)
+
+
+def test_unusable_surroundings_are_refused_before_the_driver_starts(tmp_path, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.hardware.connection.subprocess_tied_to_parent", None)
+    file = tmp_path / "a.yaml"
+    text = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only}}\n"
+    file.write_text(text + "directives: [{add_model: {name: box, file: 'package://nope/box.sdf'}}]\n")
+    connection = RobotConnection.from_scenario(file)
+    with pytest.raises(InputError, match="unknown package 'nope'"), connection.simulated_driver("BncConnector", ""):
+        pass
 
 
 def test_processes_have_different_addresses():

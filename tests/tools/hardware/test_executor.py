@@ -22,7 +22,7 @@ from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.cli.main import main
 from guiderail.tools.hardware import executor as executing
 from guiderail.tools.hardware import preflight
-from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.tools.hardware.connection import DriverEndedError, RobotConnection
 from guiderail.tools.hardware.executor import SkillExecutor
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.learning.run_folder import RunFolder
@@ -72,7 +72,7 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
     velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(context))
     assert np.abs(velocities).max() < 0.01
     metadata = {"outcome": outcome.description, "statuses": {"99 %": np.nan, "longest": np.inf}}
-    path = executor.write(tmp_path, metadata)
+    path = executor.write(tmp_path, metadata)[0]
     step_log = pd.read_parquet(path)
     assert len(step_log) == 20
     assert {"pose_0", "wrench_2", "fault", "torque_commanded_6", "position_measured_0"} <= set(step_log)
@@ -118,6 +118,26 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     step_log = pd.read_parquet(tmp_path / "hardware" / "episode-000005.parquet")
     assert metadata["outcome"].startswith("failed: PolicyError")
     assert metadata["steps"] == len(step_log) > 0
+
+
+def test_recording_is_in_another_folder_when_its_own_is_full(make_executor, monkeypatch, tmp_path):
+    executor, _ = make_executor()
+    executor.run(print)
+    write, messages = executing.write_step_log, []
+
+    def write_outside(path, rows):
+        if path.is_relative_to(tmp_path / "full"):
+            raise InputError("no room")
+        write(path, rows)
+
+    monkeypatch.setattr(executing, "write_step_log", write_outside)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    executor.save(tmp_path / "full", executing.Outcome(Fault.NONE, executing.COMPLETED, 20), {}, messages.append)
+    (file,) = tmp_path.glob("guiderail-*/episode-000000.parquet")
+    assert len(pd.read_parquet(file)) == 20
+    assert file.with_suffix(".json").exists()
+    assert messages[-1].startswith("the motion was executed, but ")
+    assert messages[-1].endswith(f"cannot be written, so the record is in {file}")
 
 
 @pytest.mark.parametrize("valid", [0, 2])  # valid actions; the first call is the warm-up
@@ -201,6 +221,26 @@ def test_execution_ends_when_statuses_stop(make_executor):
     clock.happens[300] = lambda: setattr(clock, "is_silent", True)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (Fault.STALE, 1)
+
+
+def test_arm_is_not_waited_for_when_its_simulation_has_ended(make_executor):
+    def end():
+        clock.is_silent = True
+        clock.happens = dict.fromkeys(range(clock.step, clock.step + 1000), end)
+        raise DriverEndedError("the simulated driver has ended")
+
+    executor, clock = make_executor()
+    clock.happens[200] = end
+    with pytest.raises(DriverEndedError):
+        executor.run(print)
+    assert clock.step < 210
+
+
+def test_silent_driver_is_not_reported_as_a_missing_monitor(make_executor):
+    executor, clock = make_executor()
+    clock.is_silent = True
+    with pytest.raises(InputError, match="no statuses arrive any more on LCM"):
+        executor.preflight.repeat()
 
 
 def test_execution_ends_when_the_operator_stops(make_executor):
@@ -313,6 +353,9 @@ def test_deploy_raises_first_when_out_is_not_writable(monkeypatch, tmp_path):
     monkeypatch.setattr(executing.Policy, "load", lambda folder: lambda observation: np.zeros(2))
     RunFolder(tmp_path / "run").write_config(configure("BncConnector", {"guidance": "kmp"}, episodes=1))
     (tmp_path / "file").write_text("")
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=9))
+    with pytest.raises(InputError, match=r"has room for 9 bytes, .* with room$"):
+        executing.deploy(tmp_path / "run", RobotConnection(), assume_yes=True, out=tmp_path / "out")
     with pytest.raises(InputError, match="cannot be written"):
         executing.deploy(tmp_path / "run", RobotConnection(), assume_yes=True, out=tmp_path / "file" / "out")
 
@@ -328,7 +371,12 @@ def test_monitor_check_fails_without_a_heartbeat(make_executor):
     [
         ({"synchronous": True}, "does not wait"),
         ({"sim": True, "robot": "panda"}, "have a simulated robot"),
-        ({"rate": 0.0}, "rate"),
+        ({"sim": True, "robot": "pnda"}, "did you mean panda"),
+        ({"rate": 0.0}, "from 0.001 to 1, not 0.0"),
+        ({"rate": 1e-9, "sim": True}, "from 0.001 to 1, not 1e-09"),
+        ({"rate": 0.5}, "--rate is for a simulated driver, --sim"),
+        ({"rate": 0.5, "sim": True, "synchronous": True}, "leave --rate out"),
+        ({"rate": 0.5, "sim": True, "driver": "fci"}, "leave --rate out"),
     ],
 )
 def test_connection_raises_when_options_contradict(wrong, message):

@@ -10,7 +10,7 @@ import pytest
 
 from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
-from guiderail.tools.hardware.operator import OperatorKeys, confirm, operator_keys
+from guiderail.tools.hardware.operator import STOP_SIGNALS, OperatorKeys, confirm, operator_keys
 
 
 @pytest.fixture
@@ -44,14 +44,38 @@ def test_describe_omits_enter_when_input_is_a_pipe(terminal, monkeypatch):
     assert keys.describe(has_pauses=True) == "Ctrl-C stops the arm"
 
 
-def test_ctrl_c_stops_the_arm_then_the_process():
-    before = signal.getsignal(signal.SIGINT)
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_signal_stops_the_arm_and_a_second_one_does_not_interrupt_the_stop(number, monkeypatch):
+    before = [signal.getsignal(one) for one in STOP_SIGNALS]
     with operator_keys() as keys:
-        signal.raise_signal(signal.SIGINT)
+        keys.is_moving = True
+        signal.raise_signal(number)
+        signal.raise_signal(number)
         assert keys.is_stop_requested()
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    assert signal.getsignal(signal.SIGINT) is before
+        monkeypatch.setattr("guiderail.tools.hardware.operator.HANGING_TIME", -1.0)
+        signal.raise_signal(number)
+        assert keys.must_end == (number != signal.SIGINT)
+        keys.clear_stop()
+        signal.raise_signal(number)
+        with pytest.raises(KeyboardInterrupt):  # no control step has noticed the first one
+            signal.raise_signal(number)
+    assert [signal.getsignal(one) for one in STOP_SIGNALS] == before
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_signal_ends_the_program_while_nothing_moves(number):
+    with pytest.raises(InputError, match=r"^stopped: nothing moved$"), operator_keys():
+        signal.raise_signal(number)
+
+
+def test_closed_input_is_no_terminal(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", None)
+    assert OperatorKeys().describe() == "Ctrl-C stops the arm"
+    assert not OperatorKeys().is_stop_requested()
+    with pytest.raises(InputError, match="at a terminal, or by --yes"):
+        confirm("So?")
+    with pytest.raises(InputError, match=r"at a terminal$"):
+        confirm("Resume?", has_yes=False)
 
 
 def test_garbage_collection_is_off_within_the_block():
@@ -86,5 +110,6 @@ def test_ctrl_c_at_a_question_is_no_confirmation(monkeypatch):
             confirm("So?")
         monkeypatch.setattr(sys, "stdin", io.StringIO())
         assert not keys.is_stop_requested()
+        keys.is_moving = True
         signal.raise_signal(signal.SIGINT)
         assert keys.is_stop_requested()

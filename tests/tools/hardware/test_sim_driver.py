@@ -1,6 +1,7 @@
 """With a simulated driver the parts have the same offsets as after a reset in simulation."""
 
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -46,6 +47,12 @@ def test_driver_refuses_what_the_iiwa_has_not(arguments, words, tmp_path):
         arguments = {"scenario": tmp_path / "a.yaml"}
     with pytest.raises(InputError, match=words):
         run_sim_driver(**{"url": "memq://", "seconds": 0.01, "command_timeout": 0.1} | arguments)
+
+
+@pytest.mark.skipif(find_spec("franky_sim") is not None, reason="the simulator is installed")
+def test_driver_names_what_a_simulated_franka_needs():
+    with pytest.raises(InputError, match=r"the simulated Franka needs .*: pip install"):
+        run_sim_driver("", 1.0, 1.0, driver="fci")
 
 
 def test_monitor_names_the_robots_that_it_can_watch():

@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from signal import SIGTERM, raise_signal
 
 import gymnasium
 import numpy as np
@@ -319,18 +320,28 @@ def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
 
 
 @pytest.mark.parametrize(("sim", "assume_yes"), [(False, False), (False, True), (True, False), (True, True)])
-def test_resuming_and_releasing_are_confirmed_unless_simulated(ready, monkeypatch, sim, assume_yes):
+def test_resuming_is_confirmed_and_releasing_unless_simulated(ready, monkeypatch, sim, assume_yes):
     _, _, begin = ready
     questions, offsets = [], []
-    monkeypatch.setattr("guiderail.tools.hardware.session.confirm", questions.append)
+    monkeypatch.setattr(
+        "guiderail.tools.hardware.session.confirm", lambda question, has_yes: questions.append(question)
+    )
     monkeypatch.setattr(
         "guiderail.tools.hardware.session.publish_part_offsets", lambda driver, parts: offsets.append(parts)
     )
     with begin(sim=sim, assume_yes=assume_yes) as robot:
         robot.env._confirm_resume("stopped")
         robot.env._free_workpiece("stuck")
-    assert [question.split()[0] for question in questions] == ["Resume", "Release"] * (not (sim and assume_yes))
+    assert [question.split()[0] for question in questions] == ["Resume"] + ["Release"] * (not sim)
     assert offsets == [[[1.0, 0.0], [0.0, 0.0]]] * sim
+
+
+def test_arm_does_not_resume_after_a_signal_that_ends_the_program(ready):
+    begin = ready[2]
+    with begin(sim=True, assume_yes=True) as robot:
+        raise_signal(SIGTERM)
+        with pytest.raises(InputError, match="stopped by a signal"):
+            robot.env._confirm_resume("stopped")
 
 
 def test_commands_check_fails_when_another_program_commands(monkeypatch):
@@ -520,6 +531,20 @@ def test_train_raises_when_success_is_not_observable(task, options, message, tmp
         train_on_robot(
             task, tmp_path / "run", RobotConnection(sim=True), environment={"station": "hardware"} | options, given={}
         )
+
+
+@pytest.mark.parametrize(("sim", "words"), [(True, "a simulated driver: give --sim"), (False, "a robot: leave --sim")])
+def test_run_is_resumed_with_the_kind_of_driver_that_it_began_with(sim, words, tmp_path):
+    """The address of a simulated driver differs between processes."""
+    begun, other = (
+        configure("BncConnector", OPTIONS | {"robot_url": f"udpm://239.255.76.67:{port}"}, seed=0, episodes=1)
+        for port in (20001, 20002)
+    )
+    assert begun.identity == other.identity
+    RunFolder(tmp_path).write_config(replace(begun, simulated_driver=sim))
+    connection = RobotConnection(sim=not sim)
+    with pytest.raises(InputError, match=f"was trained with {words}"):
+        train_on_robot(None, tmp_path, connection, environment={"station": "hardware"}, given={}, resume=True)
 
 
 def test_train_raises_when_demonstrations_are_requested(tmp_path):

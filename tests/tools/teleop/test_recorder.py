@@ -1,6 +1,7 @@
 """Recording of demonstrations at a page that stands in for Meshcat's."""
 
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -264,6 +265,24 @@ def test_slider_value_that_is_not_finite_is_ignored(session, wrong):
     assert np.isfinite(session.command).all()
 
 
+def test_demonstration_is_kept_in_another_folder_when_its_own_is_full(session, monkeypatch, tmp_path):
+    write = writing.write_atomically
+
+    def write_elsewhere(path, content):
+        if not path.parent.name.startswith("guiderail-"):
+            raise InputError("no room")
+        write(path, content)
+
+    session.reset()
+    lead(session, "x [mm]", 2.0, 12)
+    monkeypatch.setattr("guiderail.models.primitives.io.write_atomically", write_elsewhere)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    message = session.keep()
+    assert message.endswith(f"cannot be written, so the record is in {session.out}")
+    assert session.out.parent.parent == tmp_path
+    assert Demonstrations.load(session.out).num_demonstrations == 1
+
+
 def test_buttons_keep_discard_and_end(session):
     messages = []
     page, step = session.panel.meshcat, session.step
@@ -344,7 +363,8 @@ def test_recorder_raises_first_when_out_is_not_writable(name, tmp_path, monkeypa
         DemonstrationRecorder("GridClamp", {}, tmp_path / name, meshcat=Page())
 
 
-def test_keep_can_be_repeated_when_writing_failed(session, tmp_path):
+def test_keep_can_be_repeated_when_writing_failed(session, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.mkdtemp", Mock(side_effect=OSError))  # every other folder is full as well
     messages = []
     session.out = tmp_path / "file" / "recorded.npz"
     (tmp_path / "file").touch()
