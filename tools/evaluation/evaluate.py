@@ -122,7 +122,9 @@ def evaluate_policies(
                 kept.append(collected)
                 if progress is not None:
                     progress.update(row)
-        yield name, pd.DataFrame(rows), kept
+        table = pd.DataFrame(rows)
+        text = [column for column, kind in table.dtypes.items() if isinstance(kind, pd.StringDtype)]
+        yield name, table.astype(dict.fromkeys(text, object)), kept  # as `read_table` returns stored rows
 
 
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
@@ -213,17 +215,21 @@ def evaluate(
     Args:
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
-            a model of Stable-Baselines3.
+            a model of Stable-Baselines3. An object that does not declare `observation_space` and `action_space` is
+            tried before the first episode, with constant observations: a deep copy of it if it can be copied.
         env: Environment of a policy without a run: name of a task, an environment, or an id that is registered with
-            Gymnasium. An environment that is not of this package is reset with the seed of the episode, and its success
-            is `info["is_success"]` or `info["success"]`. If `info` has neither, the statistics of success are None.
+            Gymnasium. An environment that is not of this package is reset with the seed of the episode, which succeeds
+            if `info["is_success"]` or `info["success"]` is true at any step. If `info` has neither, the statistics of
+            success are None.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
-            None is the default set of the task. The demonstration alone is always evaluated if the guidance has one.
+            None is the default set of the task. The demonstration alone is always evaluated if the guidance of a task
+            has one; in an environment that is given as an object, it is the baseline policy "zero".
         environment: Options of the environment that differ from the run's options or the task's defaults.
-        seed: Seed of the first episode; episode i has seed + i.
-        processes: Largest number of processes; None for the number of cores. The results do not depend on it; see
-            `evaluate_policies` for policies with internal state.
+        seed: Seed of the first episode; episode i has seed + i, on which the actions of random baselines depend too.
+        processes: Largest number of processes; None for the number of cores. The results do not depend on it: a policy
+            with internal state resets it in `Callback.on_episode_start`, and one that samples random numbers seeds its
+            generator in a method `start_episode(number)`, whose number depends on the episode's seed.
         trust_policy: True to read a policy file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: True to sample the hidden values, which are constant in a run, again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
@@ -235,10 +241,11 @@ def evaluate(
         Mapping of statistics, with a table, a comparison and a sentence. Its entries: `evaluation_scope`, the
         conditions that the result is valid for; the statistics `COMPARED`, each also as `demonstration_<name>` (None
         without a demonstration) and `<baseline>_<name>`; `baselines`, the names of the evaluated baseline policies, and
-        `skipped_baselines`, those that do not fit the environment's observation or action; `best_baseline` and `p`, if
-        there is a `Comparison`; `episodes` and `seed`; `episodes_to_convergence` and `trained_episodes` of the
-        training, None without a run; `saved`, the number of saved demonstrations, if `save` is given; `differences`, if
-        `describe_differences` is given. `collisions` and `collision_steps` are None if the task declares no collision
+        `skipped_baselines`, those that do not fit the environment's observation or action; `best_baseline` and `p`, the
+        largest of the one-sided p-values against each baseline policy, if there is a `Comparison`; `episodes` and
+        `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run; `saved`, the
+        number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is given.
+        `collisions` and `collision_steps` are None if the task declares no collision
         signal.
 
     Raises:

@@ -113,7 +113,7 @@ class Comparison(NamedTuple):
 
     baseline: str  # name of the baseline policy with the most successes
     successes: int  # number of successful episodes of this baseline policy
-    p: float  # largest p-value of the tests against each baseline policy; see `compare`
+    p: float  # largest one-sided p-value of the tests against each baseline policy; see `compare`
 
 
 @dataclass(frozen=True, eq=False)  # compared as mappings
@@ -172,7 +172,7 @@ class Evaluation(Mapping[str, Any]):
             baseline, successes, p = self.comparison
             verdict = "better than" if p < SIGNIFICANT else "not shown to be better than"
             text += f", {verdict} the best baseline, {self._name(baseline)} with {successes} of {len(rows)}"
-            text += f" (p = {p:.2g})"
+            text += f" (one-sided p = {p:.2g})"
         violation = self.statistics.get("max_commanded_violation")
         if violation is not None:
             if violation <= TOLERANCE:

@@ -13,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import deepcopy
 from importlib import import_module
 from itertools import islice, product
 from pathlib import Path
@@ -112,6 +113,13 @@ class PredictPolicy(ForeignPolicy):
         self._options = {"deterministic": True} if "deterministic" in parameters else {}
         self._has_state = {"state", "episode_start"} <= parameters.keys()
         self.on_episode_start()
+
+    def copy(self) -> PredictPolicy:
+        """Return the policy of a deep copy of the model, or itself if the model cannot be copied."""
+        try:
+            return PredictPolicy(deepcopy(self.model))
+        except Exception:  # code of others can raise any exception
+            return self
 
     def on_episode_start(self) -> None:
         """Reset the internal state of a recurrent policy."""

@@ -110,19 +110,29 @@ def rollout(
 
     Args:
         env: Environment.
-        act: Policy; if it is a `Callback`, its callback methods are called too.
+        act: Policy, a function or an object with a `predict` method; if it is a `Callback`, its callback methods are
+            called too.
         callbacks: Callbacks, called in this order, after the policy.
         index: Number of the episode, for its row.
-        seed: Seed of the reset. By default the random stream continues; with `held_out` the seed is then 0.
+        seed: Seed of the reset, a whole number of at least 0. By default the random stream continues; with `held_out`
+            the seed is then 0.
         held_out: True to sample the conditions from the held-out distribution instead of that of training.
         options: Options of the reset.
 
     Raises:
-        InputError: If the reset is refused, an action is refused or does not have the shape of the environment's
-            actions, or a callback returns wrong columns (`new_columns`).
+        InputError: If `env` is no environment, `act` is no policy, the seed is invalid, the reset is refused, an action
+            is refused or does not fit the environment's actions, the reward of an environment from outside this package
+            is NaN, or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
+    from guiderail.tools.evaluation.policies import as_policy
 
+    if not isinstance(env, gymnasium.Env):
+        raise InputError(f"an episode runs in an environment, as gymnasium.make returns it, not in {brief(env)}")
+    if not callable(act):
+        act = as_policy(act)
+    if seed is not None and (seed := as_whole(seed, "a seed")) < 0:
+        raise InputError(f"a seed is a whole number of at least 0, not {seed}")
     if held_out:
         observation = reset_held_out(env, seed or 0, **(options or {}))
     else:
@@ -139,8 +149,10 @@ def rollout(
     while not is_over:
         action, privileged = act(observation), getattr(base, "privileged", None)
         if not is_own:
-            _check_shape(action, env)
+            _check_action(action, env)
         following, reward, terminated, truncated, info = env.step(action)
+        if not is_own and math.isnan(reward):
+            raise InputError("the environment returned NaN as reward: a reward is a number")
         transition = Transition(
             observation, action, float(reward), following, terminated, truncated, info,
             privileged, getattr(base, "privileged", None),
@@ -162,9 +174,10 @@ def rollout(
     return row
 
 
-def _check_shape(action: Any, env: gymnasium.Env) -> None:
-    """Raise an InputError if an action does not have the shape of an environment's actions, if these have one."""
-    expected = env.action_space.shape
+def _check_action(action: Any, env: gymnasium.Env) -> None:
+    """Raise an InputError if an action does not have the shape of an environment's actions, or is not one of them."""
+    space = env.action_space
+    expected = space.shape
     try:
         shape = np.shape(action)
     except ValueError:  # ragged
@@ -173,6 +186,16 @@ def _check_shape(action: Any, env: gymnasium.Env) -> None:
         raise InputError(
             f"the policy returned {brief(action)}, and the actions of this environment have the shape {expected}"
         )
+    if isinstance(space, gymnasium.spaces.Discrete):
+        try:
+            is_inside = bool(0 <= action - space.start < space.n)
+        except TypeError:  # no number
+            is_inside = False
+        if not is_inside:
+            last = space.start + space.n - 1
+            raise InputError(
+                f"the policy returned {brief(action)}, and the actions of this environment are {space.start} to {last}"
+            )
 
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -215,14 +238,21 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
     """Return True if the policy's actions for several observations have the shape of the environment's actions.
 
     It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
-    others have certain values.
+    others have certain values. An object with `predict` is not called if it declares both shapes; otherwise a deep
+    copy of it is called, if it can be copied.
 
     Raises:
         InputError: If `make_policy` returns no function.
     """
+    from guiderail.tools.evaluation.policies import PredictPolicy
+
     act, shape = make_policy(env), env.observation_space.shape or ()
     if not callable(act):
         raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
+    if isinstance(act, PredictPolicy):
+        if act.observation_shape is not None and act.action_shape is not None:
+            return (act.observation_shape, act.action_shape) == (env.observation_space.shape, env.action_space.shape)
+        act = act.copy()
     try:
         shapes = {np.shape(act(np.full(shape, value, np.float32))) for value in np.linspace(-1.0, 1.0, 21)}
     except (IndexError, ValueError):

@@ -112,6 +112,8 @@ def test_baselines_are_evaluated_once(bead_run, capsys):
         assert f"{name}: evaluated before, and used again" in printed
         assert f"{name} 3/3" not in printed
     assert second == first
+    for name, rows in first.rows.items():
+        pd.testing.assert_frame_equal(second.rows[name], rows, check_exact=True)
     four = evaluate(bead_run, episodes=4, baselines=policies)
     assert four["uniform_random_mean_return"] != first["uniform_random_mean_return"]
 
@@ -278,7 +280,10 @@ def test_sentence_names_the_best_baseline():
     rows = {"policy": won(*[1] * 12), "zero": won(1, *[0] * 11)}
     statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": 2e-3}
     sentence = Evaluation(statistics, rows).sentence
-    assert "better than the best baseline, zero action with 1 of 12 (p = 0.00049); the largest constraint" in sentence
+    assert (
+        "better than the best baseline, zero action with 1 of 12 (one-sided p = 0.00049); the largest constraint"
+        in sentence
+    )
     assert "was 0.002 m or rad." in sentence
 
 

@@ -1,6 +1,7 @@
 """Policies of other origin: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
 
 import math
+import threading
 import zipfile
 from pathlib import Path
 
@@ -326,6 +327,26 @@ def test_sentence_has_no_held_out_episodes_for_an_environment():
     result = evaluate(lambda point: -3.0 * point, Pointer(), 4)
     assert "succeeds in 4 of 4 episodes (95 % interval" in result.sentence
     assert "succeeds in 0 of 4 episodes" in evaluate(lambda point: 3.0 * point, Pointer(), 4).sentence
+
+
+class Counting:
+    """Policy that counts its calls."""
+
+    calls = 0
+
+    def predict(self, observation):
+        self.calls += 1
+        return 0, None
+
+
+@pytest.mark.parametrize("is_declared", [False, True])
+def test_policy_is_called_in_the_episodes_only(is_declared):
+    policy, env = Counting(), gymnasium.make("CartPole-v1")
+    if is_declared:
+        policy.observation_space, policy.action_space = env.observation_space, env.action_space
+        policy.lock = threading.Lock()  # which cannot be copied
+    result = evaluate(policy, env, 2, baselines=(), processes=1)
+    assert policy.calls == result["mean_steps"] * 2
 
 
 def test_registered_environment_is_evaluated_by_its_id():

@@ -49,6 +49,39 @@ def test_callback_cannot_replace_a_column():
         rollout(make_environment("Bead", {}), lambda observation: np.zeros(2), Score(), seed=3)
 
 
+class Predicting:
+    def predict(self, observation):
+        return 0, None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": -1}, "a seed is a whole number of at least 0, not -1"),
+        ({"seed": 1.5}, "a seed must be a whole number, not 1.5"),
+        (
+            {"env": "CartPole-v1"},
+            "an episode runs in an environment, as gymnasium.make returns it, not in 'CartPole-v1'",
+        ),
+        ({"act": 3}, "3 is no policy"),
+        ({"act": lambda observation: 7}, "returned 7, and the actions of this environment are 0 to 1"),
+        ({"act": lambda observation: "left"}, "returned 'left', and the actions"),
+    ],
+)
+def test_rollout_takes_and_refuses_what_an_evaluation_does(change, message):
+    given = {"env": gymnasium.make("CartPole-v1"), "act": Predicting(), "seed": np.int64(3)}
+    own = rollout(**given)
+    assert own == rollout(given["env"], lambda observation: 0, seed=3)
+    with pytest.raises(InputError, match=message):
+        rollout(**given | change)
+
+
+def test_reward_that_is_not_a_number_is_refused():
+    env = gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), lambda reward: float("nan"))
+    with pytest.raises(InputError, match="the environment returned NaN as reward"):
+        rollout(env, lambda observation: 0, seed=0)
+
+
 def test_seed_repeats_an_episode_and_held_out_differs():
     env = make_environment("Bead", {})
     rows = [
