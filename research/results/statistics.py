@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from scipy import stats
 
-CONFIDENCE, RESAMPLES = 0.95, 2000
+CONFIDENCE, RESAMPLES = 0.95, 20_000
 Scores = Sequence[np.ndarray]
 """Scores of the seeds of each task, (R,) each, or (…, R) for several resamples at once."""
 
