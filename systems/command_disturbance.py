@@ -35,7 +35,7 @@ class CommandDisturbance(LeafSystem):
         delay: Delay k of a command, in periods, at least 0.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
@@ -75,7 +75,7 @@ class CommandDisturbance(LeafSystem):
         context.get_mutable_numeric_parameter(self._seed).SetFromVector(declare.seed_parameter(seed))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        pose = self._pose_port.Eval(context)
+        pose = declare.start_pose(self._pose_port, context)
         discrete_state.set_value(self._count, [0.0])
         discrete_state.set_value(self._is_lost, [0.0])
         discrete_state.set_value(self._last_delivered, pose)

@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_whole
+from guiderail.models.common.arrays import as_whole, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -37,7 +37,8 @@ class HistoryBuffer(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range; at initialization, if the output that fills the history is not
+            finite.
     """
 
     def __init__(self, num_outputs: int, length: int, period: float):
@@ -58,8 +59,11 @@ class HistoryBuffer(LeafSystem):
     get_history_output_port = output_getter("history", "last P outputs, (P*O,), oldest first")
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
-        initial = self._initial_output_port if self._initial_output_port.HasValue(context) else self._output_port
-        discrete_state.set_value(self._state, np.tile(initial.Eval(context), self._shape[0]))
+        is_given = self._initial_output_port.HasValue(context)
+        initial = (self._initial_output_port if is_given else self._output_port).Eval(context)
+        if not is_finite(initial):
+            raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
+        discrete_state.set_value(self._state, np.tile(initial, self._shape[0]))
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
         remaining = context.get_discrete_state().value(self._state)[self._shape[1] :]

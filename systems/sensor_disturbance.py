@@ -119,9 +119,9 @@ class SensorDisturbance(LeafSystem):
         """Set the delay k in periods; `context` is this system's.
 
         Raises:
-            InputError: If `delay` is not from 1 to the largest delay.
+            InputError: If `delay` is not a whole number from 1 to the largest delay.
         """
-        if not 1 <= delay <= self._delay:
+        if not (is_whole(delay, 1) and delay <= self._delay):
             raise InputError(f"the delay of this sensor is from 1 to {self._delay} periods, not {delay}")
         context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
 

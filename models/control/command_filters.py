@@ -100,6 +100,8 @@ class TangentSpaceFilter(_LastCommand):
     Far from a constraint this is the desired command; at a constraint the command only moves along the constraint.
     A satisfied constraint that the step moves away from is left out, so that the command can leave it. The projection
     is only accurate near the start of a step; a step that would cross a constraint is therefore shortened to end at it.
+    Only this, and a repeated command, count as an intervention; the projection, which changes every step towards a
+    constraint, does not.
 
     Args:
         keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.

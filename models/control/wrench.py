@@ -211,7 +211,7 @@ def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
 
     Below the normal force `min_force` [N], positive, the result is zero, because the quotient is not reliable.
     """
-    if wrench[2] < min_force:
+    if not wrench[2] >= min_force:  # for NaN too
         return np.zeros(2)
     return np.array([-wrench[4], wrench[3]]) / wrench[2]
 

@@ -1,5 +1,6 @@
 """Mounting of a robot and its end effector in a plant."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -62,7 +63,9 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     base = find("frame", robot.base_frame)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
-    return MountedRobot(model, base, find("frame", robot.flange_frame), _list_actuators(plant, joints, label))
+    actuators = _list_actuators(plant, joints, label)
+    _check_joints(robot, joints, actuators, label)
+    return MountedRobot(model, base, find("frame", robot.flange_frame), actuators)
 
 
 def add_end_effector(
@@ -139,7 +142,7 @@ def _add_opened(plant: MultibodyPlant, end_effector: EndEffector) -> tuple[Frame
 
 
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
-    """Return the actuators of the joints, which must be all actuated joints of their model, in the model's order."""
+    """Return the actuators of the joints, which must be all actuated joints of their model, in its order."""
     if not joints:
         return []
     everywhere = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
@@ -149,9 +152,33 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
     for name in names:
         if name not in actuated:
             raise InputError(f"{label}: joint {name!r} has no actuator: give its model file a transmission")
+    if names != actuated and sorted(names) == sorted(actuated):
+        raise InputError(
+            f"{label}: its joints and the transmissions in its model file must both be in the order from the base on, "
+            f"not {', '.join(names)} and {', '.join(actuated)}"
+        )
     if names != actuated:
         raise InputError(f"{label}: name all joints that its model file actuates, in its order: {', '.join(actuated)}")
     return actuators
+
+
+def _check_joints(robot: Robot, joints: Sequence[Joint], actuators: Sequence[JointActuator], label: str) -> None:
+    """Raise an `InputError` unless the drives are complete and the postures are within the limits of the joints."""
+    for index, (joint, actuator) in enumerate(zip(joints, actuators, strict=True)):
+        if not 0.0 < actuator.effort_limit() < math.inf:
+            raise InputError(f"{label}: joint {joint.name()!r} needs a finite effort limit in the model file")
+        if not actuator.default_reflected_inertia() > 0.0:
+            raise InputError(
+                f"{label}: joint {joint.name()!r} needs a transmission with rotor inertia and gear ratio in the model "
+                "file, because an impedance controller is unstable without reflected inertia"
+            )
+        lower, upper = joint.position_lower_limits().item(), joint.position_upper_limits().item()
+        for what, posture in (("home", robot.home), ("level_posture", robot.level_posture)):
+            if posture is not None and not lower <= posture[index] <= upper:
+                raise InputError(
+                    f"{label}: {what} of joint {joint.name()!r} must be from {lower:g} to {upper:g}, "
+                    f"its limits in the model file, not {posture[index]:g}"
+                )
 
 
 def _add_rigid_copy(

@@ -51,12 +51,13 @@ class Robot:
         title: Name for users.
         model: URDF or SDF file, or a file of Drake model directives (.yaml) with its packages in the same folder. Each
             joint needs an actuator with effort limit, rotor inertia and gear ratio: without reflected inertia an
-            impedance controller is unstable at a step of milliseconds.
+            impedance controller is unstable at a step of milliseconds. The transmissions must be in the order of the
+            joints.
         base_frame: Frame that is welded to the world's origin, unless a joint of the model file moves or fixes it.
         flange_frame: Frame to which tools are mounted; its z axis points away from the arm.
         joints: Names of the joints (n,) from the base to the flange, each once.
-        home: Joint positions (n,) [rad] with the flange pointing down in front of the robot, far from limits and
-            singularities; inverse kinematics starts there.
+        home: Joint positions (n,) [rad], within the limits of the model file, with the flange pointing down in front of
+            the robot, far from limits and singularities; inverse kinematics starts there.
         tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
             base's x axis if the last joint is in the middle of its range, and the other joints are at home.
         apparent_rotor_inertia: Fraction of the rotors' reflected inertia that acts on the joints under torque control;

@@ -19,7 +19,7 @@ def test_center_of_pressure_is_the_point_of_a_point_force(force):
     np.testing.assert_allclose(compute([*pushed, *np.cross(point, pushed)]), point[:2])
 
 
-@pytest.mark.parametrize("force", [0.49, 0.0, -5.0])
+@pytest.mark.parametrize("force", [0.49, 0.0, -5.0, np.nan])
 def test_center_of_pressure_is_zero_when_the_force_is_small(force):
     np.testing.assert_array_equal(compute([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
 

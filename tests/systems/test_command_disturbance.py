@@ -33,6 +33,12 @@ def delivered(steps=12, seed=0, first=0.0, **options):
     return np.array(outputs)
 
 
+def test_measured_pose_must_be_finite_at_initialization(monkeypatch):
+    monkeypatch.setattr(f"{__name__}.POSE", np.nan)
+    with pytest.raises(InputError, match="measured pose must be finite"):
+        delivered()
+
+
 def test_every_command_is_delivered_without_disturbance():
     np.testing.assert_allclose(delivered(), np.arange(12.0), atol=1e-9)
 

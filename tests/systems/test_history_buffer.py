@@ -60,6 +60,15 @@ def test_history_is_filled_with_the_output_at_initialization(system):
     np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
 
 
+@pytest.mark.parametrize("inputs", [{"output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
+def test_output_that_fills_the_history_must_be_finite(system, inputs):
+    simulator = Simulator(system)
+    for name, value in inputs.items():
+        system.GetInputPort(name).FixValue(simulator.get_mutable_context(), [0.0, value])
+    with pytest.raises(InputError, match="the output that fills a history at the start must be finite"):
+        simulator.Initialize()
+
+
 def test_history_is_filled_with_initial_output_when_connected(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()

@@ -92,7 +92,7 @@ def test_delay_of_an_episode_is_at_most_the_largest():
             simulator.AdvanceTo((step + 0.5) * PERIOD)
         # The measurement of the last sample, step 5, is one period old when the delay is 1.
         assert sensor.get_disturbed_measurement_output_port().Eval(context)[0] == 6 - delay
-    for wrong in (0, 4):
+    for wrong in (0, 1.5, 4, np.nan):
         with pytest.raises(InputError, match="from 1 to 3"):
             sensor.set_delay(context, wrong)
 

@@ -1,6 +1,7 @@
 """Mounting of robots and end effectors in a plant: refusals, model files, and rigid copies for a controller."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -29,6 +30,40 @@ def test_add_robot_orders_actuators_like_the_joints():
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, arm.model, q)
     assert [plant.GetJointByName(name).GetOnePosition(context) for name in UR5E.joints] == list(q)
+
+
+TRANSMISSION = r"(?s)<transmission.*?</transmission>"
+
+
+def reverse_transmissions(text):
+    last_first = iter(reversed(re.findall(TRANSMISSION, text)))
+    return re.sub(TRANSMISSION, lambda _: next(last_first), text)
+
+
+def drop(pattern, by=""):
+    return lambda text: re.sub(pattern, by, text)
+
+
+@pytest.mark.parametrize(
+    ("change", "fields", "match"),
+    [
+        (drop(r' effort="[\d.]+"'), {}, "shoulder_pan_joint' needs a finite effort limit"),
+        (drop(r"<drake:rotor_inertia[^>]*/>"), {}, "shoulder_pan_joint' needs a transmission with rotor inertia"),
+        (drop(r'gear_ratio value="\d+"', 'gear_ratio value="0"'), {}, "rotor inertia and gear ratio"),
+        (
+            reverse_transmissions,
+            {},
+            "joints and the transmissions in its model file must both be .* and ur5e_wrist_3_joint, ur5e_wrist_2",
+        ),
+        (str, {"home": (9.0, *UR5E.home[1:])}, "home of joint 'ur5e_shoulder_pan_joint' must be from .* not 9"),
+        (str, {"level_posture": (*UR5E.home[:5], -7.0)}, "level_posture of joint 'ur5e_wrist_3_joint'"),
+    ],
+)
+def test_robot_with_incomplete_drives_or_a_posture_out_of_range_is_refused(tmp_path, change, fields, match):
+    model = tmp_path / "arm.urdf"
+    model.write_text(change(UR5E.model.read_text()))
+    with pytest.raises(InputError, match=match):
+        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, name="mine", model=model, **fields))
 
 
 def test_lighten_rotors_scales_the_rotor_inertia():
@@ -108,7 +143,7 @@ def test_add_robot_accepts_model_directives(tmp_path):
         ({"base_frame": "foot"}, "has no frame 'foot'"),
         ({"flange_frame": "hand"}, "has no frame 'hand'"),
         ({"joints": (*UR5E.joints[:5], "wrist")}, "has no joint 'wrist'"),
-        ({"joints": (*UR5E.joints[:4], UR5E.joints[5], UR5E.joints[4])}, "in its order"),
+        ({"joints": (*UR5E.joints[:4], UR5E.joints[5], UR5E.joints[4])}, "in the order from the base"),
     ],
 )
 def test_add_robot_refuses_data_that_the_model_lacks(wrong, sentence):
