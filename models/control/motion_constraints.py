@@ -323,8 +323,8 @@ def _finite(bounds: np.ndarray) -> np.ndarray:
 class MotionLimits:
     """Largest norms of velocity, acceleration and jerk of a pose."""
 
-    linear: tuple[float, float, float]  # limits of the position: [m/s], [m/s²], [m/s³]
-    angular: tuple[float, float, float]  # limits of the orientation: [rad/s], [rad/s²], [rad/s³]
+    linear: tuple[float, float, float]  # velocity, acceleration and jerk of the position: [m/s], [m/s²], [m/s³]
+    angular: tuple[float, float, float]  # the same of the orientation: [rad/s], [rad/s²], [rad/s³]
 
     def __post_init__(self) -> None:
         """Check the limits.

@@ -29,7 +29,7 @@ class WrenchBound:
         InputError: If `axes` are not six numbers, or a number is negative or NaN.
     """
 
-    axes: np.ndarray  # limits (6,) along and about the axes [N, Nm], not negative
+    axes: np.ndarray  # limits (6,) of [fx fy fz tx ty tz] along and about the axes [N, Nm], not negative
     force: float  # limit of the norm of the force [N], not negative
     torque: float  # limit of the norm of the torque [Nm], not negative
     # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m], not

@@ -172,7 +172,9 @@ class StateProgress:
     """
 
     tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
-    max_lag: int  # largest number of steps behind the clock, not negative; with 0, progress follows the clock
+    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (An option
+    # of environments has the same name and is a time in seconds.)
+    max_lag: int
 
     def __post_init__(self) -> None:
         if len(self.tolerance) != 2 or not all(0.0 < one < np.inf for one in self.tolerance):

@@ -19,7 +19,7 @@ from guiderail.models.common.registry import Registry
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Position control of joints by springs and dampers.
+    """Position control of joints by springs and dampers; the values are in the order of the joints.
 
     Raises:
         InputError: If the numbers of values differ, or a value is not a positive and finite number.

@@ -9,6 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 PAGES = sorted((DOCS / "tutorials").glob("*.md"))
+RUN = [*PAGES, DOCS / "robot.md"]
 NOTEBOOKS = sorted(
     page for page in (*DOCS.glob("*.md"), *DOCS.glob("*/*.md")) if "\nfile_format: mystnb\n" in page.read_text("utf-8")
 )
@@ -20,12 +21,12 @@ LONG_PAGES = {"compose_systems": 220}  # a complete program, from the plant to t
 def failures(forks):
     """Return the failure of each page, an empty text if there is none."""
     environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
-    finished = forks.run(Path(__file__).with_name("run_pages.py"), *PAGES, *NOTEBOOKS, **environment)
+    finished = forks.run(Path(__file__).with_name("run_pages.py"), *RUN, *NOTEBOOKS, **environment)
     assert finished.returncode == 0, finished.stderr
     return json.loads(finished.stdout.splitlines()[-1])
 
 
-@pytest.mark.parametrize("page", PAGES + NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize("page", RUN + NOTEBOOKS, ids=lambda path: path.stem)
 def test_page_runs_and_prints_what_it_shows(page, failures):
     assert not failures[page.stem], failures[page.stem]
 
