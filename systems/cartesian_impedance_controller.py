@@ -7,7 +7,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
@@ -39,7 +39,7 @@ class ImpedanceGains:
         bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
 
     Raises:
-        InputError: If an argument is out of range, or a matrix or vector of six has the wrong shape.
+        InputError: If an argument is out of range or of another type, or a matrix or vector of six has the wrong shape.
     """
 
     stiffness: np.ndarray
@@ -65,6 +65,8 @@ class ImpedanceGains:
                 "an impedance's damping ratio must be positive, its posture's gains not negative, and all of them "
                 "finite"
             )
+        if self.bound is not None and not isinstance(self.bound, WrenchBound):
+            raise InputError(f"an impedance's bound must be a WrenchBound or None, not {brief(self.bound)}")
         if not np.isfinite(self.posture).all():
             raise InputError(f"an impedance's posture must be finite joint positions, not {self.posture}")
 

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
@@ -111,6 +111,8 @@ class CartesianPositionController(LeafSystem):
             raise InputError(
                 f"a position controller's posture gain must be finite and not negative, not {posture_gain}"
             )
+        if not isinstance(speed_limits, SpeedLimits):
+            raise InputError(f"a position controller's speed_limits must be SpeedLimits, not {brief(speed_limits)}")
         if np.shape(posture) != (num_joints,):
             raise InputError(f"a position controller's posture must have {num_joints} joints")
         if not np.isfinite(posture).all():

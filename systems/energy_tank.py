@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import is_finite
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.wrench import (
     MAX_WRENCH_SIZE,
@@ -78,6 +78,8 @@ class EnergyTank(LeafSystem):
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < capacity < np.inf:
             raise InputError(f"an energy tank's capacity must be positive and finite, not {capacity} J")
+        if not isinstance(bound, WrenchBound):
+            raise InputError(f"an energy tank's bound must be a WrenchBound, not {brief(bound)}")
         if not is_finite(bound.axes):
             raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
         self._capacity, self._period = capacity, period

@@ -45,14 +45,16 @@ class FunctionGuidanceSystem(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a size or the period is out of range; at initialization, if the measured pose is not finite, or
-            the function does not return O numbers.
+        InputError: If a size or the period is out of range, or `function` is none; at initialization, if the measured
+            pose is not finite, or the function does not return O numbers.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
         super().__init__()
         if min(action_size, pose_size, wrench_size) < 1:
             raise InputError(f"guidance needs sizes of at least 1, not {action_size}, {pose_size} and {wrench_size}")
+        if not callable(function):
+            raise InputError(f"guidance needs a function of action, pose and wrench, not {brief(function)}")
         self._function = function
         self._action_port = self.DeclareVectorInputPort("action", action_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)

@@ -23,7 +23,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from guiderail.models.common.arrays import as_whole, is_finite, is_whole
+from guiderail.models.common.arrays import as_number, as_whole, is_finite, is_whole
 from guiderail.models.common.errors import InputError, brief
 
 
@@ -96,8 +96,8 @@ def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -
 
 
 def check_period(period: float) -> None:
-    """Raise an `InputError` unless the period [s] is positive and finite."""
-    if not 0.0 < period < np.inf:
+    """Raise an `InputError` unless the period [s] is a positive and finite number."""
+    if not 0.0 < as_number(period, "a system's period") < np.inf:
         raise InputError(f"a system's period must be positive and finite, not {period} s")
 
 

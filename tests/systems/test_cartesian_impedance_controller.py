@@ -430,6 +430,7 @@ def test_damping_gives_every_mode_its_damping_ratio():
         {"stiffness": np.diag([1.0, 1, 1, 1, 1, 0])},
         {"stiffness": np.diag([1.0005e8, 1, 1, 1, 1, 1])},
         {"wrench_limits": np.ones(5)},
+        {"bound": 5},
         {"wrench_limits": np.array([1.0, 1, 1, 1, 1, 0])},
     ],
 )

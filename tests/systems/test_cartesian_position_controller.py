@@ -239,6 +239,7 @@ def test_time_stamps_change_nothing_when_commands_are_current(arm):
         {"posture": np.full(7, np.nan)},
         {"posture": np.array([0.0] * 6 + [np.inf])},
         {"posture_gain": -1.0},
+        {"speed_limits": (1, 1)},
         {"posture_gain": np.nan},
         {"posture_gain": np.inf},
         {"timeout": 0.0},

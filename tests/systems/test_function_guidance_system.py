@@ -87,6 +87,8 @@ def test_no_direct_feedthrough():
 def test_constructor_refuses_arguments_out_of_range(sizes):
     with pytest.raises(InputError, match="sizes of at least 1"):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, *sizes, PERIOD)
+    with pytest.raises(InputError, match="guidance needs a function"):
+        FunctionGuidanceSystem(5, 1, 1, 1, PERIOD)
     with pytest.raises(InputError, match="period"):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 1, 1, 0.0)
 

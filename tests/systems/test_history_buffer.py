@@ -60,6 +60,12 @@ def test_history_is_filled_with_the_output_at_initialization(system):
     np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
 
 
+@pytest.mark.parametrize("period", ["0.1", None, [0.1]])
+def test_period_must_be_a_number(period):
+    with pytest.raises(InputError, match="a system's period must be a number, not"):
+        HistoryBuffer(1, 1, period)
+
+
 @pytest.mark.parametrize("inputs", [{"output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
 def test_output_that_fills_the_history_must_be_finite(system, inputs):
     simulator = Simulator(system)
