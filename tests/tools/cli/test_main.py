@@ -484,9 +484,9 @@ def test_train_passes_robot_and_imports_to_hardware(typed, robot, capsys, tmp_pa
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # undone after the test
     file = tmp_path / "desk.py"
     file.write_text(STATION)
-    typed = ["train", "BncConnector", "--station", "desk", "--import", file, "--out", "new", "--rate", "0.5", *typed]
-    assert call(capsys, *typed)[0] == 0
-    assert (asked["other"].robot, asked["other"].rate) == (robot, 0.5)
+    options = ["--station", "desk", "--import", file, "--out", "new", "--robot-url", "memq://"]
+    assert call(capsys, "train", "BncConnector", *options, *typed)[0] == 0
+    assert (asked["other"].robot, asked["other"].robot_url) == (robot, "memq://")
     assert asked["given"]["imports"] == (str(file),)
 
 
@@ -501,7 +501,7 @@ def test_evaluate_imports_the_station_before_it_is_used(capsys, tmp_path, monkey
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # undone after the test
     file = tmp_path / "other_desk.py"
     file.write_text(STATION)
-    assert call(capsys, "evaluate", trained, "--station", "desk", "--import", file, "--rate", "0.5")[0] == 0
+    assert call(capsys, "evaluate", trained, "--station", "desk", "--import", file, "--robot-url", "memq://")[0] == 0
     assert asked["station"] == "desk"
 
 

@@ -13,6 +13,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.hardware.operator import STOP_SIGNALS, OperatorKeys, confirm, operator_keys
 
 
+@pytest.fixture(autouse=True)
+def hangup_ends_the_program():
+    """Restore the default of SIGHUP, which a program started with nohup ignores."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.fixture
 def terminal(monkeypatch):
     """Yield a function that types at a terminal."""
