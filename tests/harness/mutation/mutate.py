@@ -65,6 +65,10 @@ TARGETS = {
         "tests/systems/test_command_watchdog.py",
         "tests/systems/test_torque_safety_limiter.py",
     ],
+    "systems/support/last_valid_bound.py": [
+        "tests/systems/test_energy_tank.py",
+        "tests/systems/test_cartesian_impedance_controller.py",
+    ],
 }
 SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
 # Slow imports without mutants, imported before a process is forked for each mutant.
