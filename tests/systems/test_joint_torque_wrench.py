@@ -43,6 +43,32 @@ def test_wrench_is_recovered_from_its_joint_torques(arm):
     np.testing.assert_allclose(estimate(arm, wrench), wrench, rtol=0.05, atol=0.05)
 
 
+def test_damping_has_its_documented_default_and_reduces_the_estimate(arm):
+    wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
+    plant, model = arm
+    context = plant.CreateDefaultContext()
+    plant.SetPositions(context, READY_POSTURE)
+    J = plant.CalcJacobianSpatialVelocity(
+        context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), model.target, model.target
+    )
+    damped = np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ J.T @ np.concatenate([wrench[3:], wrench[:3]]))
+    np.testing.assert_allclose(estimate(arm, wrench), [*damped[3:], *damped[:3]], rtol=1e-9)
+
+
+def test_no_time_constant_means_no_filter(arm):
+    plant, model = arm
+    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.0)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    system.get_positions_input_port().FixValue(context, READY_POSTURE)
+    torque = system.get_external_torque_input_port().FixValue(context, np.linspace(-1.0, 1.0, 7))
+    simulator.AdvanceTo(0.005)
+    first = system.get_wrench_output_port().Eval(context).copy()
+    torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
+    simulator.AdvanceTo(0.015)
+    np.testing.assert_allclose(system.get_wrench_output_port().Eval(context), 2.0 * first, atol=1e-12)
+
+
 def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
     plant, model = arm
     system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1, damping=0.0)
@@ -64,7 +90,16 @@ def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
     np.testing.assert_allclose(output.Eval(context), 2.0 * first, atol=1e-9)
 
 
-@pytest.mark.parametrize("wrong", [{"period": 0.0}, {"time_constant": -1.0}, {"damping": -1.0}, {"damping": np.inf}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"period": 0.0},
+        {"time_constant": -1.0},
+        {"time_constant": np.inf},
+        {"damping": -1.0},
+        {"damping": np.inf},
+    ],
+)
 def test_constructor_refuses_arguments_out_of_range(arm, wrong):
     with pytest.raises(InputError):
         estimate(arm, np.zeros(6), **wrong)
