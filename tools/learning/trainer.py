@@ -223,6 +223,8 @@ def _train(
     learning_log.record(rows, learner.metrics, is_finished=True)
     try:
         policy = learner.policy({"task": config.task, **described_observation(env)})
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{type(learner).__name__}.policy failed: {error}") from error
     if not isinstance(policy, Policy):
