@@ -28,6 +28,7 @@ class Part:
         extra: Discrete output, as in `Segment`.
         dwell: Control steps for which the last point is then held.
         source: Name of the part whose recording is used, if not its own.
+        until_fraction: Fraction of the recording's samples that is used, from the first one.
         is_reversed: True to run that recording backwards.
         lower: Lower limits (O,) of the commands in the frame, used if they are above the demonstrated limits.
         until: (env, observation) → true to end the segment early.
@@ -38,6 +39,7 @@ class Part:
     extra: Any
     dwell: int = 0
     source: str = ""
+    until_fraction: float = 1.0
     is_reversed: bool = False
     lower: float | np.ndarray = -np.inf
     until: Callable[[Any, Any], bool] | None = None
@@ -97,7 +99,7 @@ class OutsideTask:
             outputs = [y - origin for y, origin in zip(each.outputs, origins, strict=True)]
             local[name] = Demonstrations(each.times, outputs, each.names)
         for name, part in self.parts.items():
-            demonstrations = local[part.source or name]
+            demonstrations = _first(local[part.source or name], part.until_fraction)
             if part.is_reversed:
                 backwards = [y[::-1] for y in demonstrations.outputs]
                 demonstrations = Demonstrations(demonstrations.times, backwards, demonstrations.names)
@@ -117,8 +119,8 @@ class OutsideTask:
         if guidance == "none":
             return RepeatedAction(env, segments, self.pose)
         return GuidedEnv(
-            env, demonstrations=segments, pose=self.pose, to_action=self.to_action, guidance=guidance,
-            period=self.period, action_repeat=ACTION_REPEAT,
+            env, demonstrations=None if isinstance(guidance, Guide) else segments, guidance=guidance,
+            pose=self.pose, to_action=self.to_action, period=self.period, action_repeat=ACTION_REPEAT,
         )  # fmt: skip
 
 
@@ -161,6 +163,14 @@ class RepeatedAction(gymnasium.Wrapper):
 
     def _with_time(self, observation: np.ndarray) -> np.ndarray:
         return np.append(observation, 2.0 * self.env.steps / self.env.length - 1.0).astype(np.float32)
+
+
+def _first(demonstrations: Demonstrations, fraction: float) -> Demonstrations:
+    """Return the first samples of every demonstration."""
+    counts = [round(fraction * len(times)) for times in demonstrations.times]
+    times = [each[:count] for each, count in zip(demonstrations.times, counts, strict=True)]
+    outputs = [each[:count] for each, count in zip(demonstrations.outputs, counts, strict=True)]
+    return Demonstrations(times, outputs, demonstrations.names)
 
 
 def _origin_of(name: str) -> Callable[[Any, Any], Frame]:

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+from dataclasses import replace
 from types import SimpleNamespace
 
 import gymnasium
@@ -71,6 +72,20 @@ def test_segments_have_frames_limits_and_reversed_parts(segments):
     assert insert.constraints.violation(np.array([-0.021, 0.0])) == pytest.approx(0.001)
     assert insert.constraints.violation(np.array([-0.019, 0.0])) < 0.0
     assert retract.constraints.violation(np.array([-0.021, 0.0])) < 0.0
+
+
+def test_part_of_a_recording_is_reversed():
+    parts = {**PARTS, "retract": Part(12, "goal", 1.0, source="insert", until_fraction=0.5, is_reversed=True)}
+    _, insert, retract = replace(TASK, parts=parts).make_segments(5, 0)
+    for forwards, backwards in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
+        half = round(0.5 * len(forwards))
+        assert np.array_equal(forwards[:half][::-1], backwards)
+    assert num_steps(parts) == num_steps(PARTS)
+
+
+def test_fitted_guide_serves_the_next_seed(segments):
+    guide = TASK.make("kgrl", 0, segments).guide
+    assert TASK.make(guide, 1, segments).guide is guide
 
 
 def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
