@@ -125,7 +125,10 @@ def add_demonstration(
     displaces=True,
 )
 class KmpGuidance(PrimitiveGuidance):
-    """Guidance that commands the demonstrations' mean; the action has no effect."""
+    """Guidance that commands the demonstrations' mean; the action has no effect.
+
+    The linear constraints are enforced only together with shapes or limits of the motion.
+    """
 
     def __init__(self, prior: PriorKnowledge):
         super().__init__()

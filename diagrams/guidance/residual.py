@@ -131,7 +131,7 @@ def residual(prior: PriorKnowledge) -> Diagram:
     displaces=True,
 )
 def safe_residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning with a filter that stops the command at walls; see `SafetyFilter`."""
+    """Build residual learning with a filter that projects the command and stops it at walls; see `SafetyFilter`."""
     return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
 
 

@@ -1,4 +1,4 @@
-"""Guidance by a shared control template, from a few inputs of a user or a policy to a safe pose."""
+"""Guidance by a shared control template: a few inputs of a user or a policy move a pose within active constraints."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class ActiveConstraintFilter(Diagram):
         builder.ExportOutput(self.GetOutputPort("commanded_violation"), "constraint_violation")
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of the named objects in the root context; other objects stay."""
+        """Set the poses of the named objects in the root context; other objects keep theirs."""
         for system in (self._projector, self._machine):
             system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
 
@@ -145,7 +145,7 @@ class SctGuidance(Guidance):
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of the named objects in the root context; other objects stay."""
+        """Set the poses of the named objects in the root context; other objects keep theirs."""
         self._filter.set_frames(root_context, frames)
         mapped = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), mapped)

@@ -94,11 +94,11 @@ class Driver(ABC):
 
     @property
     def error(self) -> str:
-        """Reason for which the robot stopped by itself; empty if there is none or it is unknown."""
+        """Reason why the robot stopped by itself; empty if it did not stop or the reason is unknown."""
         return ""
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive the messages that have arrived; without a new status, wait for one at most `timeout` [s]."""
+        """Receive the messages that have arrived; if no status is new, wait at most `timeout` [s] for one."""
         end = time.monotonic() + timeout
         while True:
             status = self.read()
@@ -205,7 +205,7 @@ def describe_stop(fault: Fault, driver: Driver) -> str:
 
 
 def find_driver(robot: Robot | str) -> type[Driver]:
-    """Return the default driver class of a robot, or the driver class of a name.
+    """Return the default driver class of a robot, or the driver class with a name.
 
     Raises:
         InputError: If no driver has this name, or the name of the robot.
@@ -242,7 +242,7 @@ def check_robot(driver: Driver, robot: Robot) -> None:
 
 
 def _calc_motions(robot: Robot) -> tuple[RigidTransform, list[RigidTransform]]:
-    """Return the flange's pose at zero in the world, and its motion in the base frame for each joint at 1 rad."""
+    """Return the flange's pose in the world at zero, and its motion in the base frame for each joint alone at 1 rad."""
     plant = MultibodyPlant(0.0)
     mounted = add_robot(plant, robot)
     plant.Finalize()
@@ -259,7 +259,7 @@ def _calc_motions(robot: Robot) -> tuple[RigidTransform, list[RigidTransform]]:
 
 
 def safety_limits(plant: MultibodyPlant, driver: Driver | type[Driver]) -> SafetyLimits:
-    """Return limits of the arm below the driver's reflex limits and within those of the controller plant."""
+    """Return limits of the arm below the driver's reflex limits and within the limits of the controller plant."""
     reflex_limits = np.array(driver.torque_reflex_limits)
     return SafetyLimits(
         velocity=tuple((VELOCITY_SHARE * plant.GetVelocityUpperLimits()).tolist()),

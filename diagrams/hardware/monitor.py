@@ -20,7 +20,7 @@ from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimi
 
 
 class MonitorState(IntEnum):
-    """State of a safety monitor: no commands; commands arrive; damping the arm; commanding zero torque."""
+    """State of a safety monitor: idle without commands, watching commands, damping the arm, or sending zero torque."""
 
     IDLE = 0
     WATCHING = 1
@@ -39,11 +39,11 @@ class SafetyMonitor:
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
     lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
-    `StateEstimator` as the station, by a clock of its own, and sends a heartbeat with every check, so that a commanding
+    `StateEstimator` as the station, by a clock of its own. It sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
-    (`CommandSequence`): the arm is damped, and then has no torque until only one program sends. During a
-    stop the monitor sends torques even if no status arrives, so that the driver never repeats a torque. If the status
-    is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead.
+    (`CommandSequence`): the arm is damped, and then has zero torque until only one program sends commands. During a
+    stop the monitor sends torques even if no status arrives, so that the driver never repeats an old torque. If the
+    status is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead.
 
     Attributes:
         state: Current state.
@@ -85,7 +85,7 @@ class SafetyMonitor:
         driver.add_listener(self._on_command)
 
     def receive(self, timeout: float = 0.0) -> None:
-        """Receive what has arrived, wait at most `timeout` [s] if nothing has, and check the newest status."""
+        """Receive messages, waiting at most `timeout` [s] if there are none, and check the newest status."""
         self._driver.receive(timeout)
         self.check()
 
