@@ -40,7 +40,7 @@ STICTION_TOLERANCE = 1e-5
 
 A clamp next to its holes is pressed with 27 N and pushed sideways with 2 N, a third of the friction limit. It drifts at
 0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift decides
-whether the clamp slips in by itself or stands still.
+whether the clamp slides into the holes or stands still.
 """
 SEATED_HEIGHT = 0.5e-3  # [m] largest deviation of a seated clamp along z
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
@@ -127,7 +127,7 @@ ALONG_JAWS = 1.0 * MM  # largest grasp offset of a place along the jaws
 ACROSS_JAWS = 0.2 * MM  # largest grasp offset of a place across the jaws
 CALIBRATION = (1.8 * MM, 2.2 * MM)  # smallest and largest offset of the table
 REPEATABILITY = 0.1 * MM  # largest change of the offset from one pick-up at a place to the next
-KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with "none"
+KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with fixture_offset "none"
 
 
 class GridClampUncertainty(HiddenOffsets):
@@ -143,7 +143,7 @@ class GridClampUncertainty(HiddenOffsets):
     """
 
     def _draw_run(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        """Sample the table's offset (2,) and the places' grasp offsets (6, 2)."""
+        """Sample the table's offset (2,) [m] and the places' grasp offsets (6, 2) [m]."""
         step = 2 * ALONG_JAWS / NUM_PLACES
         along = -ALONG_JAWS + step * (np.arange(NUM_PLACES) + rng.uniform(0.0, 1.0, NUM_PLACES))
         across = rng.uniform(-ACROSS_JAWS, ACROSS_JAWS, NUM_PLACES)
@@ -170,7 +170,7 @@ MAX_TRACKING_ERROR = 8.0 * MM
 START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
 
 
-# Center and scale of the observation [position, force].
+# Center and scale of the observation [position [m], force [N]].
 CENTER = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
@@ -215,7 +215,7 @@ def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> 
 
 
 def _lane_velocity(xy: np.ndarray) -> np.ndarray:
-    """Return the velocity along the lanes at `xy`, (2,)."""
+    """Return the velocity (2,) [m/s] along the lanes at the position `xy` (2,) [m]."""
     lane = int(np.argmin(np.abs(LANES - xy[1])))
     forward = 1.0 if lane % 2 == 0 else -1.0
     if forward * xy[0] < LANE_ENDS - 0.1 * MM:
@@ -225,12 +225,12 @@ def _lane_velocity(xy: np.ndarray) -> np.ndarray:
 
 
 def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
-    """Return the inputs of `scripted_search` for a force limit of 10 N, (3,)."""
+    """Return the inputs (3,) of `scripted_search` for a force limit of 10 N."""
     return scripted_search(observation, GENTLE_SNAP_FORCE)
 
 
 def straight_descent(observation: np.ndarray) -> np.ndarray:
-    """Return the largest downward input, (3,)."""
+    """Return the inputs (3,) with the largest downward one."""
     return np.array([0.0, 0.0, -1.0])
 
 
@@ -279,14 +279,14 @@ class GridClamp(InsertionTask):
         return ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the estimate of the height; the lateral offset cannot be measured, and is checked by pulling."""
+        """Return D (6, 6) and y0 (6,), which estimate the height; a pull checks the unmeasured lateral offset."""
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = 1.0
         y0[2] = self._workcell.X_FT.translation()[2]
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
-        """Return the clamp's position in the hole's frame and the force."""
+        """Return the terms of the tool's position (3,) in the target frame, the force (3,) and a sampled limit."""
         first_three = (0, 1, 2)
         return (
             ObservationTerm("pose", CENTER[:3], SCALE[:3], first_three),
@@ -323,7 +323,7 @@ class GridClamp(InsertionTask):
         return [seated, self.force_limit()]
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a sampled pose (6,) at which the preceding skill ends and an episode starts."""
+        """Return a sampled pose (6,) [m, rad] at which the preceding skill ends and an episode starts."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
