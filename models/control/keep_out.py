@@ -72,7 +72,7 @@ class KeepOut:
         """Return half-spaces G y ≥ c that exclude the boxes with their margin, selected at a position (O,).
 
         They are the constraints and, for each box, the half-space outside the face with the most clearance. The rows of
-        G (F, O) are of unit norm; c is (F,).
+        G (F, O) have unit norm; c is (F,).
         """
         below, above = self._lower - position, position - self._upper
         clearance = np.hstack([below, above])
@@ -99,7 +99,7 @@ class KeepOut:
         """Return the nearest point on a face of the boxes that contain `desired`, and True if there is such a box."""
         point, was_in_box, margin = desired.tolist(), False, self.margin
         for lower, upper in self._boxes:
-            # For each face: depth below it, axis, position.
+            # (depth below the face, axis, coordinate just outside of the face)
             faces = [
                 face
                 for axis, x in enumerate(point)
@@ -115,7 +115,7 @@ class KeepOut:
         return np.array(point), was_in_box
 
     def _free_fraction(self, start: list[float], end: list[float]) -> float:
-        """Return the fraction of the line from `start` to `end` before it enters a box."""
+        """Return the fraction of the line from `start` (O,) to `end` (O,) that lies before a box."""
         free = 1.0
         for lower, upper in self._boxes:
             # A robot that is already closer to a box than the margin, or inside it (after a push), may leave but not

@@ -21,10 +21,10 @@ from guiderail.models.primitives.qp import solve_least_norm
 # Distances from a shape and from the plane of a linear constraint: first the distance at which the QP aims, then the
 # smaller distance that every command keeps. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
-# Largest distance of a desired command from the last one [unit of the output]; one farther away counts as one at this
-# distance, because the command is their sum with a move that is rounded at their size.
+# Largest difference between an entry of a desired command and of the last command [unit of the output]. Larger
+# differences are clipped: the command is the desired one plus a move, and a sum of two large numbers is inexact.
 _REACH = 1e4
-_ROUNDING = 5e-7  # largest share of the width of the box of speed and acceleration by which the solver may leave it
+_ROUNDING = 5e-7  # share of the width of the speed and acceleration box by which a solution may exceed the box
 _CUTS = 4  # number of linearizations of the `inside` shapes
 _BISECTIONS = 12  # number of bisections between the braking command and the nearest command
 
@@ -97,7 +97,7 @@ class MotionConstraints:
         return Violations(self.linear.violation(output, step), _largest(shapes), _largest(state))
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Return the largest of the `violations` of a command (O,); an angle counts as its arc at `LEVER`."""
+        """Return the largest of the `violations` of a command (O,), with angles as arc lengths of radius `LEVER`."""
         linear, shapes, state = self.violations(output, step)
         return _largest([linear, shapes, LEVER * state])
 
@@ -110,21 +110,21 @@ def _largest(violations: list[float]) -> float:
 class MotionConstraintFilter:
     """Filter that finds the nearest command within `MotionConstraints` from which the motion can still stop.
 
-    In one step all constraints are linear. The `outside` shapes become half-spaces, linearized at the last
-    command, so that the true constraint also holds between two commands. Speed and acceleration become boxes
+    In each step all constraints are replaced by linear ones. The `outside` shapes become half-spaces, linearized at the
+    last command, so that the true constraint also holds between two commands. Speed and acceleration become boxes
 
         |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
 
     for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if the motion can
-    brake from there, on a straight line at the largest deceleration, within the constraints. Otherwise, the last safe
-    command on the line from the braking command to the nearest one is executed. Braking was verified one step earlier,
-    so that a safe command always exists. Without a largest acceleration, braking repeats the last command.
+    brake from there, on a straight line at the largest deceleration, within the constraints. Otherwise, the farthest
+    safe command on the line from the braking command to the nearest one is executed. Braking was verified one step
+    earlier, so that a safe command always exists. Without a largest acceleration, braking repeats the last command.
 
     If the start is outside of the constraints (after a push, or because the constraints moved), the commands move back
     inside; from then on every command satisfies all constraints.
 
-    A motion that starts with a velocity (see `start`) is stopped before the constraints even if its acceleration is
-    then too large in the first step. If it is faster than the largest speed, it slows down within the largest
+    A motion that starts with a velocity (see `start`) is stopped before the constraints, even if this exceeds the
+    largest acceleration in the first step. If it is faster than the largest speed, it slows down within the largest
     acceleration.
 
     Args:
@@ -154,7 +154,7 @@ class MotionConstraintFilter:
         """Return the state (2 O,) at a pose (O,): the last command and its displacement (O,) in one step, 0 by default.
 
         If a motion cannot brake within the largest acceleration before it leaves the constraints, its displacement is
-        multiplied by a share below 1 with which it can: the acceleration limit gives way, once.
+        multiplied by a share below 1 with which it can. Only this first change exceeds the largest acceleration.
         """
         if displacement is None:
             return np.concatenate([pose, np.zeros(self.num_outputs)])
@@ -167,7 +167,7 @@ class MotionConstraintFilter:
         return np.concatenate([pose, share * displacement])
 
     def apply(self, state: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the next state (2 O,), which begins with the command, and True if only braking was left.
+        """Return the next state (2 O,), which begins with the command, and True if only braking was safe.
 
         The motion brakes if the desired command (O,) is not finite.
         """
@@ -187,7 +187,7 @@ class MotionConstraintFilter:
         upper = np.maximum(np.minimum(last + self._max_step, last + velocity + self._max_change), brake)
         goals = [c + aim]
         if (is_outside := slack < keep).any():
-            # A violated constraint is approached almost as fast as possible, or at least not violated more.
+            # First goal: move towards a violated constraint almost as fast as possible; second: do not violate it more.
             best = np.where(G > 0.0, G, 0.0) @ _finite(upper) + np.where(G < 0.0, G, 0.0) @ _finite(lower)
             towards = 0.9 * np.minimum(best, c + aim) + 0.1 * (c + slack)
             goals = [np.where(is_outside, towards, c + aim), required]
@@ -250,8 +250,8 @@ class MotionConstraintFilter:
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
         """Return the braking displacements, of the next step and until rest, as shares of the last displacement (O,).
 
-        The share of each step is smaller by φ than that of the step before: 1 − φ, 1 − 2 φ, …. φ is the largest number
-        that the acceleration limits of all outputs allow.
+        The shares of the steps are 1 − φ, 1 − 2 φ, …; φ is the largest number that the acceleration limits of all
+        outputs allow.
         """
         share = math.inf
         if self._has_acceleration:
