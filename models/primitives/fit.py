@@ -22,7 +22,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory, informati
 
 MIN_SHARE = 0.95
 """Share of the steps that must be within one standard deviation for a motion to follow the demonstrations."""
-# Length scales to try, relative to the motion's duration: from one bend to a few steps.
+# Length scales to try, relative to the motion's duration, for motions from a single bend to details of a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 # Values of ħ = λ + β to try, for outputs of unit size.
 _REGULARIZATIONS = (1.0, 0.1, 0.01)
@@ -34,12 +34,12 @@ _EVALUATED = 40  # number of steps at which candidates are compared
 class Candidate:
     """Kernel and regularization with their cross-validation error."""
 
-    length_scale: float  # ℓ of the kernel [input]
+    length_scale: float  # ℓ of the kernel [unit of the input]
     lambda_: float  # λ = β
     # RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in standard
     # deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread.
     error: float
-    worse: float  # difference from the best candidate's error, in standard errors over the demonstrations
+    worse: float  # mean excess over the best candidate's squared error, in standard errors over the demonstrations
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
 
 
@@ -54,13 +54,13 @@ class Selection:
     reference: ReferenceTrajectory  # reference of all demonstrations
     components: int  # number of components C of its mixture
     kernel: Kernel
-    length_scale: float  # ℓ of the kernel [input]
+    length_scale: float  # ℓ of the kernel [unit of the input]
     lambda_: float  # λ = β
     beta: float
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
     criteria: dict[int, float]  # Bayesian information criterion by number of components
     candidates: tuple[Candidate, ...]  # all candidates
-    why: str  # reason for the selection in a few sentences
+    why: str  # reason for the selection, in sentences
 
     @property
     def is_within_spread(self) -> bool:
@@ -92,7 +92,7 @@ def fit(
 ) -> Selection:
     """Select components, kernel and regularization by leave-one-out cross-validation.
 
-    The number of components has the least Bayesian information criterion. Kernel and regularization are taken
+    The selected number of components has the least Bayesian information criterion. Kernel and regularization are taken
     from a grid relative to the motion's duration and size. Candidates qualify if their error is within a standard error
     of the best one and their motion without actions stays within the demonstrations' spread. Of these, the strongest
     regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow. If no motion stays
@@ -102,10 +102,10 @@ def fit(
         demonstrations: At least three demonstrations.
         components: Number of components C; selected by default.
         kernel: Name of the kernel.
-        length_scale: ℓ of the kernel [input]; selected by default.
+        length_scale: ℓ of the kernel [unit of the input]; selected by default.
         kernel_parameters: Further parameters of the kernel, as in `make_kernel`.
         lambda_: λ = β; selected by default.
-        horizon: H of the intended primitive.
+        horizon: Horizon H of the intended primitive [steps].
         num_steps: As in `ReferenceTrajectory.from_demonstrations`.
         floor: As in `ReferenceTrajectory.from_demonstrations`.
         seed: As in `ReferenceTrajectory.from_demonstrations`.

@@ -158,7 +158,7 @@ def register_robot(robot: Robot) -> Robot:
         robot: Robot with a name that is not registered yet.
 
     Raises:
-        InputError: If it is no robot, or the name is taken.
+        InputError: If `robot` is not a `Robot`, or its name is taken.
     """
     if not isinstance(robot, Robot):
         raise InputError(f"a robot is registered as a Robot object, not {brief(robot)}")
@@ -178,7 +178,7 @@ def register_end_effector(end_effector: EndEffector) -> EndEffector:
     """Add an end effector, whose name is not registered yet, to the registry and return it.
 
     Raises:
-        InputError: If it is no end effector, or the name is taken.
+        InputError: If `end_effector` is not an `EndEffector`, or its name is taken.
     """
     if not isinstance(end_effector, EndEffector):
         raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")

@@ -65,7 +65,7 @@ class BncDimensions:
 
     @property
     def bore_clearance(self) -> float:
-        """Clearance between barrel and bore on each side."""
+        """Clearance between barrel and bore on each side [m]."""
         return round(self.bore_radius - self.barrel_radius, 9)
 
     def with_bore_clearance(self, clearance: float) -> "BncDimensions":
@@ -74,22 +74,22 @@ class BncDimensions:
 
     @property
     def lug_height(self) -> float:
-        """Height of the lugs' centers in J."""
+        """Height of the lugs' centers in J [m]."""
         return self.barrel_height - self.lug_depth
 
     @property
     def locked_height(self) -> float:
-        """Height of P in J with the lugs in the detents."""
+        """Height of P in J with the lugs in the detents [m]."""
         return self.lug_height - self.detent_height
 
     @property
     def slot_radius(self) -> float:
-        """Radius at which the slot's outline is unrolled, slightly outside the barrel."""
+        """Radius at which the slot's outline is unrolled, slightly outside the barrel [m]."""
         return self.barrel_radius + 0.3 * MM
 
     @property
     def slot_half_width(self) -> float:
-        """Radius of the mill that cuts the slot."""
+        """Radius of the mill that cuts the slot [m]."""
         return self.lug_radius + self.slot_clearance
 
 
@@ -147,7 +147,7 @@ def _both_halves(quads: np.ndarray) -> np.ndarray:
 
 
 def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) -> np.ndarray:
-    """Return the walls along the slot's outline, from the mouth around the detent and back to the mouth."""
+    """Return the walls along the slot's outline, from the mouth around the detent and back, as quads (Q, 4, 3) [m]."""
     d, columns = dimensions, slot_columns(dimensions)
     entry_left, entry_right = columns.angles[0], columns.angles[columns.num_entry]
     ramp = slice(columns.num_entry, None)
@@ -168,7 +168,7 @@ def _slot_walls(dimensions: BncDimensions, outer_radius: float, chamfer: float) 
 def _faces_between_entries(
     dimensions: BncDimensions, radii: tuple[float, float], margin: float, height: float, num_sides: int
 ) -> np.ndarray:
-    """Return the half of the mouth's flat face that lies between the entries of the two slots."""
+    """Return the half of the mouth's flat face between the entries of the two slots, as quads (Q, 4, 3) [m]."""
     columns = slot_columns(dimensions)
     angles = np.linspace(columns.angles[columns.num_entry] + margin, np.pi + columns.angles[0] - margin, num_sides + 1)
     return strip(cylindrical(radii[1], angles, height), cylindrical(radii[0], angles, height))

@@ -36,13 +36,13 @@ BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 
 FRICTION = 0.2  # friction coefficient of metal on metal
 # Distance at which contact with the jack begins [m]. Without a margin the plug moves into the jack for a whole step of
 # 10 ms, and the next step ejects it. With a margin, fast sliding is decelerated by more than friction, depending on the
-# step (`python -m research.benchmarks engines`).
+# time step (`python -m research.benchmarks engines`).
 MARGIN = 0.1 * MM
-# Stiffness of brass. A softer barrel distributes the load of a rim, which results in a torque on a misaligned plug that
-# metal parts do not have (docs/experiments.md, "Center of pressure on the rim").
+# Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
+# than with metal parts (docs/experiments.md, "Center of pressure on the rim").
 BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
 LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
-PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # the gasket: a spring with little friction
+PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # models the gasket as a soft spring
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
 

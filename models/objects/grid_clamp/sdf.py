@@ -94,7 +94,7 @@ def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[s
 
 
 def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
-    """Return the folder with the files of clamp and table: that of this module, or a temporary one."""
+    """Return the folder with the files of clamp and table: this one for default arguments, else a temporary one."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
     return generate_assets(files, dimensions, friction)
@@ -172,7 +172,8 @@ def lip_hulls(dimensions: GridClampDimensions) -> list[np.ndarray]:
 def bead_hulls(dimensions: GridClampDimensions) -> list[tuple[np.ndarray, tuple[float, float, float]]]:
     """Return the vertices (V, 3) [m] of each side of the bead and its outward direction (3,).
 
-    Heights are relative to the crest. The sides have the polygonal surface of `bead_mesh`.
+    Heights are relative to the crest. The sides have the polygonal surface of `bead_mesh`, with gaps at its corners and
+    a crown on its crest.
     """
     d = dimensions
     radius, height = np.array(
