@@ -1,9 +1,9 @@
 """Off-policy learners: any algorithm with the interface of Stable-Baselines3.
 
-Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploring and the schedule of
-trainings are here, so that all state that a run depends on can be written to a checkpoint. To add an algorithm, derive
-a class from `OffPolicyLearner`, set its attribute `algorithm` and register it by `register_learner`. The learner then
-uses the algorithm's own training step. SAC and TQC have an equivalent faster one (`guiderail.tools.learning.fast_sb3`).
+Stable-Baselines3 supplies the networks, the replay buffer and the training step. Acting, exploration and the training
+schedule are here, so that a checkpoint can contain all state that a run depends on. To add an algorithm, derive a class
+from `OffPolicyLearner`, set its attribute `algorithm` and register it by `register_learner`. The learner then uses the
+algorithm's own training step. SAC and TQC have an equivalent faster one (`guiderail.tools.learning.fast_sb3`).
 """
 
 import copy
@@ -58,7 +58,7 @@ class OffPolicyLearner(Learner):
         algorithm: Class of the algorithm; a subclass sets it.
         fast_algorithm: The same algorithm with a faster training step, or None; used if `training_step` is "fast", on
             the CPU, without dropout and without convolutions.
-        config: The settings.
+        config: Settings of the learner.
         model: Instance of the algorithm.
         averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
         transitions: Number of transitions so far.
@@ -153,7 +153,7 @@ class OffPolicyLearner(Learner):
         self.selection = CheckpointSelection(config.selection_window) if config.selection_window else None
         self.episodes = 0
         self.is_greedy = False
-        self._has_transition = False  # this episode has a transition in the replay buffer
+        self._has_transition = False  # True if the replay buffer has a transition of this episode
         self.greedy_successes = 0
         self._constant_action: np.ndarray | None = None  # the action of a constant episode
         self._extended_action: np.ndarray | None = None
@@ -193,7 +193,7 @@ class OffPolicyLearner(Learner):
         return self.transitions >= self.config.learning_starts
 
     def on_episode_start(self) -> None:
-        """Start an episode and choose how it explores."""
+        """Start an episode and select its exploration."""
         self.episodes += 1
         self._has_transition = False
         fraction = self.config.greedy_episode_fraction
@@ -243,7 +243,7 @@ class OffPolicyLearner(Learner):
             self.selection.exclude()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action (A,): the mean in a greedy episode, otherwise one explored as the settings prescribe."""
+        """Return the action (A,) for an observation: greedy in a greedy episode, otherwise explored as configured."""
         if self._constant_action is not None:
             return self._constant_action
         if self._follows_base_motion():
@@ -262,7 +262,7 @@ class OffPolicyLearner(Learner):
             return self.actor()._predict(tensor, deterministic=True)[0].cpu().numpy()
 
     def _follows_base_motion(self) -> bool:
-        """Return True if this action is zero, so that the base motion has no residual (Policy Decorator).
+        """Return True if the next action is zero, so that the base motion has no residual (Policy Decorator).
 
         In the progressive exploration of Yuan et al. (2025), the probability that the policy acts grows linearly.
         """
@@ -276,8 +276,8 @@ class OffPolicyLearner(Learner):
     def _temporally_extended(self) -> np.ndarray | None:
         """Return a uniformly sampled action that is repeated for several transitions; None if no repetition is active.
 
-        This is the εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves
-        states in which a policy has settled, such as free space, and shows the value of continuing in one direction.
+        This is the εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leads
+        out of regions in which a policy stays, such as free space, and yields data about long motion in one direction.
         """
         if self._extended_steps == 0:
             is_over = 0 < self.config.ez_greedy_until <= self.greedy_successes
@@ -401,7 +401,7 @@ class OffPolicyLearner(Learner):
         } | ({"demonstrated": buffer.num_demonstrated} if self.config.demonstration_fraction else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; raise KeyError, ValueError or RuntimeError if it does not fit."""
+        """Restore the result of `state`; raise KeyError, ValueError or RuntimeError if it does not fit this learner."""
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         restore_modules(tensors, self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
@@ -423,7 +423,7 @@ class OffPolicyLearner(Learner):
         self._check_restored(arrays, values)
 
     def _check_restored(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Raise a ValueError if `state` differs from what was restored, for example from another learner."""
+        """Raise a ValueError if `state` differs from the restored state, for example because of another learner."""
         own_arrays, own_values = self.state()
         different = {
             key for key in {*own_arrays, *arrays} if _array_key(own_arrays.get(key)) != _array_key(arrays.get(key))

@@ -23,7 +23,7 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
 
     Attributes:
-        fraction: Fraction of a batch that is demonstrated, once there are other transitions.
+        fraction: Fraction of a batch that is demonstrated, as soon as the buffer holds other transitions.
         num_demonstrated: Number of rows of demonstrations.
     """
 
@@ -131,7 +131,7 @@ def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-    """Set the global random generators to what `random_state` returned."""
+    """Set the global random generators to the states that `random_state` returned."""
     torch.set_rng_state(torch.from_numpy(np.array(arrays["random/torch"])))
     if "random/cuda" in arrays:
         torch.cuda.set_rng_state(torch.from_numpy(np.array(arrays["random/cuda"])))
@@ -166,9 +166,10 @@ class Sb3Callbacks(Callback):
         callback_list = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
         for one in callback_list:
             if not isinstance(one, BaseCallback):
-                raise InputError(f"{brief(one)} is no callback: give those of Stable-Baselines3 (BaseCallback)")
+                raise InputError(f"{brief(one)} is no callback of Stable-Baselines3: derive one from BaseCallback")
         self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
-        self._learner, self._first = learner, getattr(learner, "transitions", 0)  # without those of `init_from`
+        # Transitions of `init_from` are not counted.
+        self._learner, self._first = learner, getattr(learner, "transitions", 0)
         self.is_stopped = False
 
     def on_episode_start(self) -> None:
