@@ -151,7 +151,7 @@ def _station(name: str) -> dict[str, Any]:
 
 
 def _format_value(value: Any) -> str:
-    """Return a value as `--env` takes it, without the rounding error of the last digit."""
+    """Return a value in the notation of `--env`; a float is rounded to six digits."""
     if isinstance(value, tuple | list):
         return f"[{','.join(map(_format_value, value))}]"
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -29,7 +29,7 @@ class Frame:
     """Frame F of a segment in the world W.
 
     Args:
-        p: Origin p_WF [unit of the outputs]: (3,) with a rotation, otherwise (n,) with n ≤ O, for the first n outputs.
+        p: Origin p_WF [unit of the outputs]: (3,) with a rotation, otherwise (n,) for the first n of O outputs.
         R: Rotation matrix R_WF (3, 3); the identity by default.
 
     Raises:
@@ -118,15 +118,15 @@ class Segment:
         demonstrations: Demonstrations in the segment's frame, at least three, or their file.
         frame: (env, observation) → `Frame` or its origin, called when the segment begins; the world by default.
         constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
-        extra: Value for `to_action` that no action changes, such as a gripper command, or (phase, is_held) → value:
-            the phase of the segment from 0 to 1, and true while its last point is held. By default, the value of
-            `discrete`.
+        extra: Value for `to_action` that the policy does not change, such as a gripper command, or a function (phase,
+            is_held) → value: the phase of the segment from 0 to 1, and true while its last point is held. By default,
+            the value of `discrete`.
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
         until: (env, observation) → true to end the segment early, called before each step but its first; by default
-            it ends with its steps.
-        num_steps: Control steps, at least 12; by default one more than the mean duration of the demonstrations has
-            periods. A shorter segment of at least four periods is slowed down to 12 steps.
+            it ends after `num_steps` and `dwell`.
+        num_steps: Control steps, at least 12; by default the mean duration of the demonstrations in periods, plus one.
+            Demonstrations of four to ten periods are slowed down to 12 steps.
         dwell: Control steps for which the last point is held after `num_steps`.
         floor: Standard deviation (O,) or scalar whose square is added to every variance [unit of the output].
         name: Name of the segment, in `info`.
@@ -164,7 +164,7 @@ class Segment:
 
     @cached_property
     def recorded(self) -> Demonstrations:
-        """Demonstrations, read from their file if it is one."""
+        """Demonstrations, read from the file if the segment was given one."""
         given = self.demonstrations
         return given if isinstance(given, Demonstrations) else Demonstrations.load(given)
 
@@ -226,7 +226,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
         cuts: Increasing sample indices of the events, M lists of equal length K, as `find_events` returns them.
 
     Returns:
-        K + 1 demonstrations of M parts each; the clock of each part begins at 0.
+        K + 1 `Demonstrations` of M parts each; the times of each part begin at 0.
 
     Raises:
         InputError: If there is not one list for each demonstration, the lists differ in length, or a part has fewer
@@ -252,7 +252,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
 
 
 def find_events(signals: Sequence[np.ndarray], conditions: Sequence[Callable[[np.ndarray], bool]]) -> list[list[int]]:
-    """Return the sample indices of events, a list for each of M recordings.
+    """Return the sample indices of events, one list for each of M recordings.
 
     An event is the first sample after the previous event at which its condition holds.
 

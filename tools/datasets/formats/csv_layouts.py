@@ -40,7 +40,7 @@ _ALSO = {
     "ns": ("nsec",),
 }  # other spellings of units
 _SAME_UNIT = {other: unit for unit, others in _ALSO.items() for other in others}
-_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods [s]; a time step outside is in another unit
+_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods [s]; a time step outside it must have another unit
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
 _NO_POSE = re.compile(
     r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
@@ -130,7 +130,7 @@ def read_csv_files(
 def _read_written(
     file: Path, given: Sequence[str], target: Sequence[float] | None, like: np.ndarray | None
 ) -> Recorded:
-    """Read a file that `Demonstrations.save` has written; `given` has the names of options that it does not need."""
+    """Read a file that `Demonstrations.save` has written; `given` has the names of given options, which are refused."""
     if given:
         raise InputError(f"{file} holds demonstrations, whose conventions are known: leave --{given[0]} out")
     demonstrations = Demonstrations.load(file)
@@ -267,7 +267,7 @@ def _columns(file: Path, columns: Sequence[_Column], wanted: Sequence[str]) -> l
 
 
 def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the only column, or None without one; raise an InputError if there are several."""
+    """Return the only column in `found`, or None if it is empty; raise an InputError if there are several."""
     if len(found) > 1:
         names = _listed([one.name for one in found])
         raise InputError(f"{file} has {names}, and does not state which of them is {wanted}: keep only that one")
@@ -277,7 +277,7 @@ def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
 def _time(
     file: Path, columns: Sequence[_Column], given: str | None, assumptions: list[str]
 ) -> tuple[_Column, np.ndarray]:
-    """Return the column of time, and the time since its first sample (N,) [s]."""
+    """Return the time column, and the time since its first sample (N,) [s]."""
     matches = [one for one in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", one.plain))]
     clock = _only(file, matches, "time")
     if clock is None:
