@@ -1,6 +1,6 @@
 """Fuzzing of the connector: random, repeated and saturated actions in x and y, and in all six outputs.
 
-Residual learning is not constrained: its episodes test only the simulation.
+Residual learning and the demonstrations alone are not constrained: their episodes test only the simulation.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) -> tuple[float, float]:
-    """Compute the penetration depths of the rigid geometry: of the deeper lug, and of the barrel's end [m].
+    """Compute the penetration depths [m] of the rigid geometry: of the deeper lug, and of the barrel's end.
 
-    The slot is unrolled. The gasket's pad is soft and not counted. Only the end of the barrel is checked, which assumes
+    The slot is unrolled. The gasket's pad is soft and is ignored. Only the end of the barrel is checked, which assumes
     a roughly upright plug.
 
     Args:
@@ -40,7 +40,7 @@ def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) 
 
 
 def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:
-    """Return the penetration depth of a lug [m]; 0 before the mouth's face and in the two slots."""
+    """Return the penetration depth [m] of a lug with center `p_P` (3,) [m]; 0 before the mouth's face and in a slot."""
     beyond_face = p_P[2] + d.lug_radius
     if beyond_face <= 0.0:
         return 0.0
@@ -53,7 +53,7 @@ def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:
 
 
 def _barrel_inside(d: BncDimensions, p_P: np.ndarray) -> float:
-    """Return the penetration depth of the barrel's end [m]; 0 before the face, in bore and chamfer, and outside."""
+    """Return the penetration depth [m] of the barrel's end at `p_P` (3,) [m]; 0 outside of the ring's material."""
     off_axis = float(np.hypot(p_P[0], p_P[1]))
     in_bore = d.bore_radius - d.barrel_radius + max(0.0, d.mouth_chamfer - p_P[2])
     outside_plug = d.ring_radius + d.barrel_radius
@@ -61,7 +61,7 @@ def _barrel_inside(d: BncDimensions, p_P: np.ndarray) -> float:
 
 
 def slot_path(dimensions: BncDimensions) -> np.ndarray:
-    """Return the corners of the lug's unrolled path, (k, 2): arc and depth from the mouth [m], beginning outside."""
+    """Return the corners (k, 2) of the lug's unrolled path, from outside: arc length and depth from the mouth [m]."""
     d = dimensions
     corners = [
         [0.0, -d.ring_length],
@@ -75,7 +75,7 @@ def slot_path(dimensions: BncDimensions) -> np.ndarray:
 
 
 def _distance(corners: np.ndarray, point: np.ndarray) -> float:
-    """Return the distance of a point (2,) to the nearest segment between corners (k, 2)."""
+    """Return the distance [m] of a point (2,) [m] to the nearest segment between corners (k, 2) [m]."""
     starts, sides = corners[:-1], np.diff(corners, axis=0)
     along = np.clip(((point - starts) * sides).sum(1) / (sides**2).sum(1), 0.0, 1.0)
     return float(np.linalg.norm(starts + along[:, None] * sides - point, axis=1).min())
@@ -97,7 +97,7 @@ class Penetration(EnvCallback):
     """Callback that records the penetration depths of jack and plug [m] at the end of each action."""
 
     def on_episode_start(self) -> None:
-        """Start with no depths."""
+        """Clear the recorded depths."""
         self._context = self.base.simulator.get_context()
         self._plant = self.base.task.diagram.GetSubsystemByName("station").plant
         self._depths: list[tuple[float, float]] = []
@@ -120,7 +120,7 @@ class Penetration(EnvCallback):
 
 
 def campaign() -> Campaign:
-    """Return the campaign: every guidance, fixture offset and action dims, with a new offset in every episode."""
+    """Return the campaign of all cases: guidance, fixture offset and action dims. Each episode begins a new run."""
     kinds = itertools.product(("kgrl", "skgrl", "residual", "safe_residual"), ("per_run", "per_episode"), ACTION_DIMS)
     cases = [
         Case(

@@ -19,7 +19,7 @@ CONSTRAINED = ("kgrl", "skgrl", "sct")
 
 
 def grid_clamp() -> Campaign:
-    """Return the campaign: every guidance must keep all commands in the template's cuboid, below the force limit.
+    """Return the campaign: with any guidance, commands stay in the template's cuboid and forces below the limit.
 
     While the clamp is blocked, the last command is repeated. This counts as a fallback, which is allowed.
     """
@@ -101,18 +101,20 @@ def fuzz(
         task: Name of a task, or "all". A task that is not in `CAMPAIGNS` gets the campaign of `campaign_of`. With
             "all", every task of `CAMPAIGNS` gets the same number of control steps.
         episodes: Number of episodes of one task, 1000 by default.
-        steps: Number of control steps, instead of `episodes`.
+        steps: Number of control steps, instead of `episodes`; with "all", of all tasks together.
         seed: Seed of the first episode of each task.
         out: Table of one task; with "all", a folder with a table of each task and a folder with every control step.
-            Episodes in it are not run again.
+            Episodes in a table are not run again.
         environment: Options of every case, which override its own.
         report: Called with a line of text after every round.
 
     Returns:
-        The entries `cases`, `all` and `failures`; with "all", the entries `tasks`, `control_steps` and `failures`.
+        The entries `cases`, `all` and `failures`; with "all", the entries `tasks`, `control_steps`,
+        `max_commanded_violation`, `disagreement` and `failures`.
 
     Raises:
-        InputError: For an unknown task, a number out of range, or both `episodes` and `steps`.
+        InputError: For an unknown task, a number out of range, both `episodes` and `steps`, or an argument that "all"
+            does not support.
     """
     if (episodes is not None and episodes < 1) or (steps is not None and steps < 1) or seed < 0:
         raise InputError("a campaign has at least one episode or control step, and a seed from 0")
