@@ -30,7 +30,7 @@ class Parser(argparse.ArgumentParser):
 
     def add_out(self, default: str | None) -> None:
         """Add the option `--out`, a folder, required if there is no default."""
-        words = "folder of the results; what is finished in it is reused"
+        words = "folder of the results; finished results in it are reused"
         if default is None:
             self.add_argument("--out", type=Path, required=True, help=words)
         else:
@@ -74,7 +74,7 @@ def find_task(task: str, imports: Iterable[str]) -> tuple[str, tuple[str, ...]]:
 
 
 def print_result(result: Mapping[str, Any], *, as_json: bool = False) -> None:
-    """Print a result, one line a key, or as one JSON object in which infinity and NaN are null."""
+    """Print a result, one line per key, or as one JSON object in which infinity and NaN are null."""
     if as_json:
         print(to_json(result))
         return
@@ -89,7 +89,7 @@ def run_program(main: Callable[[list[str]], int | None], arguments: list[str] | 
     """Run a program and exit: 0 for success, 1 if a check or a run failed, 2 for wrong input, 130 if interrupted.
 
     Args:
-        main: Program, from its arguments to its exit code or None.
+        main: Function from the arguments to the exit code, or to None for success.
         arguments: Arguments; those of the process by default.
     """
     try:

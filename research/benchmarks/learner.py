@@ -5,9 +5,10 @@ entries and an action 2, as in the connector task.
 
 TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64) takes this share of
 Stable-Baselines3's time: 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused optimizer; 0.20
-to 0.25 with hand-written gradients. These changes multiply the time with hand-written gradients: 1.02 to 1.08 for
-quantiles sorted by PyTorch instead of NumPy; 0.96 to 1.05 for preallocated memory of the quantile errors; 1.05 to 1.08
-for sums of the quantile errors as a matrix product; 40 for two threads on busy cores, because waiting threads spin.
+to 0.25 with hand-written gradients. A further change multiplies the time with hand-written gradients by 1.02 to 1.08 if
+PyTorch instead of NumPy sorts the quantiles, by 0.96 to 1.05 if the memory of the quantile errors is preallocated, by
+1.05 to 1.08 if a matrix product sums the quantile errors, and by 40 with two threads on busy cores, because waiting
+threads spin.
 
 With large batches and layers the matrix products dominate: SAC with 256 by 256 units and batches of 256
 (`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.
@@ -47,12 +48,12 @@ class PlainTqc(OffPolicyLearner):
 PRESETS = ("tqc_contact", "sac_gridclamp", "tqc_fast", "table_4_1_simulation")
 REQUIRED_RATIO = 2.5  # smallest accepted `times_faster` of the result `REQUIRED_OF`
 REQUIRED_OF = "tqc tqc_contact"
-TURNS = 8
-_TRANSITIONS = 2000
+TURNS = 8  # timed turns of each learner, after one that is not timed
+_TRANSITIONS = 2000  # transitions in the replay buffer
 
 
 class _Spaces(gymnasium.Env):
-    """Environment of which only the spaces are used, those of the connector."""
+    """Environment with the spaces of the connector; only these are used."""
 
     observation_space = spaces.Box(-10.0, 10.0, (13,), np.float32)
     action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -65,7 +66,7 @@ LEARNERS: dict[str, tuple[type[OffPolicyLearner], type[OffPolicyLearner]]] = {
 
 
 def measure(turns: int = TURNS) -> dict[str, Any]:
-    """Measure gradient steps [ms] by algorithm and preset, and the ratio to Stable-Baselines3."""
+    """Measure the CPU time of a gradient step [ms] by algorithm and preset, and its ratio to Stable-Baselines3."""
     torch.set_num_threads(1)
     results: dict[str, Any] = {}
     for algorithm, preset in with_progress(
@@ -109,6 +110,6 @@ def show(results: dict[str, Any]) -> None:
         if isinstance(row, dict):
             needed = f" (at least {REQUIRED_RATIO})" if name == REQUIRED_OF else ""
             print(
-                f"{name:26s}  {row['step_ms']:6.2f} ms a gradient step, Stable-Baselines3 "
+                f"{name:26s}  {row['step_ms']:6.2f} ms per gradient step, Stable-Baselines3 "
                 f"{row['stable_baselines3_ms']:6.2f} ms: {row['times_faster']:.1f} times faster{needed}"
             )
