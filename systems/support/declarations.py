@@ -214,7 +214,7 @@ def update(
     system.DeclarePeriodicDiscreteUpdateEvent(period, 0.0, calc)
 
 
-_TIME_TOLERANCE = 1e-9  # tolerance of the start time [s], far above rounding errors after days, far below any period
+_TIME_TOLERANCE = 1e-9  # tolerance of the start time [s]: above rounding errors after days, below any period
 
 
 def start_time(system: LeafSystem) -> DiscreteStateIndex:
@@ -252,7 +252,7 @@ def update_after_start(
     """Declare an `update` that is omitted at the time of initialization, when no step has ended.
 
     Returns:
-        State with the `start_time`. It is declared here, so that the values of the other states need their indices.
+        State with the `start_time`, a further group of the discrete state: read the other groups by their indices.
 
     Raises:
         InputError: If the period is not positive and finite.
@@ -287,7 +287,7 @@ def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateI
 
 
 def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sources: Iterable[Source]) -> CacheEntry:
-    """Declare a cache entry with the description `name` and a value that `calc` computes from `sources`."""
+    """Declare a cache entry with the description `name` and the value that `calc` computes from `sources`."""
     return system.DeclareCacheEntry(
         description=name,
         value_producer=ValueProducer(
