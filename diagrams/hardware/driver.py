@@ -53,7 +53,8 @@ class Driver(ABC):
 
     Attributes:
         url: Address that the connection was opened with; empty for the default.
-        num_statuses: Number of different statuses received; a repeated one counts once.
+        num_statuses: Number of different statuses received. A repeated one counts once, but a malformed one without a
+            time counts each time, because the robot answers.
         num_foreign_commands: Number of commands received by the robot from other programs, without those of a safety
             monitor that stops the arm.
     """
