@@ -48,6 +48,12 @@ def test_survival_censors_runs_that_never_converged():
     assert median_survival(*survival([None, None], [20, 20])) is None
 
 
+@pytest.mark.parametrize("converged", [12, 13])
+def test_median_survival_is_the_half_in_spite_of_rounding(converged):
+    runs = [*range(1, converged + 1), *[None] * (24 - converged)]
+    assert median_survival(*survival(runs, [100] * 24)) == 12
+
+
 def test_wilson_interval_of_all_successes_has_a_lower_end():
     low, high = wilson(100, 100)
     assert low == pytest.approx(0.963, abs=1e-3)
