@@ -7,18 +7,9 @@ import pytest
 
 from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.learning.config import LEARNERS
-from research.results.methods import (
-    BASELINES,
-    NO_DEMONSTRATION,
-    SECTIONS,
-    Row,
-    Section,
-    knowledge,
-    readme_table,
-    task_table,
-    update_readme,
-)
+from research.results.methods import knowledge, readme_table, task_table, update_readme
 from research.results.page import PAGES, write_pages
+from research.results.sections import BASELINES, NO_DEMONSTRATION, SECTIONS, Row, Section
 from research.studies import study_path
 
 ROOT = Path(__file__).parents[3]

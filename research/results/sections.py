@@ -1,0 +1,269 @@
+"""Methods and baseline policies of every task, and the studies that have their results."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+BASELINES = ("demonstration alone", "uniform random actions", "best constant action", "scripted policy")
+NO_DEMONSTRATION = ("zero action", *BASELINES[1:])  # a template has no demonstration
+
+
+@dataclass(frozen=True)
+class Row:
+    """A method of a study.
+
+    Attributes:
+        name: Name in the table.
+        study: Study that has its results.
+        method: Name of the method in the study.
+        eval_set: Evaluation set, if the study has several.
+    """
+
+    name: str
+    study: str
+    method: str
+    eval_set: str | None = None
+
+
+@dataclass(frozen=True)
+class Section:
+    """Methods that were trained and evaluated under the same conditions.
+
+    Attributes:
+        title: Title of the table.
+        rows: Methods, guided ones first.
+        guided: Names of the guided methods in the README's table; empty if that table omits the section.
+    """
+
+    title: str
+    rows: Sequence[Row]
+    guided: Sequence[str] = ()
+
+
+def _baselines(
+    study: str, methods: Sequence[str], eval_set: str | None = None, names: Sequence[str] = BASELINES
+) -> list[Row]:
+    return [Row(name, study, method, eval_set) for name, method in zip(names, methods, strict=True)]
+
+
+_ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
+_ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
+_NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
+_NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
+# Evaluation set of the study connector_hard_gantry, by the label of its rows in the table of methods.
+_STATIONS = {"at 2.5 ms": "fresh", "MuJoCo": "MuJoCo", "iiwa": "iiwa", "Panda": "Panda", "UR5e": "UR5e"}
+
+SECTIONS: dict[str, list[Section]] = {
+    "BncConnector": [
+        Section(
+            "Connector, hard, on an iiwa with a robot's sensors",
+            [
+                Row("KGRL", "connector_robot_sensing", "kgrl"),
+                Row("KGRL, finer contact afterwards", "connector_robot_sensing_fine", "kgrl", "fresh"),
+                Row("KGRL, finer contact afterwards, in MuJoCo", "connector_robot_sensing_fine", "kgrl", "MuJoCo"),
+                Row("KGRL, light push", "connector_robot_sensing", "light_push"),
+                Row("KGRL, critic without privileged observation", "connector_robot_sensing", "own_observation"),
+                Row("residual RL", "connector_robot_sensing", "residual"),
+                Row("residual RL, force not bounded", "connector_robot_sensing", "residual_unbounded"),
+                *_baselines("connector_robot_sensing_baselines", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL",),
+        ),
+        Section(
+            "Connector, hard",
+            [
+                Row("KGRL", "peers_connector_hard", "kgrl"),
+                Row("sKGRL, adaptive history", "peers_connector_hard", "skgrl_adaptive"),
+                Row("residual RL", "peers_connector_hard", "residual"),
+                Row("safe residual RL", "peers_connector_hard", "safe_residual"),
+                Row("residual RL, covariance without constraints", "peers_connector_hard", "residual_covariance"),
+                Row("residual RL, control barrier function", "peers_connector_hard", "residual_cbf"),
+                Row("residual RL, tangent space", "peers_connector_hard", "residual_tangent"),
+                Row("Policy Decorator", "peers_connector_hard", "policy_decorator"),
+                Row("CrossQ", "peers_connector_hard", "crossq"),
+                Row("behavior cloning", "peers_connector_hard", "bc"),
+                Row("RLPD", "peers_connector_hard", "rlpd"),
+                Row("DroQ", "peers_connector_hard", "droq"),
+                *_baselines("peers_connector_hard", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+            guided=("KGRL", "sKGRL, adaptive history"),
+        ),
+        Section(
+            "Connector, hard, force not bounded (40 N per axis)",
+            [
+                Row("KGRL", "connector_hard", "kgrl"),
+                Row("sKGRL, adaptive history", "connector_hard", "skgrl_adaptive"),
+                Row("sKGRL", "connector_hard", "skgrl"),
+                Row("residual RL", "connector_hard", "residual"),
+                Row("safe residual RL", "connector_hard", "safe_residual"),
+                Row("residual RL with a larger action scale", "connector_hard", "residual_far"),
+                *_baselines("connector_hard_baselines", _ALL),
+            ],
+        ),
+        Section(
+            "Connector, hard, from one demonstration",
+            [
+                Row("KGRL", "connector_hard_one_demonstration", "kgrl"),
+                *_baselines("connector_hard_one_demonstration", ("demonstration",), names=BASELINES[:1]),
+            ],
+        ),
+        Section(
+            "Connector, hard, on a base policy",
+            [
+                Row("KGRL on the base policy", "connector_hard_base_policy", "kgrl"),
+                Row("Policy Decorator", "connector_hard_base_policy", "policy_decorator"),
+                Row("base policy alone", "connector_hard_base_policy", "base"),
+            ],
+        ),
+        Section(
+            "Connector, hard, learned on the gantry at 2.5 ms, evaluated there and elsewhere",
+            [
+                Row(f"KGRL, {where}", "connector_hard_gantry", "kgrl", evaluation)
+                for where, evaluation in _STATIONS.items()
+            ]
+            + [
+                row
+                for where, evaluation in _STATIONS.items()
+                for row in _baselines(
+                    "connector_hard_gantry",
+                    _NOT_CONSTANT,
+                    evaluation,
+                    [f"{name}, {where}" for name in _NAMES_NOT_CONSTANT],
+                )
+            ],
+        ),
+        Section(
+            "Connector, hard, trained in Drake, evaluated in MuJoCo",
+            [
+                Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
+                Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
+                Row("sKGRL, adaptive history", "connector_hard_fine", "skgrl_adaptive", "MuJoCo"),
+                Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
+                *_baselines("connector_hard_fine", _NOT_CONSTANT, "MuJoCo", _NAMES_NOT_CONSTANT),
+            ],
+        ),
+        Section(
+            "Connector, hard, commands within 2.8 mm",
+            [
+                Row("KGRL", "connector_hard_safety", "kgrl"),
+                Row("sKGRL, adaptive history", "connector_hard_safety", "skgrl_adaptive"),
+                Row("residual RL", "connector_hard_safety", "residual"),
+                Row("safe residual RL", "connector_hard_safety", "safe_residual"),
+                *_baselines("connector_hard_safety", _NOT_CONSTANT, names=_NAMES_NOT_CONSTANT),
+            ],
+        ),
+        Section(
+            "Connector, one unobserved offset per training run",
+            [
+                Row("KGRL", "connector", "kgrl"),
+                Row("sKGRL", "connector", "skgrl"),
+                Row("residual RL", "connector_guidance", "residual"),
+                *_baselines("connector_baselines", _ALL, "per_run"),
+            ],
+            guided=("KGRL", "sKGRL"),
+        ),
+        Section(
+            "Connector, another unobserved offset in every episode",
+            [
+                Row("KGRL", "connector_disc", "kgrl"),
+                Row("sKGRL", "connector_disc", "skgrl"),
+                *_baselines("connector_baselines", _ALL, "per_episode"),
+            ],
+        ),
+        Section(
+            "Connector, with every setting of the thesis",
+            [
+                Row("KGRL", "connector_thesis", "kgrl"),
+                Row("sKGRL", "connector_thesis", "skgrl"),
+                *_baselines("connector_thesis", _ALL[:2], names=BASELINES[:2]),
+            ],
+        ),
+    ],
+    "GridClamp": [
+        Section(
+            "Grid clamp, hard, on an iiwa with a robot's sensors",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "grid_clamp_robot_sensing", "sct"),
+                Row("RL-SCT", "grid_clamp_robot_sensing", "sct_not_shown"),
+                Row("residual RL", "grid_clamp_robot_sensing", "residual"),
+                Row("residual RL, force not bounded", "grid_clamp_robot_sensing", "residual_unbounded"),
+                Row("straight down", "grid_clamp_robot_sensing", "straight"),
+                *_baselines("grid_clamp_robot_sensing", _NOT_CONSTANT[1:], names=_NAMES_NOT_CONSTANT[1:]),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
+        Section(
+            "Grid clamp, hard",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "grid_clamp_hard", "sct"),
+                Row("residual RL", "grid_clamp_hard", "residual"),
+                Row("RL of 6D velocities", "grid_clamp_hard", "none"),
+                *_baselines("grid_clamp_hard_baselines", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
+        Section(
+            "Grid clamp",
+            [
+                Row("RL-SCT", "grid_clamp", "sct"),
+                Row("residual RL", "grid_clamp_guidance", "residual"),
+                Row("RL of 6D velocities", "grid_clamp_guidance", "none"),
+                *_baselines("grid_clamp_baselines", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT",),
+        ),
+    ],
+    "Pouring": [
+        Section(
+            "Pouring, hard",
+            [
+                Row("RL-SCT", "pouring_hard", "rl_sct"),
+                Row("RL-SCT, more episodes", "pouring_hard", "rl_sct_longer"),
+                Row("RL, reward shaped by hand", "pouring_hard", "rl"),
+                *_baselines("pouring_hard_baselines", _ALL_ZERO, names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT",),
+        ),
+        Section(
+            "Pouring",
+            [
+                Row("RL-SCT, shaped reward", "pouring_sac", "rl_sct_shaped"),
+                Row("RL-SCT, sparse reward", "pouring_sac", "rl_sct_sparse"),
+                Row("RL, reward shaped by hand", "pouring_sac", "rl_shaped"),
+                *_baselines("pouring_baselines", (*_ALL_ZERO[:3], "scripted_pour"), names=NO_DEMONSTRATION),
+            ],
+            guided=("RL-SCT, shaped reward",),
+        ),
+    ],
+    "NarrowPassage": [
+        Section(
+            "Narrow passage, hard",
+            [
+                Row("KGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "kgrl"),
+                Row("sKGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "skgrl"),
+                Row("residual RL", "peers_narrow_passage_hard", "residual"),
+                Row("safe residual RL", "peers_narrow_passage_hard", "safe_residual"),
+                Row("residual RL, covariance without constraints", "peers_narrow_passage_hard", "residual_covariance"),
+                Row("residual RL, control barrier function", "peers_narrow_passage_hard", "residual_cbf"),
+                Row("residual RL, tangent space", "peers_narrow_passage_hard", "residual_tangent"),
+                Row("Policy Decorator", "peers_narrow_passage_hard", "policy_decorator"),
+                Row("CrossQ", "peers_narrow_passage_hard", "crossq"),
+                Row("RLPD", "peers_narrow_passage_hard", "rlpd"),
+                Row("DroQ", "peers_narrow_passage_hard", "droq"),
+                *_baselines("narrow_passage_hard_baselines", [f"skgrl_{name}" for name in _ALL]),
+            ],
+            guided=("sKGRL, 10 demonstration episodes", "KGRL, 10 demonstration episodes"),
+        ),
+        Section(
+            "Narrow passage",
+            [
+                Row("KGRL", "narrow_passage", "kgrl"),
+                Row("residual RL", "narrow_passage", "residual"),
+                Row("safe residual RL", "narrow_passage", "safe_residual"),
+                *_baselines("narrow_passage_baselines", _ALL[:3], names=BASELINES[:3]),
+            ],
+            guided=("KGRL",),
+        ),
+    ],
+}
