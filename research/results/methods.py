@@ -10,7 +10,9 @@ import numpy as np
 import pandas as pd
 
 from guiderail.tools.evaluation.metrics import TOLERANCE
+from guiderail.tools.evaluation.subject import hides
 from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.experiments.job import Job
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.tables import read_table
@@ -30,6 +32,7 @@ README_COLUMNS = (
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
+RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
 MIN_SEEDS = 3  # number of seeds that an interval needs
 
 
@@ -44,7 +47,7 @@ def task_table(task: str, tables: Path) -> str:
     for section in SECTIONS.get(task, ()):
         rows = [(row.name, *_cells(seeds)) for row in section.rows if len(seeds := last_rows(tables, row))]
         if rows:
-            remarks = "".join(f"\n{line}\n" for line in (*improvements(section, tables), *knowledge(section, tables)))
+            remarks = "".join(f"\n{line}\n" for write in REMARKS for line in write(section, tables))
             parts.append(f"### {section.title}\n\n{_markdown(COLUMNS, rows)}\n{remarks}")
     return "\n".join(parts)
 
@@ -53,21 +56,23 @@ def readme_table(tables: Path) -> str:
     """Return the Markdown table of the README: a row for each section, hard tasks first."""
     rows = []
     for section in sorted((s for sections in SECTIONS.values() for s in sections), key=lambda s: "hard" not in s.title):
-        named = {row.name: last_rows(tables, row) for row in section.rows}
-        guided = [(name, named[name]) for name in section.guided if len(named[name])]
+        named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
+        guided = [named[name] for name in section.guided if name in named]
         if not guided:
             continue
-        residual, scripted, random = (named.get(n, pd.DataFrame()) for n in ("residual RL", BASELINES[3], BASELINES[1]))
+        residual, scripted, random = (named.get(name) for name in ("residual RL", BASELINES[3], BASELINES[1]))
+        efforts = [*dict.fromkeys(_effort(*one) for one in guided)]
+        if residual and (effort := _effort(*residual)) not in efforts:
+            efforts.append(f"residual RL: {effort}")
         rows.append(
             (
                 section.title,
-                "; ".join(f"{name.split(',')[0]} {_success(seeds)}" for name, seeds in guided),
+                "; ".join(f"{_label(row)} {_percent((row, seeds))}" for row, seeds in guided),
                 _percent(residual),
                 f"{_percent(scripted)} / {_percent(random)}",
-                ", ".join(dict.fromkeys(f"{n:g}" for _, seeds in guided for n in seeds["training_episodes"]))
-                + f" ({len(guided[0][1])})",
-                "; ".join(f"{name.split(',')[0]} {_stopped(seeds)}" for name, seeds in guided),
-                _stopped(residual),
+                "; ".join(efforts),
+                "; ".join(f"{row.name.split(',')[0]} {_stopped(seeds)}" for row, seeds in guided),
+                _stopped(residual[1]) if residual else "–",
             )
         )
     return _markdown(README_COLUMNS, rows)
@@ -159,13 +164,13 @@ def is_guided(row: Row) -> bool:
 
 
 def knowledge(section: Section, tables: Path) -> list[str]:
-    """Return a sentence that names the demonstrated episodes of the learned methods, if they differ."""
+    """Return a sentence that names the demonstrated episodes of the learned methods, if there are any."""
     methods: dict[int, list[str]] = {}  # names by number of demonstrated episodes
     for row in section.rows:
         if _is_trained(last_rows(tables, row)):
             methods.setdefault(demonstrated_episodes(row), []).append(row.name)
     if len(methods) < 2:
-        return []
+        return [f"Demonstrated episodes of every learned method: {number}." for number in methods if number]
     counts = sorted(filter(None, methods), reverse=True)
     parts = [f"{number} demonstrated episodes: {', '.join(methods[number])}" for number in counts]
     parts += ["none: the other methods"] if 0 in methods else []
@@ -190,6 +195,26 @@ def demonstrated_episodes(row: Row) -> int:
     return resolve_preset(preset, algorithm).demonstration_episodes
 
 
+def has_run_offset(row: Row) -> bool:
+    """Return True if all held-out episodes of a seed have the same hidden offset; in training they have it, too."""
+    study = load_study(study_path(row.study))
+    import_modules(study.imports)
+    environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment
+    sets = [one for one in study.eval_set if row.eval_set in (None, one.name)]
+    return any(hides(study.task, {**environment, **one.env}) and not one.options.get("new_run") for one in sets)
+
+
+def offsets(section: Section, tables: Path) -> list[str]:
+    """Return a sentence that names the methods whose held-out episodes have the hidden offset of their run."""
+    rows = [row for row in section.rows if len(last_rows(tables, row))]
+    fixed = [row.name for row in rows if has_run_offset(row)]
+    if not fixed:
+        return []
+    names = [row.name for row in rows if row.name not in fixed]
+    others = f" A new hidden offset in every held-out episode: {'; '.join(names)}." if names else ""
+    return [f"One hidden offset for each seed, in training and in held-out episodes: {'; '.join(fixed)}.{others}"]
+
+
 def _is_trained(seeds: pd.DataFrame) -> bool:
     return "training_episodes" in seeds and bool(seeds["training_episodes"].notna().any())
 
@@ -198,6 +223,7 @@ def _is_evaluated(seeds: pd.DataFrame) -> bool:
     return "success_rate" in seeds and bool(seeds["success_rate"].notna().all())
 
 
+REMARKS = (improvements, knowledge, offsets)  # functions that return the sentences below the table of a section
 _SAFETY = ("max_commanded_violation", "violating_episodes", "peak_force")
 
 
@@ -243,16 +269,31 @@ def _success(seeds: pd.DataFrame) -> str:
     span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
     is_single = len(seeds) == 1 and _is_trained(seeds)
     mean = f"{rates.mean():.{int(99.5 <= rates.mean() < 100)}f}"  # 99.6 is not written as 100
-    return f"{mean}{' (one seed)' if is_single else span}"
+    return f"{mean}{' (one seed)' if is_single else span}{'' if _is_evaluated(seeds) else ' in training'}"
 
 
-def _percent(seeds: pd.DataFrame) -> str:
-    return _success(seeds) if len(seeds) else "–"
+def _percent(result: tuple[Row, pd.DataFrame] | None) -> str:
+    """Return the success of a row, marked if it was evaluated with the hidden offset of each run; a dash without it."""
+    return f"{_success(result[1])}{RUN_OFFSET if has_run_offset(result[0]) else ''}" if result else "–"
+
+
+def _label(row: Row) -> str:
+    """Return the name of a row with its setting in brackets; demonstrated episodes have a column of their own."""
+    name, _, setting = row.name.partition(", ")
+    return f"{name} ({setting})" if setting and "demonstration" not in setting else name
+
+
+def _effort(row: Row, seeds: pd.DataFrame) -> str:
+    """Return the number of training episodes, of demonstrated ones among them, and of seeds."""
+    episodes, demonstrated = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"])), ""
+    if number := demonstrated_episodes(row):
+        demonstrated = f", {number} of them demonstrated"
+    return f"{episodes}{demonstrated} ({len(seeds)})"
 
 
 def _stopped(seeds: pd.DataFrame) -> str:
-    """Return the share of training episodes of all seeds that ended in a collision [%]; a dash where it is unknown."""
-    column = "training_ended_in_collision"
-    if seeds.empty or column not in seeds or seeds[column].isna().any():
+    """Return the share of training episodes that ended in a collision or a spill [%]; a dash where it is unknown."""
+    columns = ["training_ended_in_collision", "training_ended_in_spill"]
+    if not {*columns} <= {*seeds} or seeds[columns].isna().any(axis=None):
         return "–"
-    return f"{100 * seeds[column].sum() / seeds['training_episodes'].sum():.0f}"
+    return f"{100 * seeds[columns].sum(axis=None) / seeds['training_episodes'].sum():.0f}"

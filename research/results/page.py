@@ -130,7 +130,8 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
 def _page_head(title: str) -> str:
     return (
         f"# {title}\n\nWritten by `python -m research.results` from the tables in `research/results`. All results are "
-        "simulated.\nHeld-out episodes have initial conditions that training never samples.\n"
+        "simulated.\nHeld-out episodes have initial conditions that training never samples. If a run has one hidden offset, held-out "
+        "episodes have\nthe same offset.\n"
     )
 
 

@@ -60,8 +60,8 @@ SECTIONS: dict[str, list[Section]] = {
             "Connector, hard, on an iiwa with a robot's sensors",
             [
                 Row("KGRL", "connector_robot_sensing", "kgrl"),
-                Row("KGRL, finer contact afterwards", "connector_robot_sensing_fine", "kgrl", "fresh"),
-                Row("KGRL, finer contact afterwards, in MuJoCo", "connector_robot_sensing_fine", "kgrl", "MuJoCo"),
+                Row("KGRL, 80 episodes, then 60 with finer contact", "connector_robot_sensing_fine", "kgrl", "fresh"),
+                Row("KGRL, 80 episodes, then 60 with finer contact, in MuJoCo", "connector_robot_sensing_fine", "kgrl", "MuJoCo"),
                 Row("KGRL, light push", "connector_robot_sensing", "light_push"),
                 Row("KGRL, critic without privileged observation", "connector_robot_sensing", "own_observation"),
                 Row("residual RL", "connector_robot_sensing", "residual"),
@@ -240,8 +240,8 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Narrow passage, hard",
             [
-                Row("KGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "kgrl"),
-                Row("sKGRL, 10 demonstration episodes", "peers_narrow_passage_hard", "skgrl"),
+                Row("KGRL", "peers_narrow_passage_hard", "kgrl"),
+                Row("sKGRL", "peers_narrow_passage_hard", "skgrl"),
                 Row("residual RL", "peers_narrow_passage_hard", "residual"),
                 Row("safe residual RL", "peers_narrow_passage_hard", "safe_residual"),
                 Row("residual RL, covariance without constraints", "peers_narrow_passage_hard", "residual_covariance"),
@@ -253,7 +253,7 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("DroQ", "peers_narrow_passage_hard", "droq"),
                 *_baselines("narrow_passage_hard_baselines", [f"skgrl_{name}" for name in _ALL]),
             ],
-            guided=("sKGRL, 10 demonstration episodes", "KGRL, 10 demonstration episodes"),
+            guided=("sKGRL", "KGRL"),
         ),
         Section(
             "Narrow passage",

@@ -7,7 +7,7 @@ import pytest
 
 from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.learning.config import LEARNERS
-from research.results.methods import knowledge, readme_table, task_table, update_readme
+from research.results.methods import knowledge, offsets, readme_table, task_table, update_readme
 from research.results.page import PAGES, write_pages
 from research.results.sections import BASELINES, NO_DEMONSTRATION, SECTIONS, Row, Section
 from research.studies import study_path
@@ -67,17 +67,18 @@ def test_missing_study_is_left_out(tmp_path):
 HEAD = (
     "method,seed,after_episodes,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,"
     "violating_episodes,peak_force,training_episodes,training_success_rate,training_episodes_to_convergence,"
-    "training_max_commanded_violation,training_violating_episodes,training_peak_force,training_ended_in_collision\n"
+    "training_max_commanded_violation,training_violating_episodes,training_peak_force,training_ended_in_collision,"
+    "training_ended_in_spill\n"
 )
 
 
 def test_each_seed_is_listed_after_its_last_episode(tmp_path):
     (tmp_path / "peers_connector_hard.csv").write_text(
         HEAD
-        + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1\n"
-        + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,4\n"
-        + "residual,8,60,fresh,100,1.0,0,0,-0.1,0,14.5,60,0.8,,0.0,0,20.0,3\n"
-        + "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,2\n"
+        + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1,0\n"
+        + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,3,1\n"
+        + "residual,8,60,fresh,100,1.0,0,0,-0.1,0,14.5,60,0.8,,0.0,0,20.0,3,0\n"
+        + "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,2,0\n"
     )
     kgrl, residual = rows(task_table("BncConnector", tmp_path))
     assert kgrl[0] == "KGRL"
@@ -90,11 +91,12 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
         "14.5 (31.0)",
     ]
     (row,) = rows(readme_table(tmp_path))
-    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "60 (1)", "KGRL 3", "6"]
+    effort = "60 (1); residual RL: 60 (2)"
+    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", effort, "KGRL 3", "6"]
 
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
-    template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2\n"
+    template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2,0\n"
     rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_cbf": (0.1, 0.2, 0.3, 0.4)}
     lines = [template.format(name, seed, rate) for name, each in rates.items() for seed, rate in enumerate(each)]
     (tmp_path / "peers_connector_hard.csv").write_text(HEAD + "".join(lines))
@@ -110,6 +112,7 @@ def test_methods_of_unequal_knowledge_are_marked():
     (sentence,) = knowledge(hard, TABLES)
     assert "equal knowledge.** 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other" in sentence
     assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
+    assert knowledge(SECTIONS["NarrowPassage"][0], TABLES) == ["Demonstrated episodes of every learned method: 10."]
 
 
 def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
@@ -121,7 +124,7 @@ def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
 
 
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
-    line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0\n"
+    line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,0\n"
     (tmp_path / "peers_connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
     assert rows(readme_table(tmp_path))[0][-2:] == ["KGRL –", "–"]
 
@@ -134,6 +137,24 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
     )
     (row,) = rows(task_table("NarrowPassage", tmp_path))
     assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "–", "0, 3, never", "none", "(3.0)"]
+    (row,) = rows(readme_table(tmp_path))
+    assert row[1] == "KGRL 58 (25–100) in training"
+
+
+def test_results_with_the_offset_of_the_run_are_marked():
+    table = {row[0]: row for row in rows(readme_table(TABLES))}
+    assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99.5 (96–100) †", "100 †", "98 / 52"]
+    assert table["Grid clamp, hard"][4] == "60, 3 of them demonstrated (10); residual RL: 60 (5)"
+    assert "†" not in "".join(table["Connector, hard"])
+    (clamp,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp")
+    (sentence,) = offsets(clamp, TABLES)
+    assert "held-out episodes: RL-SCT; residual RL; RL of 6D velocities. A new hidden offset" in sentence
+    assert offsets(SECTIONS["BncConnector"][0], TABLES) == []
+
+
+def test_spilled_episodes_count_as_stopped():
+    table = {row[0]: row for row in rows(readme_table(TABLES))}
+    assert table["Pouring, hard"][5] == "RL-SCT 31"
 
 
 def test_update_readme_refuses_a_text_without_markers():
