@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -119,7 +119,7 @@ def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
     converged = _join(seeds["training_episodes_to_convergence"])
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
     forces = _forces(parts) if held_out else f"({_forces(parts)})"
-    return f"{episodes} ({_span(seeds['seed'])})", success, _middle(seeds), converged, _violation(parts), forces
+    return f"{episodes} ({span(seeds['seed'])})", success, _middle(seeds), converged, _violation(parts), forces
 
 
 def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
@@ -235,7 +235,7 @@ def _join(values: pd.Series) -> str:
     return ", ".join("never" if pd.isna(value) else f"{value:.3g}" for value in values)
 
 
-def _span(seeds: pd.Series) -> str:
+def span(seeds: Iterable[float]) -> str:
     """Return consecutive seeds as a range, others as a list."""
     numbers = sorted(int(seed) for seed in seeds)
     if len(numbers) > 2 and numbers == list(range(numbers[0], numbers[-1] + 1)):

@@ -20,7 +20,7 @@ from guiderail.tools.imports import import_modules
 from guiderail.tools.tables import cell, read_table, table_text
 from research.figures import FIGURES, figure_command
 from research.figures.thesis import THESIS
-from research.results.methods import task_table
+from research.results.methods import span, task_table
 from research.studies import study_command_line, study_names, study_path
 from research.thesis import describe_differences
 
@@ -43,7 +43,7 @@ PAGES = {
 NOT_RESULTS = ("figure", "the thesis", "command", "seconds", "seeds", "condition")
 COLUMNS = (
     "method", "after episodes", "evaluation set", "held-out success of each seed", "episodes to convergence",
-    "max. commanded violation", "collisions in training", "hours",
+    "max. commanded violation", "force above the limit in training", "stopped in training", "hours",
 )  # fmt: skip
 # Tables of programs that are not studies, with the columns that the page shows; None: all of them.
 PROGRAMS: dict[str, tuple[str, ...] | None] = {
@@ -130,8 +130,9 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
 def _page_head(title: str) -> str:
     return (
         f"# {title}\n\nWritten by `python -m research.results` from the tables in `research/results`. All results are "
-        "simulated.\nHeld-out episodes have initial conditions that training never samples. If a run has one hidden offset, held-out "
-        "episodes have\nthe same offset.\n"
+        "simulated.\nHeld-out episodes have initial conditions that training never samples. If a run has one hidden "
+        "offset, held-out\nepisodes have the same offset. A training episode is stopped by a collision (a force above the limit, or "
+        "an obstacle of the\nnarrow passage) or a spill.\n"
     )
 
 
@@ -189,9 +190,19 @@ def _study_section(study: Study, rows: pd.DataFrame) -> str:
     ):
         cells = [method, after or "–", eval_set or "–", *_numbers(group)]
         lines.append(f"| {' | '.join(map(cell, cells))} |")
-    if missing := [method for method in study.methods if method not in set(rows["method"])]:
-        lines += ["", f"Not run: {', '.join(missing)}."]
+    if missing := _missing(study, rows):
+        lines += ["", f"Not run: {'; '.join(missing)}."]
     return "\n".join([*lines, *_difference_lines(study, set(rows["method"])), ""])
+
+
+def _missing(study: Study, rows: pd.DataFrame) -> list[str]:
+    """Return the methods of a study without results, and the methods that lack some of their seeds with these."""
+    missing = []
+    for method, declared in study.methods.items():
+        seeds, done = set(declared.seeds or study.seeds), set(rows.loc[rows["method"] == method, "seed"])
+        if left := seeds - done:
+            missing.append(f"{method}, seeds {span(left)}" if done else method)
+    return missing
 
 
 def _difference_lines(study: Study, evaluated: Collection[str]) -> list[str]:
@@ -247,9 +258,18 @@ def _numbers(group: pd.DataFrame) -> list[str]:
     rates, trained = group.get("success_rate", []), "training_episodes" in group
     held_out = ", ".join("–" if pd.isna(rate) else f"{rate:.0%}" for rate in rates) or "–"
     if not trained or group["training_episodes"].isna().all():
-        return [held_out, "–", "–", "–", "–"]
+        return [held_out, "–", "–", "–", "–", "–"]
     converged = ", ".join("never" if pd.isna(n) else f"{n:g}" for n in group["training_episodes_to_convergence"])
     worst = float(group["training_max_commanded_violation"].max())
     violation = "none" if worst <= TOLERANCE else f"{worst:.2g}"
     hours = float(np.nansum(group["training_wall_time"].to_numpy(float))) / 3600
-    return [held_out, converged, violation, f"{int(group['training_collisions'].sum())}", f"{hours:.2f}"]
+    collisions = f"{int(group['training_collisions'].sum())}"
+    return [held_out, converged, violation, collisions, _stopped(group), f"{hours:.2f}"]
+
+
+def _stopped(group: pd.DataFrame) -> str:
+    """Return the number of training episodes of all seeds that ended in a collision or a spill."""
+    collisions, spills, episodes = (
+        int(group[f"training_{name}"].sum()) for name in ("ended_in_collision", "ended_in_spill", "episodes")
+    )
+    return f"{collisions}{f' + {spills} spills' if spills else ''} of {episodes:,}"

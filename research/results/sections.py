@@ -61,7 +61,12 @@ SECTIONS: dict[str, list[Section]] = {
             [
                 Row("KGRL", "connector_robot_sensing", "kgrl"),
                 Row("KGRL, 80 episodes, then 60 with finer contact", "connector_robot_sensing_fine", "kgrl", "fresh"),
-                Row("KGRL, 80 episodes, then 60 with finer contact, in MuJoCo", "connector_robot_sensing_fine", "kgrl", "MuJoCo"),
+                Row(
+                    "KGRL, 80 episodes, then 60 with finer contact, in MuJoCo",
+                    "connector_robot_sensing_fine",
+                    "kgrl",
+                    "MuJoCo",
+                ),
                 Row("KGRL, light push", "connector_robot_sensing", "light_push"),
                 Row("KGRL, critic without privileged observation", "connector_robot_sensing", "own_observation"),
                 Row("residual RL", "connector_robot_sensing", "residual"),

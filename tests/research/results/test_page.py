@@ -27,10 +27,11 @@ def finished(tmp_path):
             "method": "skgrl", "after_episodes": 40, "eval_set": "gantry", "seed": seed, "success_rate": rate,
             "episodes": 100, "training_episodes": 40, "training_episodes_to_convergence": converged,
             "training_max_commanded_violation": -1e-4, "training_collisions": 1, "training_wall_time": 1800.0,
+            "training_ended_in_collision": 3, "training_ended_in_spill": spills,
             "max_commanded_violation": -1e-4, "violating_episodes": 0, "training_violating_episodes": 0,
             "peak_force": 10.0, "training_peak_force": 10.0,
         }
-        for seed, rate, converged in ((30, 1.0, 12), (31, 0.97, None))
+        for seed, rate, converged, spills in ((30, 1.0, 12, 0), (31, 0.97, None, 2))
     ]  # fmt: skip
     rows.append({"method": "nothing", "after_episodes": 0, "eval_set": "gantry", "seed": 0, "success_rate": 0.14})
     write_table(tmp_path / "study" / "connector", pd.DataFrame(rows))
@@ -39,13 +40,13 @@ def finished(tmp_path):
 
 def test_page_has_every_seed_the_thesis_and_the_differences(finished, tmp_path):
     page = write_results([finished], tmp_path / "results")
-    assert "| skgrl | 40 | gantry | 100%, 97% | 12, never | none | 2 | 1.00 |" in page
-    assert "| nothing | – | gantry | 14% | – | – | – | – |" in page
+    assert "| skgrl | 40 | gantry | 100%, 97% | 12, never | none | 2 | 6 + 2 spills of 80 | 1.00 |" in page
+    assert "| nothing | – | gantry | 14% | – | – | – | – | – |" in page
     assert THESIS["5.9"] in page
     assert "guiderail study research/studies/connector.yaml --out studies" in page
     (differs,) = (line for line in page.splitlines() if line.startswith("Differences from the thesis (skgrl)"))
     assert "reward shaped (thesis: sparse)" in differs
-    assert "Not run: kgrl" in page
+    assert "Not run: skgrl, seeds 32–34; kgrl." in page
 
 
 def test_differences_of_all_methods_are_stated_once(finished, tmp_path):
@@ -63,7 +64,7 @@ def test_page_has_the_rows_of_a_study_without_evaluation(finished, tmp_path):
     table = table.drop(columns="success_rate").assign(eval_set="", training_success_rate=0.5)
     write_table(tmp_path / "unjudged" / "connector", table)
     page = write_results([tmp_path / "unjudged"], tmp_path / "results")
-    assert "| skgrl | 40 | – | – | 12, never | none | 2 | 1.00 |" in page
+    assert "| skgrl | 40 | – | – | 12, never | none | 2 | 6 + 2 spills of 80 | 1.00 |" in page
 
 
 def test_sweep_has_a_picture_and_breaking_points(tmp_path):
@@ -71,7 +72,8 @@ def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     rows = [
         {"method": method, "after_episodes": 100 * learned, "eval_set": one.name, "seed": 110, "episodes": 40,
          "success_rate": rate, "training_episodes": 100 if learned else None, "training_episodes_to_convergence": None,
-         "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0}
+         "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0,
+         "training_ended_in_collision": 0, "training_ended_in_spill": 0}
         for method, learned in (("rl_sct", True), ("uniform_random", False))
         for one, rate in zip(load_study(study_path("pouring_sweep")).eval_sets, rates[method], strict=True)
     ]  # fmt: skip
@@ -81,7 +83,7 @@ def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     assert "](pouring_sweep.svg)" in page
     assert "| rl_sct | 100% | 100% | 95% | 85% | 60% | 0% | 30 |" in page
     assert "| uniform_random | 5% | 5% | 5% | 5% | 5% | 5% | from the easiest on |" in page
-    assert "| rl_sct | 100 | – | – | never | none | 0 | 0.17 |" in page
+    assert "| rl_sct | 100 | – | – | never | none | 0 | 0 of 100 | 0.17 |" in page
     assert "| uniform_random | – |" not in page
     assert "Not run: " in page
     write_results([], tmp_path / "results")
