@@ -17,7 +17,7 @@ from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.tables import read_table
 from research.results.sections import BASELINES, SECTIONS, Row, Section
-from research.results.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from research.results.statistics import Scores, bootstrap_interval, interquartile_mean, probability_of_improvement
 from research.studies import study_path
 
 COLUMNS = (
@@ -34,6 +34,7 @@ BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the 
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
 MIN_SEEDS = 3  # number of seeds that an interval needs
+MIN_EQUAL_SEEDS = 5  # the same for an interval without width
 
 
 def task_table(task: str, tables: Path) -> str:
@@ -130,12 +131,21 @@ def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
 
 
 def _middle(seeds: pd.DataFrame) -> str:
-    """Return the interquartile mean of the seeds' held-out success [%] with its interval; a dash for too few seeds."""
+    """Return the interquartile mean of the seeds' held-out success [%]; a dash for too few seeds.
+
+    The interval follows, unless it has no width because few seeds are equal.
+    """
     scores = _scores(seeds)
     if scores is None:
         return "–"
     low, high = bootstrap_interval(interquartile_mean, scores)
-    return f"{100 * interquartile_mean(scores):.3g} ({100 * low:.3g}–{100 * high:.3g})"
+    mean = f"{100 * interquartile_mean(scores):.3g}"
+    return f"{mean} ({100 * low:.3g}–{100 * high:.3g})" if _has_interval(low, high, scores) else mean
+
+
+def _has_interval(low: float, high: float, *methods: Scores) -> bool:
+    """Return False for an interval without width of too few seeds: equal seeds are not certainty."""
+    return low < high or min(len(scores) for method in methods for scores in method) >= MIN_EQUAL_SEEDS
 
 
 def improvements(section: Section, tables: Path) -> list[str]:
@@ -149,9 +159,10 @@ def improvements(section: Section, tables: Path) -> list[str]:
     for name in (name for name in section.guided if name in scores):
         pair = scores[name], scores[best]
         low, high = bootstrap_interval(probability_of_improvement, *pair)
+        interval = f"95 %: {low:.2f}–{high:.2f}; " if _has_interval(low, high, *pair) else ""
         lines.append(
             f"A seed of {name} succeeds more often than one of {best} with probability "
-            f"{probability_of_improvement(*pair):.2f} (95 %: {low:.2f}–{high:.2f}; ties count half)."
+            f"{probability_of_improvement(*pair):.2f} ({interval}ties count half)."
         )
     return lines
 

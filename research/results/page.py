@@ -131,8 +131,8 @@ def _page_head(title: str) -> str:
     return (
         f"# {title}\n\nWritten by `python -m research.results` from the tables in `research/results`. All results are "
         "simulated.\nHeld-out episodes have initial conditions that training never samples. If a run has one hidden "
-        "offset, held-out\nepisodes have the same offset. A training episode is stopped by a collision (a force above the limit, or "
-        "an obstacle of the\nnarrow passage) or a spill.\n"
+        "offset, held-out\nepisodes have the same offset. A training episode is stopped by a collision (a force above "
+        "the limit, or an\nobstacle of the narrow passage) or a spill.\n"
     )
 
 

@@ -107,6 +107,19 @@ def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
     assert "equal knowledge" not in text
 
 
+@pytest.mark.parametrize(("number", "middle"), [(4, "100"), (5, "100 (100–100)")])
+def test_few_equal_seeds_have_no_interval(number, middle, tmp_path):
+    template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2,0\n"
+    lines = [
+        template.format(name, seed, rate) for name, rate in (("kgrl", 1.0), ("residual", 0.5)) for seed in range(number)
+    ]
+    (tmp_path / "peers_connector_hard.csv").write_text(HEAD + "".join(lines))
+    text = task_table("BncConnector", tmp_path)
+    assert rows(text)[0][3] == middle
+    interval = "95 %: 1.00–1.00; " if number == 5 else ""
+    assert f"residual RL with probability 1.00 ({interval}ties count half)" in text
+
+
 def test_methods_of_unequal_knowledge_are_marked():
     (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard")
     (sentence,) = knowledge(hard, TABLES)
