@@ -298,3 +298,57 @@ def test_settings_of_the_thesis_do_not_reproduce_its_success():
     for rows in (kgrl, skgrl):
         assert (rows["training_episodes"] == 45).all()
         assert (rows[["max_commanded_violation", "training_max_commanded_violation"]] <= TOLERANCE).all(axis=None)
+
+
+def ended_share(study, method, how="collision"):
+    """Return the share of a method's training episodes that a collision or spill ended [%]."""
+    once = rows_of(study, method).drop_duplicates("seed")
+    return 100 * once[f"training_ended_in_{how}"].sum() / once["training_episodes"].sum()
+
+
+def test_force_ends_a_share_of_unbounded_training():
+    methods = ("kgrl", "skgrl_adaptive", "residual", "safe_residual", "residual_far")
+    shares = [ended_share("connector_hard", method) for method in methods]
+    shares += [ended_share("connector_hard_fine", method) for method in ("kgrl", "skgrl_adaptive", "residual")]
+    assert all(14.5 <= share <= 25 for share in shares)
+    assert round(ended_share("connector_hard", "skgrl")) == 63
+    ended = [180 * ended_share("grid_clamp_sweep", method) / 100 for method in ("sct", "residual")]
+    assert ended == pytest.approx([22, 166])
+
+
+def test_spills_and_obstacles_end_training_episodes():
+    spills = [ended_share("pouring_hard", method, "spill") for method in ("rl_sct", "rl_sct_longer", "rl")]
+    assert spills == pytest.approx([92 / 3, 104 / 4.5, 0])
+    passage = [round(ended_share("peers_narrow_passage_hard", m)) for m in ("skgrl", "residual_covariance", "kgrl")]
+    assert passage == [36, 39, 41]
+    others = (
+        "residual",
+        "safe_residual",
+        "residual_cbf",
+        "residual_tangent",
+        "policy_decorator",
+        "crossq",
+        "rlpd",
+        "droq",
+    )
+    assert all(51.5 < ended_share("peers_narrow_passage_hard", method) < 69.5 for method in others)
+
+
+def test_measured_jerk_of_skgrl_is_less_smaller_than_commanded():
+    jerk = {}
+    for study in ("connector_hard", "connector_hard_fine", "connector_hard_safety", "peers_connector_hard"):
+        for name in ("measured_linear", "commanded_angular"):
+            kgrl, skgrl = (
+                rows_of(study, method).drop_duplicates("seed")[f"training_jerk_{name}_first_10"].mean()
+                for method in ("kgrl", "skgrl_adaptive")
+            )
+            jerk[study, name] = kgrl / skgrl if name == "measured_linear" else skgrl / kgrl
+    measured = [ratio for (_, name), ratio in jerk.items() if name == "measured_linear"]
+    assert (min(measured), max(measured)) == pytest.approx((1.5, 2.2), abs=0.06)
+    turns = [jerk[study, "commanded_angular"] for study in ("connector_hard", "connector_hard_safety")]
+    assert turns == pytest.approx([3.4, 2.8], abs=0.05)
+
+
+def test_cloned_slalom_has_one_seed():
+    for method, rate in (("bc", 0.39), ("bc_kgrl", 1.0), ("bc_skgrl", 1.0)):
+        assert rows_of("peers_narrow_passage_hard_bc", method)["success_rate"].tolist() == [rate]
