@@ -227,7 +227,7 @@ def evaluate_baselines(task: OutsideTask, env: Any, episodes: int) -> dict[str, 
     wins = [evaluate(env, lambda *_, a=a: a, 10, SELECTION_SEED + 100)["successes"] for a in finalists]
     best = finalists[int(np.argmax(wins))]
     result[f"constant {best.tolist()}"] = evaluate(env, lambda *_: best, episodes)
-    if task.schedule and hasattr(env, "guide"):
+    if task.schedule and env.has_wrapper_attr("guide"):
         result["schedule"] = evaluate(env, lambda _, info: task.schedule[info["segment"]], episodes)
     for name, row in result.items():
         print(name, row["by_side"], flush=True)
@@ -268,7 +268,8 @@ def main() -> None:
     for seed, path in paths.items():
         begin = time.process_time()
         env = task.make(guidance, seed, segments)
-        guidance = getattr(env, "guide", guidance)  # fitted once
+        if env.has_wrapper_attr("guide"):
+            guidance = env.get_wrapper_attr("guide")  # fitted once
         result: dict[str, Any] = {"task": args.task, "method": label, "seed": seed}
         if is_baselines:
             result["held_out"] = evaluate_baselines(task, env, args.held_out)

@@ -22,6 +22,7 @@ from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
 HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
 MAX_LAG = 0.035  # lag of the hand at which the first two attempts end, because the peg presses on the box [m]
+OUTSIDE = 0.7  # fraction of an insertion after which the peg enters the hole
 MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table, for the highest assumed hole [m]
 
 
@@ -34,17 +35,21 @@ def is_blocked(env: Any, observation: Any) -> bool:
 # lower commands are allowed.
 _FLOORS = {"object_start": MIN_HEIGHT, "assumed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}
 LOWER = {name: np.array([-np.inf, -np.inf, height]) for name, height in _FLOORS.items()}
+# A retraction that began at the end of the insertion would first push the blocked peg 1 cm further through the hand.
+_RETRACT = Part(
+    24, "assumed_goal", CLOSED, source="insert", until_fraction=OUTSIDE, is_reversed=True, lower=LOWER["assumed_goal"]
+)
 PARTS = {
     "reach": Part(30, "object_start", OPEN, lower=LOWER["object_start"]),
     "grasp": Part(28, "object_start", close_at_end, dwell=22, lower=LOWER["object_start"]),
     "carry": Part(34, "assumed_goal", CLOSED, lower=LOWER["assumed_goal"]),
     "insert": Part(40, "assumed_goal", CLOSED, dwell=10, lower=LOWER["assumed_goal"], until=is_blocked),
     # Two more attempts: retract along the insertion and insert again, with the demonstrations of the first insertion.
-    "retract": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
+    "retract": _RETRACT,
     "insert 2": Part(
         40, "assumed_goal", CLOSED, dwell=10, source="insert", lower=LOWER["assumed_goal"], until=is_blocked
     ),
-    "retract 2": Part(30, "assumed_goal", CLOSED, source="insert", is_reversed=True, lower=LOWER["assumed_goal"]),
+    "retract 2": _RETRACT,
     "insert 3": Part(40, "assumed_goal", CLOSED, dwell=40, source="insert", lower=LOWER["assumed_goal"]),
 }
 LENGTH = num_steps(PARTS)
@@ -114,7 +119,11 @@ TASK = OutsideTask(
     pose=pose,
     to_action=to_action,
     scripted=scripted(SawyerPegInsertionSideV3Policy()),
-    schedule={name: np.array([0.0, -0.7, 0.3]) for name in ("reach", "grasp", "carry", "insert")}
-    | {name: np.array([0.0, 0.7, 0.3]) for name in ("retract", "insert 2")}
-    | {name: np.array([0.0, -0.7, 0.3]) for name in ("retract 2", "insert 3")},
+    # Peg's head in the frame of the assumed hole, grasp along the peg, lag of the hand, last blocked position, phase.
+    # With all 26 entries the policy depends on irrelevant ones, such as the peg's first position.
+    observed=(3, 4, 5, 6, 12, 13, 14, 19, 20, 21, 22),
+    schedule={name: np.zeros(3) for name in ("reach", "grasp")}
+    | {name: np.array([0.0, -0.6, 0.3]) for name in ("carry", "insert")}
+    | {name: np.array([0.0, 0.5, 0.3]) for name in ("retract", "insert 2")}
+    | {name: np.array([0.0, 0.9, 0.3]) for name in ("retract 2", "insert 3")},
 )

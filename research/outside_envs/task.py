@@ -1,11 +1,12 @@
 """A task in an environment of another package: the segments of its motion, with and without guidance."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.wrappers import TransformObservation
 
 from guiderail import Demonstrations, Frame, GuidedEnv, LinearConstraints, Segment, cut_demonstrations
 from guiderail.models.primitives.demonstrations import compute_bounds
@@ -74,6 +75,8 @@ class OutsideTask:
         to_action: (env, observation, command, extra) → the environment's own action.
         scripted: (env) → the environment's own action by the scripted policy, which observes the hidden goal.
         schedule: Fixed action of each segment, by name; together the actions search without observations.
+        observed: Indices of the entries that a policy with guidance observes, of the environment's observation followed
+            by phase and command; all if empty.
     """
 
     parts: Mapping[str, Part]
@@ -85,6 +88,7 @@ class OutsideTask:
     to_action: Callable[[Any, Any, np.ndarray, Any], np.ndarray]
     scripted: Callable[[Any], np.ndarray]
     schedule: Mapping[str, np.ndarray] = field(default_factory=dict)
+    observed: Sequence[int] = ()
 
     def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
         """Return the segments, from `count` demonstrations recorded with a seed."""
@@ -118,10 +122,15 @@ class OutsideTask:
         env = self.make_env(seed)
         if guidance == "none":
             return RepeatedAction(env, segments, self.pose)
-        return GuidedEnv(
+        guided = GuidedEnv(
             env, demonstrations=None if isinstance(guidance, Guide) else segments, guidance=guidance,
             pose=self.pose, to_action=self.to_action, period=self.period, action_repeat=ACTION_REPEAT,
         )  # fmt: skip
+        if not self.observed:
+            return guided
+        observed = np.array(self.observed)
+        space = gymnasium.spaces.Box(-np.inf, np.inf, observed.shape, np.float32)
+        return TransformObservation(guided, lambda observation: observation[observed], space)
 
 
 def num_steps(parts: Mapping[str, Part]) -> int:
