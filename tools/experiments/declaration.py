@@ -15,6 +15,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    PrivateAttr,
     ValidationError,
     ValidatorFunctionWrapHandler,
     field_validator,
@@ -183,6 +184,12 @@ class Study(_Strict):
     folder: RunName = "{method}-{seed}"  # folder of a run
     # Modules, files (.py) or task folders that register the task, the learner, …; relative to the working directory.
     imports: tuple[str, ...] = ()
+    _whole: dict[str, Method] = PrivateAttr(default_factory=dict)  # methods of the study of which this is a part
+
+    @property
+    def all_methods(self) -> dict[str, Method]:
+        """Methods, including those that `subset` left out."""
+        return self._whole or self.methods
 
     @property
     def eval_sets(self) -> tuple[EvalSet, ...]:
@@ -233,7 +240,9 @@ class Study(_Strict):
             changed_seeds = self.seeds if seeds is None else _SeedChoice(seeds=tuple(seeds)).seeds
         except ValidationError as error:
             raise InputError(_sentence(error)) from error
-        return self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
+        part = self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
+        part._whole = self.all_methods
+        return part
 
 
 def load_study(file: Path | str) -> Study:

@@ -15,7 +15,7 @@ import socket
 import traceback
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property, partial
 from pathlib import Path
@@ -112,6 +112,25 @@ class Job:
         )
         return RunFolder(self.out / name)
 
+    @cached_property
+    def source(self) -> RunFolder | None:
+        """Run from which training starts (`init_from`); None without one."""
+        path = getattr(self.config(1).learner, "init_from", "") if self.learns else ""
+        return RunFolder(path) if path else None
+
+    @cached_property
+    def source_job(self) -> Job | None:
+        """Job that trains the source, also of a method that the selected part of the study leaves out."""
+        if self.source is None:
+            return None
+        whole = self.study.model_copy(update={"methods": self.study.all_methods})
+        for name, method in whole.methods.items():
+            for seed in dict.fromkeys((self.seed, *(method.seeds or whole.seeds))):
+                job = Job(whole, name, seed, self.out)
+                if job.learns and job.folder.path.resolve() == self.source.path:
+                    return job
+        return None
+
     @property
     def log(self) -> Path:
         """Log file of the workers that ran the job."""
@@ -153,6 +172,37 @@ def check_job(job: Job) -> None:
         job.folder.refuse_existing()
 
 
+def check_source(job: Job, *, is_selected: bool = False) -> str:
+    """Return the state of the run that a job starts from; empty without one, or if only tables are to be read.
+
+    With `is_selected`, the study trains that run before the job, so that it may be unfinished.
+
+    Raises:
+        InputError: If that run is not finished, or is another than when the job's run began.
+    """
+    if job.source is None:
+        return ""
+    stored = job.folder.config().source if (job.folder.path / "config.yaml").exists() else ""
+    name, source = f"{job.method}, seed {job.seed}, starts from the run in {job.source.path}", job.source
+    done = _num_episodes(source)
+    episodes = done if job.source_job is None else job.source_job.after_episodes[-1]
+    state = f"{source.path.name}, {episodes} episodes, "
+    if done == episodes and (source.path / "policy.json").exists():
+        state = source.state
+    elif not (is_selected and done <= episodes):
+        if not any(_needs_training(job, number) for number in job.after_episodes):
+            return ""
+        if done > episodes:
+            raise InputError(f"{name}, which has {done} episodes instead of {episodes}: name another folder with --out")
+        missing = f"has {done} of its {episodes} episodes" if done < episodes else "is missing or not finished"
+        raise InputError(f"{name}, which {missing}: train that run first, with the same --out")
+    if stored and not stored.startswith(state):
+        raise InputError(
+            f"{name}, which is not the one that it was trained from ({stored}): name another folder with --out"
+        )
+    return state
+
+
 def is_done(job: Job) -> bool:
     """Return True if a job is trained and evaluated, so that its rows only have to be read."""
     pairs = itertools.product(job.after_episodes, job.study.eval_sets)
@@ -163,9 +213,9 @@ def is_done(job: Job) -> bool:
 def run_job(job: Job) -> list[dict[str, Any]]:
     """Complete the training and evaluation of a job, and return its rows."""
     import_modules(job.study.imports)
-    rows = []
+    source, rows = check_source(job), []
     for episodes in job.after_episodes:
-        trained = _train(job, episodes).iloc[:episodes]
+        trained = _train(job, episodes, source).iloc[:episodes]
         row = {
             "method": job.method,
             "policy": job.study.methods[job.method].policy,
@@ -188,23 +238,32 @@ def _needs_training(job: Job, episodes: int) -> bool:
     folder = job.folder
     if not job.learns or (job.policy_folder(episodes) / "policy.json").exists():
         return False
-    done = len(folder.episodes()) if (folder.path / "episodes.csv").exists() else 0
+    done = _num_episodes(folder)
     if done != episodes:
         return done < episodes
     return folder.config().episodes != done or not (folder.path / "policy.json").exists()
 
 
-def _train(job: Job, episodes: int) -> pd.DataFrame:
-    """Train the run to at least a number of episodes, copy its policy, and return its episodes."""
+def _num_episodes(folder: RunFolder) -> int:
+    """Return the number of training episodes in a run's table; 0 without one."""
+    return len(folder.episodes()) if (folder.path / "episodes.csv").exists() else 0
+
+
+def _train(job: Job, episodes: int, source: str) -> pd.DataFrame:
+    """Train the run to at least a number of episodes, copy its policy, and return its episodes.
+
+    `source` is the state of the run that a new run starts from; see `check_source`.
+    """
     if not job.learns:
         return pd.DataFrame()
     folder, copy = job.folder, job.policy_folder(episodes)
     if _needs_training(job, episodes):
         from guiderail.tools.learning.trainer import run_training
 
-        config = job.config(episodes)
+        is_resumed = (folder.path / "config.yaml").exists()
+        config = replace(job.config(episodes), source=folder.config().source if is_resumed else source)
         demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
-        run_training(folder, config, resume=(folder.path / "config.yaml").exists(), demonstrator=demonstrator)
+        run_training(folder, config, resume=is_resumed, demonstrator=demonstrator)
     rows = folder.episodes()
     if len(rows) == episodes and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):

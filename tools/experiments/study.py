@@ -10,7 +10,9 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,7 +24,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.metrics import statistics_of, wilson_of_each
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep, source_file
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
-from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, is_done, run_job
+from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, check_source, is_done, run_job
 from guiderail.tools.experiments.progress import StudyProgress
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
@@ -66,7 +68,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataF
     for job in jobs:
         check_job(job)
     _refuse_shared_folders(jobs)
-    outcomes = _run_jobs(jobs, engine or make_engine())
+    outcomes = _run_jobs(jobs, _in_order(jobs), engine or make_engine())
     pairs = [(job, outcomes[index]) for index, job in enumerate(jobs)]
     rows = pd.DataFrame([row for _, outcome in pairs for row in outcome.rows], dtype=object)
     failed = [f"{job.method}, seed {job.seed}, failed: {one.failure}" for job, one in pairs if one.failure]
@@ -186,30 +188,67 @@ def _check_columns(study: Study) -> None:
             raise InputError(f"the study {study.name} has no column {one.of!r}: {did_you_mean(one.of, known)}")
 
 
-def _run_jobs(jobs: list[Job], engine: Engine) -> dict[int, Outcome]:
-    """Return the outcome of each job; the rows of finished jobs are read in this process."""
-    done = {index: job for index, job in enumerate(jobs) if is_done(job)}
-    to_run = {index: job for index, job in enumerate(jobs) if index not in done}
+def _in_order(jobs: list[Job]) -> list[list[int]]:
+    """Return the indices of the jobs in groups: a job is in a later group than the job whose run it starts from.
+
+    Raises:
+        InputError: If jobs start from each other's runs, or a run that a job starts from is missing or another one.
+    """
+    indices = {job.folder.path: index for index, job in enumerate(jobs)}
+    sources = [None if job.source_job is None else indices.get(job.source_job.folder.path) for job in jobs]
+    sorter = TopologicalSorter({index: () if one is None else (one,) for index, one in enumerate(sources)})
+    try:
+        sorter.prepare()
+    except CycleError as error:
+        job = jobs[error.args[1][0]]
+        raise InputError(
+            f"{job.method}, seed {job.seed}, would start from its own run: let init_from name another method's run"
+        ) from None
+    for job, source in zip(jobs, sources, strict=True):
+        check_source(job, is_selected=source is not None)
+    groups = []
+    while sorter.is_active():
+        groups.append(sorted(sorter.get_ready()))
+        sorter.done(*groups[-1])
+    return groups
+
+
+def _run_jobs(jobs: list[Job], groups: list[list[int]], engine: Engine) -> dict[int, Outcome]:
+    """Return the outcome of each job, group by group; the rows of finished jobs are read in this process."""
+    to_run = {index: job for index, job in enumerate(jobs) if not is_done(job)}
     outcomes: dict[int, Outcome] = {}
-    with StudyProgress(to_run, len(jobs)) as progress:
-        for index, job in done.items():
-            try:
-                outcomes[index] = Outcome(tuple(run_job(job)))
-            except InputError as error:
-                outcomes[index] = Outcome(failure=str(error))
-            progress.end(index, job, outcomes[index])
+    failed: dict[Path, str] = {}  # failed jobs by folder
+    work = partial(attempt, work=run_job, versions=installed_versions())
+    with StudyProgress(to_run, len(jobs)) as progress, engine if to_run else nullcontext():
+
+        def end(index: int, outcome: Outcome) -> None:
+            outcomes[index], job = outcome, jobs[index]
+            if outcome.failure:
+                failed[job.folder.path] = f"{job.method}, seed {job.seed}"
+            progress.end(index, job, outcome)
+
         if to_run:
-            work = partial(attempt, work=run_job, versions=installed_versions())
-            with engine:
-                try:
-                    jobs[0].log.parent.mkdir(parents=True, exist_ok=True)
-                except OSError as error:
-                    raise InputError(
-                        f"{jobs[0].out} cannot be written ({error.strerror}): name another folder with --out"
-                    ) from error
-                for index, outcome in engine.run(work, to_run):
-                    outcomes[index] = outcome
-                    progress.end(index, jobs[index], outcome)
+            try:
+                jobs[0].log.parent.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise InputError(
+                    f"{jobs[0].out} cannot be written ({error.strerror}): name another folder with --out"
+                ) from error
+        for group in groups:
+            ready = {}
+            for index in group:
+                job, source = jobs[index], jobs[index].source_job
+                if index not in to_run:
+                    try:
+                        end(index, Outcome(tuple(run_job(job))))
+                    except InputError as error:
+                        end(index, Outcome(failure=str(error)))
+                elif source is not None and source.folder.path in failed:
+                    end(index, Outcome(failure=f"it starts from the run of {failed[source.folder.path]}, which failed"))
+                else:
+                    ready[index] = job
+            for index, outcome in engine.run(work, ready) if ready else ():
+                end(index, outcome)
     return outcomes
 
 

@@ -1,5 +1,6 @@
 """Run folder: the files of one training run, readable without the program that wrote them."""
 
+import hashlib
 import json
 import platform
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,6 +49,7 @@ class RunConfig:
     task_content: str = ""  # digest of the files that define the task; empty if there are none
     human_in_the_loop: bool = False  # True if a supervisor corrects the policy; see the option via_points
     simulated_driver: bool | None = None  # on a hardware station: True for a simulated driver, False for a robot
+    source: str = ""  # in a study, state of the run that `init_from` named when training began; see `RunFolder.state`
 
     @property
     def action_repeat(self) -> int:
@@ -58,7 +60,8 @@ class RunConfig:
     def identity(self) -> str:
         """Text of all that determines an episode; a resumed run may differ in the rest, such as `episodes`."""
         environment = {name: value for name, value in self.environment.items() if name not in CHANGING}
-        return json.dumps([self.task, self.seed, environment, config_values(self.learner)], sort_keys=True)
+        learner = config_values(self.learner) | ({"init_from": self.source} if self.source else {})
+        return json.dumps([self.task, self.seed, environment, learner], sort_keys=True)
 
     def refuse_changed_task(self, path: Path, otherwise: str = "train again in another folder") -> None:
         """Raise an InputError if the task's files have changed since the run in the folder `path` began.
@@ -108,6 +111,12 @@ class RunFolder:
         """Folder of the learning logs, such as those of TensorBoard."""
         return self.path / "logs"
 
+    @property
+    def state(self) -> str:
+        """Name of the folder, number of episodes and digest of the policy, which identify a finished run."""
+        policy = hashlib.blake2b((self.path / "policy.safetensors").read_bytes(), digest_size=8).hexdigest()
+        return f"{self.path.name}, {len(self.episodes())} episodes, policy {policy}"
+
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Lock the run against other processes; the lock of a killed process has no effect.
@@ -150,11 +159,17 @@ class RunFolder:
         refuse_existing_run(self.path)
 
     def refuse_another(self, config: RunConfig) -> None:
-        """Raise an InputError if the folder's run has another task, environment, learner, seed or other task files."""
+        """Raise an InputError if the folder's run has another task, environment, learner, seed or other task files.
+
+        The path in `init_from` may differ if the state of that run is stored, because a study's folder may be moved.
+        """
         stored = self.config()
         stored.refuse_changed_task(self.path)
         # An option that is missing in the stored configuration has its default.
         stored = replace(stored, environment=as_arguments(check_environment(stored.task, stored.environment)))
+        learner: Any = stored.learner
+        if stored.source and (path := getattr(config.learner, "init_from", "")):
+            stored = replace(stored, learner=replace(learner, init_from=path))
         for key in ("task", "environment", "learner", "seed"):
             if getattr(stored, key) != getattr(config, key):
                 raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
@@ -165,6 +180,8 @@ class RunFolder:
         values["imports"] = list(config.imports)
         if config.simulated_driver is None:
             del values["simulated_driver"]
+        if not config.source:
+            del values["source"]
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
     def config(self) -> RunConfig:

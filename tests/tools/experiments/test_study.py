@@ -1,4 +1,5 @@
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -114,6 +115,67 @@ def test_failed_job_is_listed_and_stops_no_other(tmp_path, capsys):
     file_of_episodes.write_bytes(table)
     checkpoint.write_bytes(whole)
     assert without_clock(run(study(), out)) == without_clock(expected)
+
+
+def continued(episodes=4, source="coarse-{seed}"):
+    """Return a study whose method `fine`, declared first, starts from the run of `coarse`."""
+    fine = {"learner": {"settings": {"init_from": source}, "episodes": 2}}
+    methods = {"fine": fine, "coarse": {"learner": {"episodes": episodes}}}
+    return study(methods=methods, seeds=[5], after_episodes=[], eval_set=[{"episodes": 2}])
+
+
+def test_job_starts_when_the_run_it_starts_from_is_finished(tmp_path):
+    run(continued().subset(["coarse"]), tmp_path / "parts")
+    expected = run(continued().subset(["fine"]), tmp_path / "parts")
+    rows = run(continued(), tmp_path / "whole")
+    assert rows["method"].tolist() == ["fine", "coarse"]
+    assert without_clock(rows[:1]) == without_clock(expected)
+    assert RunFolder(tmp_path / "whole" / "fine-5").config().source.startswith("coarse-5, 4 episodes, policy ")
+
+
+def test_study_with_a_source_can_be_moved_and_resumed(tmp_path):
+    run(continued(), tmp_path / "old")
+    (tmp_path / "old").rename(tmp_path / "new")
+    longer = continued().model_dump(exclude={"eval_set"})
+    longer["methods"]["fine"]["learner"]["episodes"] = 3
+    assert run(Study.model_validate(longer), tmp_path / "new")["training_episodes"].tolist() == [3, 4]
+    shutil.rmtree(tmp_path / "new" / "coarse-5")  # only a run that is to be trained needs it
+    assert run(Study.model_validate(longer).subset(["fine"]), tmp_path / "new")["training_episodes"].tolist() == [3]
+
+
+@pytest.mark.parametrize(
+    ("trained", "wanted", "methods", "words"),
+    [
+        (4, continued(6), None, r"is not the one that it was trained from \(coarse-5, 4 episodes, policy"),
+        (None, continued(), ["fine"], "coarse-5, which has 0 of its 4 episodes: train that run first"),
+        (None, continued(source="corase-{seed}"), None, "corase-5, which is missing or not finished"),
+        (None, continued(source="fine-{seed}"), None, "fine, seed 5, would start from its own run"),
+    ],
+)
+def test_study_refuses_a_source_before_anything_runs(trained, wanted, methods, words, tmp_path):
+    if trained:
+        run(continued(trained), tmp_path)
+    before = modification_times(tmp_path)
+    with pytest.raises(InputError, match=words):
+        run(wanted.subset(methods), tmp_path)
+    assert modification_times(tmp_path) == before
+
+
+def test_study_refuses_a_source_that_is_only_partly_trained(tmp_path):
+    run(continued(2).subset(["coarse"]), tmp_path)
+    with pytest.raises(InputError, match="coarse-5, which has 2 of its 4 episodes"):
+        run(continued(4).subset(["fine"]), tmp_path)
+    run(continued(4).subset(["coarse"]), tmp_path)
+    with pytest.raises(InputError, match="coarse-5, which has 4 episodes instead of 2"):
+        run(continued(2), tmp_path)
+
+
+def test_job_fails_when_the_run_it_starts_from_failed(tmp_path):
+    run(continued(2).subset(["coarse"]), tmp_path)
+    (tmp_path / "coarse-5" / "checkpoint" / "state.safetensors").write_bytes(b"")
+    with pytest.raises(RunsFailedError) as failed:
+        run(continued(4), tmp_path)
+    assert failed.value.sentences[0] == "fine, seed 5, failed: it starts from the run of coarse, seed 5, which failed"
 
 
 def test_study_imports_what_registers_its_task(tmp_path):
