@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import re
 import shlex
 from collections.abc import Sequence
 from contextlib import suppress
@@ -300,6 +302,7 @@ def _name_methods(runs: list[Run]) -> None:
     for task in {run.config.task for run in runs}:
         task_runs = [run for run in runs if run.config.task == task]
         settings = [flat(run.config) for run in task_runs]
+        _name_sources(task_runs, settings)
         keys = list(dict.fromkeys(key for one in settings for key in one))
         differing = [key for key in keys if len({repr(one.get(key)) for one in settings}) > 1]
         # Options that come with a guidance or an algorithm are implied by its name.
@@ -311,6 +314,20 @@ def _name_methods(runs: list[Run]) -> None:
             kind = str(one.get("guidance", ""))
             words = [label(kind) if key == "guidance" else _format_setting(key, one.get(key)) for key in chosen]
             run.method = ", ".join(words) or (label(kind) if kind else run.config.task)
+
+
+def _name_sources(runs: Sequence[Run], settings: Sequence[dict[str, Any]]) -> None:
+    """Replace `init_from` by a path relative to the run's folder, with {seed} in place of the run's own seed."""
+    paths = {
+        number: os.path.relpath(one["init_from"], run.path.resolve().parent)
+        for number, (run, one) in enumerate(zip(runs, settings, strict=True))
+        if one.get("init_from")
+    }
+    for number, path in paths.items():
+        seed = runs[number].config.seed
+        if {runs[other].config.seed for other, same in paths.items() if same == path} == {seed}:
+            path = re.sub(rf"(?<!\d){seed}(?!\d)", "{seed}", path)
+        settings[number]["init_from"] = path
 
 
 def _format_setting(key: str, value: Any) -> str:

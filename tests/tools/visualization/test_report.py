@@ -302,3 +302,12 @@ def test_violation_that_is_not_a_number_is_shown_in_any_order(values):
     ]
     (row,) = _safety({"kgrl": runs}).rows
     assert "not finite" in [cell.text for cell in row.cells]
+
+
+def test_seeds_with_runs_of_their_own_to_start_from_are_one_method(studied, tmp_path):
+    for seed, source in ((1, "coarse-1"), (2, "coarse-2"), (1, "other"), (2, "other")):
+        run = shutil.copytree(studied / f"skgrl-{seed}", tmp_path / f"{source.partition('-')[0]}-fine-{seed}")
+        config = RunFolder(run).config()
+        RunFolder(run).write_config(replace(config, learner=replace(config.learner, init_from=str(tmp_path / source))))
+    methods = [run.method for run in gather([tmp_path]).runs]
+    assert methods == ["init from coarse-{seed}"] * 2 + ["init from other"] * 2
