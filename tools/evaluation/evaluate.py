@@ -27,6 +27,7 @@ from guiderail.tools.evaluation.evaluation import (
     Evaluation,
     compare,
     episodes_file,
+    has_rows,
     load_or_compute,
     statistics,
 )
@@ -187,7 +188,8 @@ def evaluate_once(
     if folder is None:
         rows = compute()
     else:
-        rows = load_or_compute(episodes_file(folder, name, config, environment, about=about, **how), compute)
+        file = episodes_file(folder, name, config, environment, about=about, **how)
+        rows = load_or_compute(file, compute, how.get("episodes"))
     return rows if len(rows) else None
 
 
@@ -292,7 +294,9 @@ def evaluate(
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {name: _episodes_file(subject, name, where, how, functions.get(name)) for name in (POLICY, *others)}
-        stored = {name: read_table(file) for name in others if (file := files[name]) is not None and file.exists()}
+        stored = {
+            name: read_table(file) for name in others if (file := files[name]) is not None and has_rows(file, episodes)
+        }
         missing = {name: make for name, make in others.items() if name not in stored}
         skipped = [name for name, make in missing.items() if not is_compatible(make, evaluation_env)]
         policies = {POLICY: subject.make_policy(evaluation_env)}

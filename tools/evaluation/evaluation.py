@@ -28,18 +28,25 @@ MAX_NAME_BYTES = 200  # largest size of the name of a policy in a file's name, o
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' evaluated episodes, in the run's folder
 
 
-def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame]) -> pd.DataFrame:
+def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: int | None = None) -> pd.DataFrame:
     """Return the rows of a file; if it does not exist, compute and write them. An empty table is not written.
+
+    Rows are also computed again if the file does not have one for each of `episodes`.
 
     Raises:
         InputError: If the file is damaged or cannot be written.
     """
-    if not file.exists():
+    if not has_rows(file, episodes):
         rows = compute()
         if not len(rows):
             return rows
         write_atomically(file, table_text(rows).encode())
     return read_table(file)
+
+
+def has_rows(file: Path, episodes: int | None = None) -> bool:
+    """Return True if a table exists and has a row for each of `episodes`; raise an InputError if it is damaged."""
+    return file.exists() and (episodes is None or len(read_table(file)) == episodes)
 
 
 def episodes_file(

@@ -30,7 +30,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_run
-from guiderail.tools.evaluation.evaluation import load_or_compute
+from guiderail.tools.evaluation.evaluation import has_rows, load_or_compute
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
@@ -166,7 +166,7 @@ def check_job(job: Job) -> None:
     if (job.folder.path / "config.yaml").exists():
         job.folder.refuse_another(config)
         for episodes in job.after_episodes:
-            if not all(_evaluated_file(job, episodes, eval_set)[0].exists() for eval_set in job.study.eval_sets):
+            if not all(_is_evaluated(job, episodes, eval_set) for eval_set in job.study.eval_sets):
                 _refuse_lost_policy(job, episodes)
     elif job.learns:
         job.folder.refuse_existing()
@@ -206,7 +206,7 @@ def check_source(job: Job, *, is_selected: bool = False) -> str:
 def is_done(job: Job) -> bool:
     """Return True if a job is trained and evaluated, so that its rows only have to be read."""
     pairs = itertools.product(job.after_episodes, job.study.eval_sets)
-    is_evaluated = all(_evaluated_file(job, *pair)[0].exists() for pair in pairs)
+    is_evaluated = all(_is_evaluated(job, *pair) for pair in pairs)
     return is_evaluated and not any(_needs_training(job, episodes) for episodes in job.after_episodes)
 
 
@@ -313,7 +313,7 @@ def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFram
             write_atomically(_digest_file(file), content.encode())
         return rows
 
-    return load_or_compute(file, evaluate)
+    return load_or_compute(file, evaluate, eval_set.episodes)
 
 
 def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> tuple[Path, str]:
@@ -322,6 +322,15 @@ def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> tuple[Path, s
     values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
     content = digest(job, eval_set, episodes)
     return job.folder.path / eval_set.file.format(**values, digest=content), content
+
+
+def _is_evaluated(job: Job, episodes: int, eval_set: EvalSet) -> bool:
+    """Return True if all episodes of an evaluation set are stored; a damaged table is refused when it is read."""
+    file = _evaluated_file(job, episodes, eval_set)[0]
+    try:
+        return has_rows(file, eval_set.episodes)
+    except InputError:
+        return True
 
 
 def _digest_file(file: Path) -> Path:

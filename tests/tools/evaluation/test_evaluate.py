@@ -17,6 +17,7 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random,
 from guiderail.tools.evaluation.evaluate import (
     _save_demonstrations,
     evaluate,
+    evaluate_once,
     evaluate_policy,
 )
 from guiderail.tools.evaluation.evaluation import COMPARED, Evaluation, compare, load_or_compute, stored_episodes
@@ -91,6 +92,26 @@ def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
     elsewhere = evaluate(Run(bead_run), episodes=3, environment={"wall": -0.5})
     assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
     assert elsewhere["mean_return"] != result["mean_return"]
+
+
+def test_stored_episodes_that_lost_rows_are_evaluated_again(bead_run):
+    others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
+    first = evaluate(bead_run, episodes=3, baselines=others)
+    files = [*(bead_run / "baselines").glob("*.csv")]
+    whole = [file.read_bytes() for file in files]
+    for file in files:
+        file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
+    assert evaluate(bead_run, episodes=3, baselines=others).statistics == first.statistics
+    assert [file.read_bytes() for file in files] == whole
+
+
+def test_evaluate_once_evaluates_a_table_that_lost_rows_again(bead_config, tmp_path):
+    how = {"about": None, "episodes": 3, "seed": 5}
+    first = evaluate_once(tmp_path, "zero", bead_config, zero_policy, bead_config.environment, **how)
+    (file,) = tmp_path.glob("*.csv")
+    file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
+    again = evaluate_once(tmp_path, "zero", bead_config, zero_policy, bead_config.environment, **how)
+    pd.testing.assert_frame_equal(again, first)
 
 
 def test_baselines_are_evaluated_once(bead_run, capsys):

@@ -209,6 +209,20 @@ def test_earlier_policy_can_be_evaluated_later(tmp_path):
         run(study(eval_set=[{"episodes": 4}]), tmp_path)
 
 
+def without_last_row(file):
+    file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
+
+
+def test_evaluated_episodes_that_were_lost_are_evaluated_again(tmp_path):
+    one = study(after_episodes=[2], seeds=[5])
+    expected = run(one, tmp_path)
+    (table,) = (tmp_path / "learner-5").glob("held_out-2-*.csv")
+    whole = table.read_bytes()
+    without_last_row(table)
+    assert without_clock(run(one, tmp_path)) == without_clock(expected)
+    assert table.read_bytes() == whole
+
+
 def test_evaluated_episodes_of_other_settings_are_not_used(tmp_path):
     methods = {"nothing": {"policy": "zero"}}
     near, far = (
