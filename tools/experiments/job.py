@@ -236,9 +236,11 @@ def run_job(job: Job) -> list[dict[str, Any]]:
 def _needs_training(job: Job, episodes: int) -> bool:
     """Return True if training must run to reach a number of episodes, or to write the policy after that number."""
     folder = job.folder
-    if not job.learns or (job.policy_folder(episodes) / "policy.json").exists():
+    if not job.learns:
         return False
     done = _num_episodes(folder)
+    if (job.policy_folder(episodes) / "policy.json").exists():  # training only restores rows that the table lost
+        return done < episodes <= folder.num_saved_episodes()
     if done != episodes:
         return done < episodes
     return folder.config().episodes != done or not (folder.path / "policy.json").exists()
@@ -261,10 +263,16 @@ def _train(job: Job, episodes: int, source: str) -> pd.DataFrame:
         from guiderail.tools.learning.trainer import run_training
 
         is_resumed = (folder.path / "config.yaml").exists()
-        config = replace(job.config(episodes), source=folder.config().source if is_resumed else source)
+        config = job.config(max(episodes, folder.num_saved_episodes()))
+        config = replace(config, source=folder.config().source if is_resumed else source)
         demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
         run_training(folder, config, resume=is_resumed, demonstrator=demonstrator)
     rows = folder.episodes()
+    if len(rows) < episodes:
+        raise InputError(
+            f"{folder.path / 'episodes.csv'} has {len(rows)} of {episodes} episodes: restore it, or name another "
+            "folder with --out"
+        )
     if len(rows) == episodes and not (copy / "policy.json").exists():
         for name in ("policy.safetensors", "policy.json"):
             write_atomically(copy / name, (folder.path / name).read_bytes())

@@ -16,6 +16,7 @@ import pandas as pd
 import yaml
 from pydantic import ConfigDict, Field, SkipValidation
 from pydantic.dataclasses import dataclass
+from safetensors import SafetensorError, safe_open
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
@@ -220,6 +221,18 @@ class RunFolder:
     def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replace `episodes.csv`; reading a number gives the same number, bit for bit."""
         write_atomically(self.path / "episodes.csv", table_text(rows).encode())
+
+    def num_saved_episodes(self) -> int:
+        """Return the number of episodes in the checkpoint, 0 without one; raise an InputError if it is damaged."""
+        if not self.checkpoint.is_file():
+            return 0
+        try:
+            with safe_open(self.checkpoint, framework="numpy") as file:
+                return len(json.loads(file.metadata()["values"])["rows"])
+        except (SafetensorError, ValueError, KeyError, TypeError, OSError, RecursionError) as error:
+            raise InputError(
+                f"the checkpoint {self.checkpoint} is damaged: restore a copy, or train again in another folder"
+            ) from error
 
     def episodes(self) -> pd.DataFrame:
         """Read `episodes.csv`; raise an InputError if it is missing or not a table of episodes."""

@@ -309,7 +309,7 @@ def resumed_config(
         environment = {key: resolved.get(key, value) for key, value in environment.items()}
     arguments = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in arguments.items():
-        if key == "episodes" and value < config.episodes and value < (done := _count_episodes(folder)):
+        if key == "episodes" and value < config.episodes and value < (done := folder.num_saved_episodes()):
             raise InputError(f"the run in {folder.path} has done {done} episodes: give at least as many")
         if key != "episodes" and stored.get(key) != value:
             raise InputError(
@@ -324,13 +324,6 @@ def resumed_config(
         )
     episodes = check_episodes(given.get("episodes", config.episodes))
     return replace(config, episodes=episodes, versions=_merged_versions(folder, config))
-
-
-def _count_episodes(folder: RunFolder) -> int:
-    """Return the number of episodes in a run's checkpoint."""
-    from guiderail.tools.learning.checkpoint import load_checkpoint  # imports PyTorch: slow
-
-    return len(load_checkpoint(folder.checkpoint)[1].get("rows", ())) if folder.checkpoint.exists() else 0
 
 
 def _merged_versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:

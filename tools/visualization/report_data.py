@@ -188,8 +188,17 @@ def _folder_names(runs: Sequence[Run]) -> list[str]:
 
 
 def _episodes(folder: RunFolder) -> pd.DataFrame:
-    """Return the training episodes of a run, empty without a table; raise an InputError if a column is missing."""
-    rows = folder.episodes() if (folder.path / "episodes.csv").is_file() else pd.DataFrame()
+    """Return the training episodes of a run, empty without a table.
+
+    Raises:
+        InputError: If a column is missing, or the table of a finished run lost rows.
+    """
+    table = folder.path / "episodes.csv"
+    rows = folder.episodes() if table.is_file() else pd.DataFrame()
+    if (folder.path / "policy.json").exists() and len(rows) < (saved := folder.num_saved_episodes()):
+        raise InputError(
+            f"{table} has {len(rows)} of the {saved} episodes of its checkpoint: resume the run, which writes it again"
+        )
     if len(rows) and (missing := [name for name in REQUIRED_COLUMNS if name not in rows]):
         raise InputError(f"{folder.path} is of another version: its episodes have no {missing[0]}; train again")
     return rows

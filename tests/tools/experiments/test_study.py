@@ -223,6 +223,22 @@ def test_evaluated_episodes_that_were_lost_are_evaluated_again(tmp_path):
     assert table.read_bytes() == whole
 
 
+def test_training_episodes_that_were_lost_are_restored(tmp_path):
+    one, folder = study(seeds=[5]), RunFolder(tmp_path / "learner-5")
+    expected, config = run(one, tmp_path), folder.config()
+    table = folder.path / "episodes.csv"
+    whole = table.read_bytes()
+    for _ in range(3):
+        without_last_row(table)
+    assert without_clock(run(one, tmp_path)) == without_clock(expected)
+    assert (table.read_bytes(), folder.config()) == (whole, config)
+    without_last_row(table)
+    folder.checkpoint.unlink()
+    with pytest.raises(RunsFailedError) as failed:
+        run(one, tmp_path)
+    assert f"{table} has 3 of 4 episodes: restore it" in failed.value.sentences[0]
+
+
 def test_evaluated_episodes_of_other_settings_are_not_used(tmp_path):
     methods = {"nothing": {"policy": "zero"}}
     near, far = (

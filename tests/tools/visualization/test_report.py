@@ -311,3 +311,10 @@ def test_seeds_with_runs_of_their_own_to_start_from_are_one_method(studied, tmp_
         RunFolder(run).write_config(replace(config, learner=replace(config.learner, init_from=str(tmp_path / source))))
     methods = [run.method for run in gather([tmp_path]).runs]
     assert methods == ["init from coarse-{seed}"] * 2 + ["init from other"] * 2
+
+
+def test_report_refuses_a_table_that_lost_rows(studied, tmp_path):
+    table = shutil.copytree(studied / "skgrl-1", tmp_path / "run") / "episodes.csv"
+    table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
+    with pytest.raises(InputError, match=f"{table} has 2 of the 3 episodes of its checkpoint: resume the run"):
+        gather([tmp_path])
