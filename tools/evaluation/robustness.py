@@ -144,7 +144,7 @@ class Point:
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
     """Return the points of `axes` that an environment supports, and sentences about the points that are left out.
 
-    There is one sentence for each axis and reason.
+    There is one sentence for each axis and reason. An axis whose points with a disturbance are all left out has none.
 
     Raises:
         InputError: If the environment itself is invalid.
@@ -154,6 +154,7 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
     for axis in axes:
         trained = axis.default if _is_default(axis, resolved) else None
         reasons: dict[str, list[str]] = {}
+        of_axis = []
         for value in axis.values:
             try:
                 changes = {} if value == trained else axis.change(resolved, value)
@@ -162,9 +163,13 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                 check_environment(task, {**resolved, **changes})
                 changed = {**environment, **changes}
                 options = {"new_run": True} if axis.resamples and hides(task, {**resolved, **changed}) else {}
-                result.append(Point(axis, value, changed, trained, options))
+                of_axis.append(Point(axis, value, changed, trained, options))
             except InputError as error:
                 reasons.setdefault(str(error).partition(": choose one of")[0], []).append(f"{value:g}")
+        if reasons and of_axis and all(point.value == axis.default for point in of_axis):
+            next(iter(reasons.values())).insert(0, f"{axis.default:g}")
+            of_axis = []
+        result += of_axis
         left_out += [f"{axis.name} {', '.join(values)} left out: {reason}" for reason, values in reasons.items()]
     return result, left_out
 

@@ -170,8 +170,18 @@ def test_points_cover_every_value_or_state_why_not(task):
             assert at[axis.default] == arguments
         assert all(at[value] != arguments for value in at if value != axis.default)
     names = {sentence.split()[0] for sentence in left_out}
+    assert names.isdisjoint({point.axis.name for point in result} - {"clearance"})
     assert names <= {"payload", "clearance", "offsets"}
     assert all(": " in sentence for sentence in left_out)
+
+
+def test_axis_without_a_disturbed_point_is_left_out(tmp_path):
+    result, left_out = points("NarrowPassage", {}, select_axes("late,lost"))
+    assert result == []
+    assert left_out[0].startswith("late 0, 1, 2, 5, 10 left out: NarrowPassage has no option 'late_commands'")
+    with pytest.raises(InputError, match="the environment has none of these axes"):
+        robustness(["zero"], task="NarrowPassage", axes="late", out=tmp_path / "late")
+    assert not (tmp_path / "late").exists()
 
 
 def test_points_replace_a_range_by_each_value():
