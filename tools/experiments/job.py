@@ -404,10 +404,13 @@ def _best_constant(job: Job) -> np.ndarray:
     return load_or_compute(file, compare).iloc[0].filter(like="action_").to_numpy(float)
 
 
-def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: Mapping[str, str]) -> Outcome:
+def attempt(
+    job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: Mapping[str, str], call: str
+) -> Outcome:
     """Run `work` on a job and log the attempt; return its rows, or one sentence on its failure, and raise nothing.
 
-    A worker with other package versions than `versions` is refused, because results depend on them.
+    A worker with other package versions than `versions` is refused, because results depend on them. `call` identifies
+    the call of `run_study` in the log.
     """
     host = socket.gethostname()
     if not job.log.parent.is_dir():
@@ -419,7 +422,7 @@ def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: 
                 failure=f"{host} has {name} {installed.get(name)} instead of {version}: install the same versions "
                 "everywhere, because results depend on them"
             )
-    _append(job, f"{BEGIN}{host}, process {os.getpid()}\n")
+    _append(job, f" attempt of study call {call}{BEGIN}{host}, process {os.getpid()}\n")
     try:
         rows = work(job)
     except InputError as error:
@@ -433,10 +436,10 @@ def attempt(job: Job, *, work: Callable[[Job], list[dict[str, Any]]], versions: 
     return Outcome(tuple(rows))
 
 
-def count_attempts(log: Path, start: int = 0) -> int:
-    """Return the number of workers that started a job, counted from byte `start` of its log; 0 while it waits."""
+def count_attempts(log: Path, call: str) -> int:
+    """Return the number of workers that started a job in the call `call` of a study; 0 while it waits."""
     try:
-        return log.read_bytes()[start:].count(BEGIN.encode())
+        return log.read_bytes().count(f"{call}{BEGIN}".encode())
     except FileNotFoundError:
         return 0
 

@@ -26,19 +26,18 @@ class StudyProgress:
     engines need not report it. Use it as a context manager.
     """
 
-    def __init__(self, jobs: Mapping[int, Any], total: int, console: Console | None = None):
+    def __init__(self, jobs: Mapping[int, Any], total: int, call: str, console: Console | None = None):
         """Construct the display.
 
         Args:
             jobs: Jobs to run, by key.
             total: Number of jobs of the study, including those that are done.
+            call: Text that identifies this study's attempts in the logs, which other processes may write too.
             console: Console; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
-        self._open = {
-            key: (job, job.folder.path / "episodes.csv", job.log.stat().st_size if job.log.exists() else 0)
-            for key, job in jobs.items()
-        }
+        self._call = call
+        self._open = {key: (job, job.folder.path / "episodes.csv") for key, job in jobs.items()}
         self._total, self._num_ended, self._num_failed = total, 0, 0
         terminal = self._console.is_terminal
         self._period = TERMINAL_PERIOD if terminal else LOG_PERIOD
@@ -60,7 +59,7 @@ class StudyProgress:
 
     def end(self, key: int, job: Any, outcome: Outcome) -> None:
         """Print the outcome of a job."""
-        attempts = count_attempts(job.log, self._open[key][2]) if key in self._open else 0
+        attempts = count_attempts(job.log, self._call) if key in self._open else 0
         self._open = {other: one for other, one in self._open.items() if other != key}  # copy: _watch may be iterating
         self._num_ended += 1
         self._num_failed += bool(outcome.failure)
@@ -83,8 +82,8 @@ class StudyProgress:
     def _running(self) -> list[tuple[str, str]]:
         """Return the name and the state of each running job."""
         running = []
-        for job, table, log_size in self._open.values():
-            attempts = count_attempts(job.log, log_size)
+        for job, table in self._open.values():
+            attempts = count_attempts(job.log, self._call)
             if not attempts:
                 continue
             done, episodes = 0, job.after_episodes[-1]

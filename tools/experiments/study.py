@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import secrets
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
@@ -218,8 +219,9 @@ def _run_jobs(jobs: list[Job], groups: list[list[int]], engine: Engine) -> dict[
     to_run = {index: job for index, job in enumerate(jobs) if not is_done(job)}
     outcomes: dict[int, Outcome] = {}
     failed: dict[Path, str] = {}  # failed jobs by folder
-    work = partial(attempt, work=run_job, versions=installed_versions())
-    with StudyProgress(to_run, len(jobs)) as progress, engine if to_run else nullcontext():
+    call = secrets.token_hex(4)
+    work = partial(attempt, work=run_job, versions=installed_versions(), call=call)
+    with StudyProgress(to_run, len(jobs), call) as progress, engine if to_run else nullcontext():
 
         def end(index: int, outcome: Outcome) -> None:
             outcomes[index], job = outcome, jobs[index]

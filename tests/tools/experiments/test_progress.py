@@ -14,18 +14,18 @@ def job(folder: Path, seed: int):
     return SimpleNamespace(method="kgrl", seed=seed, after_episodes=[2, 4], folder=run, log=folder / f"{seed}.txt")
 
 
-def begin(one, episodes, workers=1):
+def begin(one, episodes, workers=1, call="now"):
     with one.log.open("a") as log:
-        log.write("2026-01-01 begins on here, process 1\n" * workers)
+        log.write(f"2026-01-01 attempt of study call {call} begins on here, process 1\n" * workers)
     if episodes:
         (one.folder.path / "episodes.csv").write_text("episode\n" + "0\n" * episodes)
 
 
 def test_progress_shows_running_and_ended_jobs(tmp_path):
     jobs = {n: job(tmp_path, n) for n in range(5)}
-    begin(jobs[4], 4)  # in an earlier study: it waits
+    begin(jobs[4], 4, call="before")  # in an earlier study: it waits
     console = Console(file=io.StringIO(), force_terminal=True, width=120)
-    board = StudyProgress(jobs, 6, console)
+    board = StudyProgress(jobs, 6, "now", console)
     with board:
         begin(jobs[0], 3)
         begin(jobs[1], 4, workers=2)
@@ -45,7 +45,8 @@ def test_progress_shows_running_and_ended_jobs(tmp_path):
 
 def test_progress_prints_a_line_per_ended_job_in_a_file(tmp_path):
     one, console = job(tmp_path, 0), Console(file=io.StringIO())
-    with StudyProgress({0: one}, 1, console) as board:
+    with StudyProgress({0: one}, 1, "now", console) as board:
         begin(one, 4, workers=2)
+        begin(one, 0, call="other")  # by another process, which the lock of the run refuses
         board.end(0, one, Outcome(({"eval_set": "held out", "success_rate": 0.5},)))
     assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2, those before it were lost)\n"
