@@ -93,7 +93,7 @@ class OffPolicyConfig(LearnerConfig):
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
-    init_from: Folder = ""  # run from whose networks, optimizers and replay buffer learning starts
+    init_from: Folder = ""  # run whose networks, optimizers, replay buffer and number of episodes learning starts from
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
