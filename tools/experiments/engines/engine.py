@@ -43,6 +43,8 @@ class Engine(AbstractContextManager[Any]):
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
         """Yield keys and outcomes of the jobs as they finish, in any order.
 
+        It is called again for jobs that start from the runs of earlier ones.
+
         Args:
             work: Function from a job to its outcome; it can be pickled and raises nothing.
             jobs: Jobs by key; they can be pickled.
