@@ -259,7 +259,7 @@ def validate_options(model: type[Model], values: Mapping[str, Any], context: str
     try:
         return model(**values)
     except ValidationError as error:
-        raise InputError(_format_error(model, error.errors()[0], values)) from None
+        raise InputError(_format_error(model, error.errors()[0], values, context)) from None
 
 
 def check_choice(name: str, value: Any, choices: list[str], context: str) -> str:
@@ -295,12 +295,18 @@ _NUMBER_ERRORS = dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "w
 _NUMBER_ERRORS |= dict.fromkeys(("float_type", "float_parsing"), "number")
 
 
-def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any]) -> str:
+def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any], subject: str) -> str:
     """Return pydantic's error as a sentence that names the option and the remedy."""
-    name = str(error["loc"][0])
-    value, kind, context = values.get(name), error["type"], error.get("ctx", {})
+    kind, context = error["type"], error.get("ctx", {})
     if isinstance(context.get("error"), InputError):
         return str(context["error"])
+    name, field, value = _locate(model, error["loc"], values)
+    name = name or subject
+    if kind == "missing":
+        return f"{name} is missing: give it"
+    if kind == "extra_forbidden":
+        known = model.model_fields if field is None else _models_of(field)[0].model_fields
+        return f"{name} has no option {brief(error['loc'][-1])}: {did_you_mean(error['loc'][-1], known)}"
     if kind == "literal_error":
         choices = [word.strip().strip("'") for word in context["expected"].replace(" or ", ", ").split(",")]
         return f"there is no {name} {brief(value)}: {did_you_mean(value, choices)}"
@@ -309,14 +315,41 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any])
     if kind in bounds:
         (bound,) = context.values()
         return f"{name} must be {bounds[kind]} {bound:g}, not {brief(value)}"
-    if kind in ("tuple_type", "too_short", "too_long", *_NUMBER_ERRORS) and (
-        example := _example(model.model_fields[name])
-    ):
+    examples = ("tuple_type", "too_short", "too_long", *_NUMBER_ERRORS)
+    if field is not None and kind in examples and (example := _example(field)):
         return f"{name} must be {example}, not {brief(value)}"
     if kind in _NUMBER_ERRORS:
         return f"{name} must be a {_NUMBER_ERRORS[kind]}, not {brief(value)}"
     message = str(error["msg"]).removeprefix("Value error, ")
     return f"{name} cannot be {brief(value)}: {message[:1].lower()}{message[1:]}"
+
+
+def _locate(
+    model: type[BaseModel], location: tuple[int | str, ...], values: Mapping[str, Any]
+) -> tuple[str, FieldInfo | None, Any]:
+    """Return the path, field and value of the innermost option at pydantic's location of an error, as motion.push.
+
+    An entry of a list of options is part of the path, as in plug.pieces[0].friction, but not one of numbers. If the
+    error is that of the whole model, the path is empty and the field None.
+    """
+    name, field, value = "", None, values
+    models = [model]
+    for part in location:
+        if isinstance(part, int) and models:
+            name, value = f"{name}[{part}]", value[part]
+        elif models and part in models[0].model_fields:
+            field = models[0].model_fields[str(part)]
+            value = value.get(part) if isinstance(value, Mapping) else getattr(value, str(part), None)
+            name, models = f"{name}.{part}" if name else str(part), _models_of(field)
+        else:
+            break
+    return name, field, value
+
+
+def _models_of(field: FieldInfo) -> list[type[BaseModel]]:
+    """Return the option models that a field or its entries have; empty for any other field."""
+    annotations = (field.annotation, *get_args(field.annotation))
+    return [one for one in annotations if isinstance(one, type) and issubclass(one, BaseModel)]
 
 
 def _example(field: FieldInfo) -> str:
