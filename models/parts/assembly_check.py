@@ -18,6 +18,7 @@ from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, sample_
 MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
 MAX_FLANK_SLOPE = 0.98  # the same for the flank of a thread
 MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
+_ROUNDING = 1e-6  # rounding of lengths in mesh files [m]
 _SAMPLES = 12000  # number of points sampled on the walls of a part
 _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a rounding error [m²]
 
@@ -94,20 +95,20 @@ def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, a
     """Return the motion of a plug from `clear` [m] above the socket, with a `turn` [rad] and `advance` [m] at the end.
 
     Raises:
-        InputError: If the plug at its target reaches less than 0.5 mm into the socket, or less than `TOUCH` deeper than
+        InputError: If the plug at its target reaches at most `TOUCH` into the socket, or at most `TOUCH` deeper than
             the advance.
     """
     rim = float(socket.bounds[1, 2] - plug.bounds[0, 2])
-    if rim < 5e-4:
+    if rim <= TOUCH + _ROUNDING:
         raise InputError(
             f"the plug ends {1e3 * abs(rim):.1f} mm {'above' if rim < 0.0 else 'inside'} the socket at the target and "
             "is not inserted: draw them assembled, place the plug with --plug-pose, or give the direction in which it "
-            "comes out with --axis"
+            f"comes out with --axis; it must enter more than {1e3 * TOUCH:g} mm"
         )
-    if advance and advance > rim - TOUCH:
+    if advance and advance >= rim - TOUCH - _ROUNDING:
         raise InputError(
             f"the plug advances by {1e3 * advance:.3g} mm during --turn, but enters only {1e3 * rim:.3g} mm: it must "
-            f"enter {1e3 * TOUCH:g} mm more than it advances; give a smaller --turn or --pitch"
+            f"enter more than {1e3 * TOUCH:g} mm more than it advances; give a smaller --turn or --pitch"
         )
     return InsertionMotion(travel=rim + clear, rim=rim, turn=turn, advance=advance)
 
