@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.tasks.part.file import Bounds, read_task_file, write_task_file
+from guiderail.diagrams.tasks.part.file import PartTaskFile, read_task_file, write_task_file
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import visible_files
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
@@ -68,8 +68,7 @@ def fit_bounds(
     # The new task file is validated before anything is written, and written last, after the other files succeeded.
     task_file = None
     if task is not None:
-        task_file = read_task_file(task)
-        task_file = task_file.model_copy(update={"bounds": validate_options(Bounds, values, str(task))})
+        task_file = validate_options(PartTaskFile, {**dict(read_task_file(task)), "bounds": values}, str(task))
     if draw is not None:
         _draw(bounds, demonstrations, draw)
     if out is not None:

@@ -6,11 +6,11 @@ import hashlib
 import re
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 import yaml
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.options import ContactOptions
@@ -51,6 +51,10 @@ AUTOMATE: dict[str, Any] = {
 }
 """Options of difficulty="automate": AutoMate's uncertainty, ±2 mm along x and y and ±5° about the axis."""
 _LARGEST = float(np.finfo(float).max)
+MAX_CLEARANCE = 500.0  # largest measured clearance [mm], the largest size of a part
+# Largest bound of a command [m], [rad]: larger ones are probably in millimeters or degrees. A command may approach from
+# the side, start at the largest `travel`, and turn by 180° and a `search_turn`.
+MAX_BOUND = np.array([0.1, 0.1, 0.6, 4.0, 1.0, 1.0])
 
 
 class Piece(Options):
@@ -87,7 +91,7 @@ class MotionNumbers(Options):
     """Motion of the plug along z of the target frame."""
 
     travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
-    rim: Number = Field(gt=0, le=0.5, description="height at which the plug stands on the rim [m]")
+    rim: Number = Field(gt=TOUCH, le=0.5, description="height at which the plug stands on the rim [m]")
     turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
     advance: Number = Field(0.0, ge=0, le=0.5, description="height lost during the turn, as by a screw [m]")
     search_turn: Number = Field(
@@ -111,8 +115,8 @@ class MotionNumbers(Options):
     @field_validator("advance")
     @classmethod
     def _is_within_the_socket(cls, value: float, info: ValidationInfo) -> float:
-        if value and value > info.data.get("rim", np.inf) - TOUCH:
-            raise ValueError(f"the advance must be at least {TOUCH:g} m less than rim")
+        if value and value >= info.data.get("rim", np.inf) - TOUCH:
+            raise ValueError(f"the advance must be more than {TOUCH:g} m less than rim")
         return value
 
     def plan_straight_insertion(self) -> tuple[np.ndarray, np.ndarray]:
@@ -128,8 +132,8 @@ class Tolerance(Options):
     """Largest deviation of the plug from the target at success."""
 
     height: Number = Field(0.5 * MM, gt=0, description="along z [m]")
-    lateral: Number = Field(1.0 * MM, gt=0, description="across z [m]")
-    turn: Number = Field(4.0, gt=0, description="about z [degrees]")
+    lateral: Number = Field(1.0 * MM, gt=0, le=10.0 * MM, description="across z [m]")
+    turn: Number = Field(4.0, gt=0, le=180, description="about z [degrees]")
     steps: int = Field(3, ge=1, description="consecutive steps that count as success, at the default control period")
 
     def accepts(self, plug: np.ndarray) -> bool:
@@ -152,7 +156,6 @@ class Bounds(Options):
     phases: tuple[Number, ...] | None = Field(
         None,
         min_length=1,
-        validate_default=True,
         description="fraction of the motion from which each list applies; the first is 0",
     )
 
@@ -162,14 +165,16 @@ class Bounds(Options):
         rows = value if value and isinstance(value[0], list | tuple) else (value,)
         if not all(_is_row(row) for row in rows):
             raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null for an absent bound")
+        if (np.abs(_filled(rows, 0.0)) > MAX_BOUND).any():
+            raise ValueError(
+                f"bounds are in meters and radians, at most {MAX_BOUND[0]:g} m for x and y, {MAX_BOUND[2]:g} m for z, "
+                f"{MAX_BOUND[3]:g} rad for Rz and {MAX_BOUND[4]:g} rad for Ry and Rx"
+            )
         return value
 
-    @field_validator("phases")
-    @classmethod
-    def _fit(cls, phases: tuple[float, ...] | None, info: ValidationInfo) -> tuple[float, ...] | None:
-        if not {"lower", "upper"} <= info.data.keys():
-            return phases  # the errors of `lower` and `upper` are reported instead
-        lower, upper = _filled(info.data["lower"], -np.inf), _filled(info.data["upper"], np.inf)
+    @model_validator(mode="after")
+    def _fit(self) -> Self:
+        (lower, upper), phases = self.arrays(), self.phases
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("without phases, lower and upper are one list each; with phases, one list for each phase")
         if (lower > upper).any():
@@ -179,11 +184,16 @@ class Bounds(Options):
         for bound in (np.isfinite(lower), np.isfinite(upper)):
             if phases is not None and (bound.any(axis=0) != bound.all(axis=0)).any():
                 raise ValueError("an output is bounded in every phase or in none")
-        return phases
+        return self
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray]:
         """Return lower and upper bounds, (6,) or one row for each phase (K, 6); an absent bound is infinite."""
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
+
+    def nearest(self, pose: np.ndarray, phase: int) -> np.ndarray:
+        """Return the pose (6,) within the bounds of a phase, 0 or -1 for the last, that is nearest to a pose (6,)."""
+        lower, upper = (np.atleast_2d(rows)[phase] for rows in self.arrays())
+        return np.clip(pose, lower, upper)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
         """Return the bounds as G y ≥ c: constant, or those of the phase of each of `num_steps` steps."""
@@ -290,10 +300,44 @@ class PartTaskFile(Options):
         {}, description="measurements of create-task, for information; only the clearance is used, in hold tests"
     )
 
+    @field_validator("measured")
+    @classmethod
+    def _has_a_clearance(cls, value: dict[str, Any]) -> dict[str, Any]:
+        clearance = value.get("clearance_mm")
+        is_number = isinstance(clearance, int | float) and not isinstance(clearance, bool)
+        if clearance is not None and not (is_number and 0.0 <= clearance <= MAX_CLEARANCE):
+            raise ValueError(
+                f"clearance_mm is a number from 0 to {MAX_CLEARANCE:g}, or null if no walls face each other, not "
+                f"{brief(clearance)}"
+            )
+        return value
+
     @field_validator("time_step")
     @classmethod
     def _is_a_time_step(cls, value: float | None) -> float | None:
         return ContactOptions(time_step=value).time_step
+
+    @field_validator("tolerance")
+    @classmethod
+    def _is_below_the_rim(cls, value: Tolerance, info: ValidationInfo) -> Tolerance:
+        if "motion" in info.data and value.height >= info.data["motion"].rim:
+            raise ValueError(f"height must be less than motion.rim, {info.data['motion'].rim:g} m")
+        return value
+
+    @field_validator("bounds")
+    @classmethod
+    def _include_the_target(cls, value: Bounds, info: ValidationInfo) -> Bounds:
+        if not {"motion", "tolerance"} <= info.data.keys():
+            return value  # their errors are reported instead
+        tolerance, push = info.data["tolerance"], info.data["motion"].push
+        x, y, z, Rz, Ry, Rx = value.nearest(np.zeros(POSE_SIZE), -1)
+        nearest = np.array([x, y, max(z, min(z + push, 0.0)), Rx, Ry, Rz])  # a push is below the target
+        if not tolerance.accepts(nearest) or max(abs(Ry), abs(Rx)) >= tolerance.turn * DEGREE:
+            raise ValueError(
+                "these bounds exclude the pose of the seated plug, which is 0 in all outputs: let them include 0 (for "
+                "z, a value from -motion.push to 0) at the end of the motion"
+            )
+        return value
 
     @field_validator("sides", "rim_sides")
     @classmethod
@@ -319,8 +363,7 @@ class PartTaskFile(Options):
     @property
     def clearance(self) -> float:
         """Measured clearance between the parts [m]; 0 if it was not measured."""
-        value = self.measured.get("clearance_mm")
-        return MM * float(value) if isinstance(value, int | float) and 0.0 < value <= _LARGEST else 0.0
+        return MM * float(self.measured.get("clearance_mm") or 0.0)
 
     @cached_property
     def turn(self) -> float:

@@ -36,12 +36,19 @@ from guiderail.diagrams.tasks.options import (
     FixtureOffsetOptions,
     ForceOptions,
 )
-from guiderail.diagrams.tasks.part.file import AUTOMATE, Bounds, PartTaskFile, read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.file import (
+    AUTOMATE,
+    FILE_NAME,
+    Bounds,
+    PartTaskFile,
+    read_task_file,
+    task_folder_digest,
+)
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.parsing import add_models
-from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
+from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.parts.assembly_check import SYMMETRIES
@@ -132,6 +139,8 @@ IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
 MIN_PUSH = 1.5 * MM  # smallest displacement of the command of a seated plug by a push, in addition to the play [m]
 FOLLOWING = 3.0  # rate of change of the action per distance of 2 mm between the command and a plug in the socket [1/s]
+# Largest distance from the demonstrations' start to the bounds, inside which an episode starts [m], [rad].
+MAX_START_SHIFT = np.array([*[1.0 * MM] * 3, *[2.0 * DEGREE] * 3])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
 
 
@@ -253,6 +262,23 @@ class PartInsertion(DemonstratedInsertion):
         self.collision = Threshold("contact_force", self.options.largest_force_limit)
         self.num_steps = self.reference().num_steps
         self.insertion_length = self.file.motion.travel
+        self._check_length_and_start()
+
+    def _check_length_and_start(self) -> None:
+        """Raise an InputError if `task.yaml` excludes every success, or the start of the demonstrations."""
+        steps, start = self.file.tolerance.steps, self.reference().means[0]
+        if self.steps_of(steps) > self.num_steps:
+            raise InputError(
+                f"tolerance.steps in {self.folder / FILE_NAME} is {steps}, longer than an episode of "
+                f"{self.num_steps * self.control_period:.3g} s: give fewer steps"
+            )
+        shift = np.abs(self.file.bounds.nearest(start, 0) - start)
+        if (shift > MAX_START_SHIFT).any():
+            output = int((shift / MAX_START_SHIFT).argmax())
+            raise InputError(
+                f"bounds in {self.folder / FILE_NAME} exclude the start of the demonstrations, at {POSE_NAMES[output]} = "
+                f"{start[output]:.4g}: let them include it at the beginning of the motion"
+            )
 
     def workcell(self) -> PartWorkcell:
         """Return the socket in the world and the plug in the tool."""
