@@ -1,5 +1,6 @@
 """Parts are checked for overlap, clearance between walls and a free path to the target."""
 
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from guiderail.models.parts.assembly_check import (
     plan_motion,
     shrink,
 )
+from guiderail.models.parts.demonstrator import plan_straight_insertion
 from guiderail.models.parts.mesh_file import Part, load_part
 
 pytest.importorskip("trimesh")
@@ -42,6 +44,15 @@ def test_plan_motion_refuses_a_plug_above_its_socket(tmp_path):
     assert plan_motion(plug, socket, 0.0).rim == pytest.approx(15e-3)
     with pytest.raises(InputError, match=r"ends 5\.0 mm above the socket"):
         plan_motion(plug.transform(np.eye(3), np.array([0, 0, 0.02])), socket, 0.0)
+
+
+@pytest.mark.parametrize(("depth", "is_accepted"), [(0.5, False), (0.51, True)])
+def test_plug_enters_more_than_the_slow_motion_at_the_rim(depth, is_accepted, tmp_path):
+    plug, socket = load("square_peg", tmp_path)  # it enters 15 mm
+    raised = plug.transform(np.eye(3), np.array([0.0, 0.0, 0.015 - 1e-3 * depth]))
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="must enter more than 0.5 mm"):
+        motion = plan_motion(raised, socket, 0.0)
+        assert np.diff(plan_straight_insertion(motion.travel, motion.rim, 0.0, push=0.0)[0]).min() > 0.0
 
 
 def test_find_obstructions_finds_snaps_and_passes_turns(tmp_path):
