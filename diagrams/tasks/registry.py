@@ -112,12 +112,24 @@ def is_task_folder(name: str | Path) -> bool:
 def register_task_folder(folder: str | Path) -> str:
     """Register the task of a folder and return its name; calling it again reads the folder again.
 
+    If a folder with the same content is registered already, that one is used.
+
     Raises:
         InputError: If the folder's task is not valid, or another task has its name.
     """
-    from guiderail.diagrams.tasks.part.task import load_task_folder  # imports Drake
+    from guiderail.diagrams.tasks.part.file import task_folder_digest  # imports Drake
+    from guiderail.diagrams.tasks.part.task import load_task_folder
 
     task = load_task_folder(Path(folder))
+    registered = TASKS.get(task.file.name) if task.file.name in TASKS.names() else task
+    other = getattr(registered, "folder", task.folder)
+    if other != task.folder:
+        if is_task_folder(other) and task_folder_digest(other) == task_folder_digest(task.folder):
+            return register_task_folder(other)
+        raise InputError(
+            f"the tasks in {task.folder} and {other} are both called {task.file.name}: change 'name:' in the task.yaml "
+            "of one of them"
+        )
     register_task(task.file.name)(task)
     return task.name
 

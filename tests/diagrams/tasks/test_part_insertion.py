@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
 from guiderail.diagrams.tasks.part.file import Bounds, MotionNumbers, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.task import load_task_folder, write_workcell
-from guiderail.diagrams.tasks.registry import TASKS, environment_id
+from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task_folder
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.sdf import lathe
 from guiderail.models.primitives import Demonstrations
@@ -149,6 +149,14 @@ def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
             (folder / name).write_bytes(content.replace(b"0.02", b"0.03"))
         tasks.append(load_task_folder(folder))
     assert len(set(tasks)) == 5
+
+
+def test_two_folders_with_one_name_must_have_the_same_content(tmp_path):
+    one, copy, other = (write(tmp_path / name, name="parts/peg") for name in ("one", "copy", "other"))
+    assert [register_task_folder(folder) for folder in (one, copy, one)] == 3 * ["parts/peg"]
+    write(other, name="parts/peg", force_limit=20.0)
+    with pytest.raises(InputError, match=f"in {other} and {one} are both called parts/peg: change 'name:' in"):
+        register_task_folder(other)
 
 
 def test_of_the_measurements_only_the_clearance_changes_the_digest(tmp_path):
