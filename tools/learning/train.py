@@ -23,6 +23,7 @@ from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
 from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
+from guiderail.tools.evaluation.subject import counts_collisions
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.learner import check_log_formats
@@ -74,9 +75,11 @@ class Run:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Statistics of training, and the paths of the pictures."""
+        """Statistics of training, and the paths of the pictures; no collisions if the task declares no collision."""
         rows = self.episodes
         recent, values = own_episodes(rows)["success"].tail(10), summary(rows, SUMMARY)
+        if not counts_collisions(self.config.task):
+            values["collisions"] = None
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
         if not reports_success(rows):
             values |= dict.fromkeys(("episodes_to_convergence", "success_rate", "success_rate_last_10"))
