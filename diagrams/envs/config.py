@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.options import (
     check_choice,
     validate_options,
 )
-from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, possible_guidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, default_guidance, possible_guidance
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS, StationKind
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
@@ -160,7 +160,6 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
         raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
     merged = {
-        "guidance": guidance[0],
         "station": stations[0],
         "reward": task.rewards[0],
         "observation": task.observations[0],
@@ -168,6 +167,8 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
         **task.difficulties[difficulty],
         **options,
     }
+    if "guidance" not in merged:
+        merged["guidance"] = default_guidance(guidance)
     check_choice("station", merged["station"], stations, name)
     check_choice("reward", merged["reward"], list(task.rewards), name)
     check_choice("observation", merged["observation"], list(task.observations), name)

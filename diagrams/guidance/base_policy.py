@@ -162,6 +162,7 @@ class BasePolicyGuidance(_ChunkGuidance, ChunkExecutionGuidance):
     color="#7f7f7f",
     demonstrates=True,
     options=GuardOptions,
+    ignores_actions=True,
 )
 def base_policy(prior: PriorKnowledge) -> Diagram:
     """Build guidance that executes a base policy's chunks, with a guard by default."""

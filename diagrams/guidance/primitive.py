@@ -123,6 +123,7 @@ def add_demonstration(
     color="#333333",
     demonstrates=True,
     displaces=True,
+    ignores_actions=True,
 )
 class KmpGuidance(PrimitiveGuidance):
     """Guidance that commands the demonstrations' mean; the action has no effect.

@@ -39,6 +39,7 @@ class GuidanceKind:
         displaces: True if each entry of an action displaces one explored output. Only then is a task's symmetry used
             for data augmentation.
         options: Model of further options of the environment, if there are any.
+        ignores_actions: True if actions have no effect. A task that declares no default has another one.
     """
 
     name: str
@@ -49,6 +50,7 @@ class GuidanceKind:
     demonstrates: bool = False
     displaces: bool = False
     options: type[Options] | None = None
+    ignores_actions: bool = False
 
     def missing_requirements(self, provided: Collection[str]) -> tuple[str, ...]:
         """Return the missing requirements of the most complete alternative; empty if an alternative is complete.
@@ -80,6 +82,7 @@ def register_guidance(
     demonstrates: bool = False,
     displaces: bool = False,
     options: type[Options] | None = None,
+    ignores_actions: bool = False,
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
     """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
@@ -93,10 +96,11 @@ def register_guidance(
         demonstrates: See `GuidanceKind`.
         displaces: See `GuidanceKind`.
         options: Model of further options of the environment.
+        ignores_actions: See `GuidanceKind`.
     """
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
-        kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options)
+        kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options, ignores_actions)
         GUIDANCE.register(name, kind)
         return build
 
@@ -106,6 +110,11 @@ def register_guidance(
 def possible_guidance(provided: Collection[str]) -> list[str]:
     """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
     return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
+
+
+def default_guidance(possible: Collection[str]) -> str:
+    """Return the first kind of guidance in `possible` that does not ignore actions; the first one if all do."""
+    return next((name for name in possible if not GUIDANCE.get(name).ignores_actions), next(iter(possible)))
 
 
 def check_guidance(name: str, provided: Collection[str], task: str = "this task") -> GuidanceKind:

@@ -11,6 +11,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
+from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
@@ -22,6 +23,7 @@ from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
+from guiderail.tools.learning.train import train
 from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10
@@ -120,6 +122,12 @@ def test_task_that_lacks_methods_is_refused_with_their_names():
         InputError, match=r"lab/Own lacks reset\(\), workcell\(\): every task must define these methods"
     ):
         declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
+
+
+def test_default_guidance_has_an_effect():
+    declare()
+    assert possible_guidance(TASKS.get("lab/Own").provides())[0] == "base_policy"
+    assert EnvConfig.resolve("lab/Own", {}).guidance == "kgrl"
 
 
 def test_settings_of_another_guidance_are_accepted():
@@ -269,6 +277,13 @@ def test_collisions_are_counted_only_if_declared():
     declare(collision=Threshold("contact_force"))
     assert counts_collisions("lab/Own")
     assert all(map(counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
+
+
+def test_training_reports_collisions_only_if_declared(tmp_path):
+    for name, attributes, expected in (("without", {}, None), ("with", {"collision": Threshold("contact_force")}, 0)):
+        declare(**attributes)
+        run = train("lab/Own", out=tmp_path / name, episodes=1, algorithm="ppo", pictures=False)
+        assert run.summary["collisions"] == expected
 
 
 def test_own_task_is_fuzzed_with_every_guidance():
