@@ -68,17 +68,23 @@ class Part:
 
 
 def find_unit(path: Path, unit: str | None) -> str | None:
-    """Return the unit of a file, which its format or `unit` determines; None if neither does.
+    """Return the unit of a file, which its format or else `unit` determines; None if neither does."""
+    return _KNOWN.get(path.suffix.lower()) or unit
+
+
+def find_units(paths: Sequence[Path], unit: str | None) -> list[str | None]:
+    """Return the unit of each file, as `find_unit`.
 
     Raises:
-        InputError: If `unit` is unknown, or contradicts the format.
+        InputError: If `unit` is unknown, or contradicts the formats of all files.
     """
     if unit is not None:
         _check_unit(unit)
-    known = _KNOWN.get(path.suffix.lower())
-    if known and unit not in (None, known):
-        raise InputError(f"{path.name} is read in meters, as its format defines: remove --unit {unit}")
-    return known or unit
+    units = [find_unit(path, unit) for path in paths]
+    if unit is not None and unit not in units:
+        names = " and ".join(path.name for path in paths)
+        raise InputError(f"{names} are read in meters, as their formats define: remove --unit {unit}")
+    return units
 
 
 def _check_unit(unit: str) -> None:

@@ -121,7 +121,7 @@ def create_task(
     plug: Annotated[Path, argument("Mesh of the part in the tool: .stl, .obj, .ply, .glb, .step.", "PLUG")],
     socket: Annotated[Path, argument("Mesh of the part in the world.", "SOCKET")],
     out: Annotated[Path, option("Folder of the task; it must not exist.")],
-    unit: Annotated[str | None, option("Unit of the meshes: mm, cm, m or inch.")] = None,
+    unit: Annotated[str | None, option("Unit of .stl, .obj and .ply meshes: mm, cm, m or inch.")] = None,
     plug_pose: Annotated[
         str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the socket, degrees].")
     ] = "0,0,0,0,0,0",

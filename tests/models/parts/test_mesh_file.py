@@ -12,7 +12,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.parts import repair
-from guiderail.models.parts.mesh_file import load_part
+from guiderail.models.parts.mesh_file import find_units, load_part
 from guiderail.models.parts.solids import to_manifold
 
 trimesh = pytest.importorskip("trimesh")
@@ -56,6 +56,15 @@ def test_load_part_returns_meters(ending, tmp_path):
     np.testing.assert_allclose(np.ptp(part.bounds, axis=0), [0.01, 0.01, 0.02], rtol=1e-6)
     assert len(part.bodies) == 1
     assert str(part.repair) == ""
+
+
+def test_unit_applies_to_files_whose_format_states_none():
+    assert find_units([Path("plug.glb"), Path("socket.stl")], "mm") == ["m", "mm"]
+    assert find_units([Path("plug.glb"), Path("socket.step")], None) == ["m", "m"]
+    with pytest.raises(InputError, match=r"plug\.glb and socket\.step are read in meters, .*: remove --unit mm"):
+        find_units([Path("plug.glb"), Path("socket.step")], "mm")
+    with pytest.raises(InputError, match="there is no unit 'ell'"):
+        find_units([Path("plug.stl")], "ell")
 
 
 def test_load_part_reads_step():
