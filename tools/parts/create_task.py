@@ -27,6 +27,7 @@ from guiderail.models.parts.assembly_check import (
     InsertionMotion,
     check_target,
     compute_center_of_mass,
+    compute_radius_of_gyration,
     find_obstructions,
     find_symmetries,
     measure_side_clearance,
@@ -34,7 +35,7 @@ from guiderail.models.parts.assembly_check import (
 )
 from guiderail.models.parts.assembly_check import shrink as shrink_part
 from guiderail.models.parts.demonstrator import NUM_DEMONSTRATIONS
-from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, load_part, obj_text
+from guiderail.models.parts.mesh_file import UNITS, Part, find_unit, find_units, load_part, obj_text
 from guiderail.models.parts.preparation import MIN_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
 from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.parts.contact import MISALIGNMENTS, Choice, Contact, choose_contact, cpu_time
@@ -63,7 +64,7 @@ def read_parts(
     Args:
         plug: Mesh file of the part in the tool.
         socket: Mesh file of the part in the world.
-        unit: Unit of both files; None if their formats state it.
+        unit: Unit of the files whose format states none; None if the formats of both state it.
         plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the socket's unit, and rotations
             [rx ry rz] about the fixed axes x, y and z, in this order [degrees].
         axis: Direction in which the plug is removed, in the coordinates of the socket's file; a key of `AXES`.
@@ -83,7 +84,7 @@ def read_parts(
     point = None if center is None else as_numbers(center, "--center")
     if point is not None and point.shape != (3,):
         raise InputError(f"--center is 3 numbers, not {brief(center)}")
-    units = [find_unit(path, unit) for path in (plug, socket)]
+    units = find_units((plug, socket), unit)
     if None in units:
         raise InputError(
             f"{(plug, socket)[units.index(None)].name} does not say its unit: give --unit {', '.join(UNITS)}"
@@ -425,14 +426,12 @@ def _task_file(
         pieces = [{"file": f"{name}_surface.obj", "friction": friction}]
         if contact.compliant == name:
             pieces = [{"file": file, "modulus": modulus, "friction": friction} for file, modulus in contact.files]
-        vertices = surface.visual[0]
-        middle = part.bounds.mean(axis=0)
         models[name] = PartModel(
             source=part.path.name,
             visual=f"{name}.obj",
             mass=round(max(1e-3, DENSITY * surface.volume), 6),
-            center=tuple(np.round(middle, 6).tolist()),
-            gyration=round(float(np.sqrt(((vertices - middle) ** 2).sum(axis=1).mean())), 6),
+            center=tuple(np.round(compute_center_of_mass(part), 6).tolist()),
+            gyration=round(compute_radius_of_gyration(part), 6),
             pieces=tuple(Piece.model_validate(piece) for piece in pieces),
             convex=(),
         )

@@ -80,7 +80,7 @@ class PartModel(Options):
     visual: str = Field(description="OBJ file of the visual, in the target frame [m]")
     mass: Number = Field(gt=0, description="mass [kg]")
     center: Numbers = Field(min_length=3, max_length=3, description="center of mass in the target frame [m]")
-    gyration: Number = Field(gt=0, description="radius of gyration [m]")
+    gyration: Number = Field(gt=0, description="radius of gyration [m], the same about every axis")
     pieces: tuple[Piece, ...] = Field(min_length=1, description="collision meshes")
     convex: tuple[str, ...] = Field(
         (), description="OBJ files of convex pieces, which station=mujoco needs for both parts; default: none"
