@@ -16,7 +16,13 @@ from guiderail.diagrams.envs.options import (
     check_choice,
     validate_options,
 )
-from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind, check_guidance, default_guidance, possible_guidance
+from guiderail.diagrams.guidance.registry import (
+    GUIDANCE,
+    GuidanceKind,
+    check_guidance,
+    default_guidance,
+    possible_guidance,
+)
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS, StationKind
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder

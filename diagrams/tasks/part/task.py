@@ -276,7 +276,7 @@ class PartInsertion(DemonstratedInsertion):
         if (shift > MAX_START_SHIFT).any():
             output = int((shift / MAX_START_SHIFT).argmax())
             raise InputError(
-                f"bounds in {self.folder / FILE_NAME} exclude the start of the demonstrations, at {POSE_NAMES[output]} = "
+                f"bounds in {self.folder / FILE_NAME} exclude the demonstrations' start, {POSE_NAMES[output]} = "
                 f"{start[output]:.4g}: let them include it at the beginning of the motion"
             )
 

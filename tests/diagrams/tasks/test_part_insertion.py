@@ -300,7 +300,7 @@ FREE = [None] * 6
         ({"bounds": {"lower": [*FREE[:2], 0.019, *FREE[3:]], "upper": FREE}}, "exclude the pose of the seated plug"),
         ({"bounds": {"lower": [0.001, *FREE[1:]], "upper": FREE}}, "exclude the pose of the seated plug"),
         ({"bounds": {"lower": [*FREE[:5], 0.3], "upper": FREE}}, "exclude the pose of the seated plug"),
-        ({"bounds": {"lower": FREE, "upper": [*FREE[:2], 0.015, *FREE[3:]]}}, "exclude the start of the demonstrations"),
+        ({"bounds": {"lower": FREE, "upper": [*FREE[:2], 0.015, *FREE[3:]]}}, "exclude the demonstrations' start, z"),
         ({"bounds": {"lower": [-2, -2, *FREE[2:]], "upper": [2, 2, *FREE[2:]]}}, "bounds are in meters and radians"),
         ({"tolerance": {"height": 0.5}}, r"height must be less than motion\.rim, 0\.01 m"),
         ({"tolerance": {"height": 0.01}}, r"height must be less than motion\.rim, 0\.01 m"),
