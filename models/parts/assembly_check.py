@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.common.transforms import MM
@@ -287,11 +288,15 @@ _SECTIONS = 12  # heights at which outlines are compared
 _AROUND = 1.15  # radius around the axis in which a socket is compared, in radii of the plug
 
 
-def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def find_symmetries(
+    plug: Part, socket: Part, motion: InsertionMotion, deviation: float = 0.0
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return the names of the symmetries of both parts, and of further ones that nearly hold on the rim.
 
-    The parts are in the target frame, the plug at its target. On the rim, the plug is turned by minus `motion.turn`.
-    With a turn, the first tuple is empty.
+    A symmetry also maps the plug at its target to one that fits the socket: it overlaps it no more than the plug does,
+    apart from rounding and `deviation`, the largest overlap caused by the decimation of both parts [m]. The parts are
+    in the target frame, the plug at its target. On the rim, the plug is turned by minus `motion.turn`. With a turn, the
+    first tuple is empty.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     socket_solids, plug_solids = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]
@@ -301,8 +306,11 @@ def find_symmetries(plug: Part, socket: Part, motion: InsertionMotion) -> tuple[
     holes = [_hole(socket_solids, height, radius) for height in heights]
     tip, mouth = _outline(plug_solids, low + BELOW), _hole(socket_solids, rim - BELOW, radius)
     same, near = [], []
+    largest = measure_overlap(plug_solids, socket_solids)[0] + MAX_RESTING_OVERLAP + deviation
     for name, move in SYMMETRIES.items():
-        if motion.turn == 0.0 and min(_similarity(one, move) for one in (*entering, *holes)) >= SAME:
+        outlines_agree = min(_similarity(one, move) for one in (*entering, *holes)) >= SAME
+        moved = [solid.transform(block_diag(move, np.eye(1, 2)).astype(float)) for solid in plug_solids]
+        if motion.turn == 0.0 and outlines_agree and measure_overlap(moved, socket_solids)[0] <= largest:
             same.append(name)
         elif min(_similarity(tip, move), _similarity(mouth, move)) >= NEARLY:
             near.append(name)

@@ -187,7 +187,7 @@ def create_task(
     deviation = max(part.repair.moved + surface.deviation for part, surface in zip(parts, both, strict=True))
     log(_describe_surfaces(parts, both, deviation, clearance))
     # Symmetry augmentation leaves turns unchanged, but a reflection reverses the turn that the policy searches for.
-    sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path)
+    sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path, first + second)
     log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
     prepared = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,

@@ -152,3 +152,18 @@ def test_find_symmetries_returns_those_of_the_drawing(name, turn, same, on_the_r
     assert set(exact) == same
     assert on_the_rim is None or set(approximate) == on_the_rim
     assert not set(exact) & set(approximate)
+
+
+@pytest.mark.parametrize(("height", "same"), [(0.1, set(SYMMETRIES)), (0.6, {"mirrored across x"})])
+def test_key_higher_than_the_clearance_is_no_symmetry(height, same, tmp_path):
+    def solid(grown, low):
+        shaft = Manifold.cylinder(15.0, 10.0 + grown, circular_segments=96)
+        key = Manifold.cube((1.0, 1.2 + 2.0 * grown, 15.0)).translate((9.0 + height + grown, -0.6 - grown, 0.0))
+        return (shaft + key).translate((0.0, 0.0, low))
+
+    socket = Manifold.cube((40.0, 40.0, 20.0)).translate((-20.0, -20.0, -20.0)) - solid(0.15, -14.9)
+    PartDrawing([solid(0.0, -14.9)], [socket], 0.15).write(tmp_path)
+    parts = read_parts(tmp_path / "plug.stl", tmp_path / "socket.stl", "mm", (0.0,) * 6, "+z", (0.0, 0.0, 0.0))
+    exact, approximate = find_symmetries(*parts, plan_motion(*parts, 0.0))
+    assert set(exact) == same
+    assert set(exact) | set(approximate) == set(SYMMETRIES)
