@@ -19,6 +19,7 @@ from pydrake.geometry import Rgba, Role
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.tasks.registry import is_task_folder
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
@@ -170,9 +171,9 @@ class Side:
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
-    """Return the default path of a run's page, which is in the current folder if `run` is no folder."""
+    """Return the default path of a run's page, which is in the current folder if `run` is no folder, or a task's."""
     name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
-    return run / name if run.is_dir() else Path(name)
+    return run / name if run.is_dir() and not is_task_folder(run) else Path(name)
 
 
 def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None) -> dict[str, Any]:

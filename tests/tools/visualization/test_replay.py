@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization import replay
-from guiderail.tools.visualization.replay import DRAWN, Motion, find_report, violation_unit, write_page
+from guiderail.tools.visualization.replay import DRAWN, Motion, default_page, find_report, violation_unit, write_page
 
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 BALL = f"{DRAWN}/robot/ball"
@@ -119,6 +120,12 @@ def test_motion_has_one_sample_when_no_control_step_was_done(tmp_path):
     assert poses(recorded["frames"][BALL]).shape == (1, 7)
     assert recorded["force"] is None
     env.close()
+
+
+def test_page_of_a_task_folder_is_in_the_current_folder(tmp_path):
+    assert default_page(tmp_path, {}) == tmp_path / "replay.html"
+    (tmp_path / "task.yaml").touch()
+    assert default_page(tmp_path, {"station": "arm"}) == Path("replay-arm.html")
 
 
 def test_page_names_the_report_command_with_the_folder_of_the_run(tmp_path):
