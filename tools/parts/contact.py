@@ -243,7 +243,7 @@ def _try_contact(folder: Path, contact: Contact, make_file: MakeFile) -> Choice:
             file = make_file(contact, push)
             aligned = insert(folder, file, snapping=contact.snapping_pieces)
             if aligned.success and aligned.lowest < -file.tolerance.height:
-                # Nothing stops the plug at the target: a push would move it past the target.
+                # Nothing stops the plug at the target: a push would move it past the target. `create_task` reports it.
                 alternative = make_file(contact, 0.0)
                 unpushed = insert(folder, alternative, snapping=contact.snapping_pieces)
                 if unpushed.success:

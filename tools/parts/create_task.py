@@ -336,6 +336,11 @@ def _measure(
     misaligned = choice.misaligned or tuple(
         insert(folder, file, offset=xy, snapping=contact.snapping_pieces) for xy in MISALIGNMENTS
     )
+    if not choice.push:
+        log(
+            "nothing stops the plug at the seated pose, so the motion does not push: check the seated pose "
+            "(--plug-pose), unless the hole is a through hole"
+        )
     trials = (aligned, *misaligned)
     is_blocked = all(trial.is_blocked for trial in misaligned)
     result = "blocked (as required)" if is_blocked else "at the height of the target, but must be blocked"

@@ -14,6 +14,7 @@ from guiderail.diagrams.tasks.part.file import PartTaskFile
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common import files as writing
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.parts.contact import rank
 from guiderail.tools.parts.create_task import ask_unit, create_task
@@ -390,7 +391,7 @@ def test_screw_is_inserted_by_its_turn(tmp_path, capsys):
     assert (file.motion.turn, file.motion.advance) == (pytest.approx(-180.0), pytest.approx(4e-3))
     assert file.measured["inserted"]
     assert file.measured["penetration_mm"] < 0.5 * file.measured["clearance_mm"]
-    with pytest.raises(ValueError, match="the advance must be at least"):
+    with pytest.raises(ValueError, match="the advance must be more than"):
         MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
 
 
@@ -486,6 +487,16 @@ def test_fitted_bounds_become_those_of_the_task(folder, capsys):
         env.close()
     finally:
         (folder / "task.yaml").write_text(before)
+
+
+def test_fitted_bounds_that_exclude_the_target_are_refused(folder, tmp_path, capsys):
+    before = (folder / "task.yaml").read_text()
+    demonstrations = Demonstrations.load(folder / "demonstrations.npz")
+    aside = [outputs + [0.005, *[0.0] * 5] for outputs in demonstrations.outputs]
+    Demonstrations(demonstrations.times, aside).save(tmp_path / "aside.npz")
+    call("dataset", "fit-bounds", tmp_path / "aside.npz", "--outputs", "0,1", "--task", folder, code=2)
+    assert "exclude the pose of the seated plug" in capsys.readouterr().err
+    assert (folder / "task.yaml").read_text() == before
 
 
 def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, capsys):
@@ -606,7 +617,9 @@ def test_plug_without_a_stop_is_not_pushed_past_the_target(tmp_path):
     plate = trimesh.creation.box((30.0, 30.0, 10.0)).difference(trimesh.creation.box((8.4, 8.4, 20.0)))
     plug.apply_translation((0.0, 0.0, 15.0)).export(tmp_path / "plug.stl")
     plate.apply_translation((0.0, 0.0, 5.0)).export(tmp_path / "socket.stl")
-    create_task(tmp_path / "plug.stl", tmp_path / "socket.stl", tmp_path / "task", unit="mm", hard_episodes=0)
+    files, logged = (tmp_path / "plug.stl", tmp_path / "socket.stl", tmp_path / "task"), []
+    create_task(*files, unit="mm", hard_episodes=0, log=logged.append)
+    assert any(line.startswith("nothing stops the plug at the seated pose") for line in logged)
     created = yaml.safe_load((tmp_path / "task" / "task.yaml").read_text())
     assert created["motion"]["push"] == 0.0
     assert int(created["measured"]["demonstrations_seated"][0]) >= 3
