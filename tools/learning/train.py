@@ -78,20 +78,20 @@ class Run:
         """Statistics of training, and the paths of the pictures; no collisions if the task declares no collision."""
         rows = self.episodes
         recent, values = own_episodes(rows)["success"].tail(10), summary(rows, SUMMARY)
-        if not counts_collisions(self.config.task):
+        config = load_yaml(self.path / "config.yaml", "configuration")  # `self.config` would import what it names
+        if not counts_collisions(config["task"]):
             values["collisions"] = None
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
         if not reports_success(rows):
             values |= dict.fromkeys(("episodes_to_convergence", "success_rate", "success_rate_last_10"))
             note = "the environment reports none"
-        trust = " --trust-imports" if _names_code(self.path / "config.yaml") else ""
+        trust = " --trust-imports" if _names_code(config) else ""
         note += f"; evaluate the deterministic policy with guiderail evaluate {shlex.quote(str(self.path))}{trust}"
         return {"run": str(self.path), **values, "success_in_training": note, **self.pictures}
 
 
-def _names_code(file: Path) -> bool:
+def _names_code(config: Mapping[str, Any]) -> bool:
     """Return True if a run's configuration names code, which a new process loads only within `trust_imports`."""
-    config = load_yaml(file, "configuration")
     base_policy = str(config["environment"].get("base_policy", ""))
     has_code = is_policy_file(base_policy) and not base_policy.endswith(".onnx")
     return has_code or not all(map(is_task_folder, config["imports"]))
