@@ -45,11 +45,17 @@ def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
     An unknown name is returned unchanged.
 
     Raises:
-        InputError: If the folder's task is not valid.
+        InputError: If the folder's task is not valid, or its learner is unknown.
     """
     if typed in TASKS.names() or not is_task_folder(typed):
         return typed, ()
     name = register_task_folder(typed)
+    from guiderail.tools.learning.config import resolve_preset  # it imports this module
+
+    try:
+        resolve_preset(**{"preset": None, **TASKS.get(name).learner})
+    except InputError as error:
+        raise InputError(f"recommended.learner in {Path(typed) / 'task.yaml'} is invalid: {error}") from None
     return name, (str(Path(typed).resolve()),)
 
 

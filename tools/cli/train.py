@@ -90,7 +90,7 @@ def train(
     a checkpoint, the policy, a learning curve and a page that shows held-out episodes. An interrupted run is resumed
     with --resume and ends in the same result.
     """
-    task, folders = (None, ()) if task is None else cli.find_task(task)
+    task, folders = (None, ()) if task is None else cli.find_task(task, imports)
     modules = (*folders, *(imports or ()))
     if task is not None and not modules and not resume:
         check_task_name(task)  # before anything slow is imported

@@ -258,6 +258,17 @@ class Recommended(Options):
         description="algorithm, preset, and settings that override the preset",
     )
 
+    @field_validator("learner")
+    @classmethod
+    def _is_a_learner(cls, value: dict[str, Any]) -> dict[str, Any]:
+        kinds = {"algorithm": str, "preset": str, "settings": dict}
+        for key, entry in value.items():
+            if key not in kinds:
+                raise ValueError(f"there is no key {key!r}: {did_you_mean(key, kinds)}")
+            if not isinstance(entry, kinds[key]):
+                raise ValueError(f"{key} must be {'values by name' if key == 'settings' else 'a name'}")
+        return value
+
 
 class SearchNumbers(Options):
     """Parameters of the scripted search for a plug on the rim."""

@@ -20,6 +20,7 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_ta
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.sdf import lathe
 from guiderail.models.primitives import Demonstrations
+from guiderail.tools.environments import task_named
 from guiderail.tools.imports import import_modules
 
 PART = {"visual": "{}.obj", "mass": 0.1, "center": [0.0, 0.0, 0.0], "gyration": 0.01, "pieces": [{"file": "{}.obj"}]}
@@ -289,6 +290,22 @@ def test_it_starts_inside_its_bounds(tmp_path):
         assert start[2] == pytest.approx(0.0195)
 
 
+@pytest.mark.parametrize(
+    ("learner", "says"),
+    [
+        ({"algorithm": "tqx"}, "there is no algorithm 'tqx': did you mean tqc"),
+        ({"algorithm": "tqc", "settings": {"symetry": "near"}}, "no setting 'symetry'"),
+        ({"settings": {"batch_size": 32}}, None),
+        ({}, None),
+    ],
+)
+def test_learner_of_a_task_folder_is_checked_when_it_is_loaded(learner, says, tmp_path):
+    folder = str(write(tmp_path / "peg", recommended={"learner": learner}))
+    message = f"learner in {folder}/task.yaml is invalid: .*{says}"
+    with nullcontext() if says is None else pytest.raises(InputError, match=message):
+        assert task_named(folder)[0] == "parts/peg"
+
+
 FREE = [None] * 6
 
 
@@ -311,6 +328,8 @@ FREE = [None] * 6
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "friction": 3}])}, r"plug\.pieces\[0\]\.friction must be"),
         ({"motion": {"travel": 0.02}}, r"motion\.rim is missing: give it"),
         ({"motion": {"travel": 0.02, "rim": 0.01, "pusch": 0}}, r"motion has no option 'pusch': did you mean push"),
+        ({"recommended": {"learner": {"algoritm": "tqc"}}}, "there is no key 'algoritm': did you mean algorithm"),
+        ({"recommended": {"learner": {"algorithm": 3}}}, r"recommended\.learner cannot be .*: algorithm must be a name"),
         ({"measured": {"clearance_mm": "abc"}}, "clearance_mm is a number from 0 to 500, or null"),
         ({"measured": {"clearance_mm": -5}}, "clearance_mm is a number from 0 to 500, or null"),
         ({"measured": {"clearance_mm": 10**400}}, "clearance_mm is a number from 0 to 500, or null"),
