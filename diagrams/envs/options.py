@@ -241,7 +241,11 @@ class TangentOptions(Options):
 class ResetOptions(Options):
     """Options of every reset."""
 
-    held_out: bool = Field(False, description="sample held-out conditions, which training never samples")
+    held_out: bool = Field(
+        False,
+        description="sample held-out conditions, by random numbers that training never uses; the task determines if "
+        "their range is that of training",
+    )
 
 
 Model = TypeVar("Model", bound=BaseModel)

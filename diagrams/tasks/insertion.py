@@ -75,6 +75,8 @@ HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 class InsertionTask(Task):
     """Insertion of a workpiece in the tool into a fixture, with sampled offsets of both and a force limit.
 
+    Held-out offsets are drawn from the same range as those of training, with other random numbers.
+
     Attributes:
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
