@@ -336,8 +336,8 @@ def _locate(
     An entry of a list of options is part of the path, as in plug.pieces[0].friction, but not one of numbers. If the
     error is that of the whole model, the path is empty and the field None.
     """
-    name, field, value = "", None, values
-    models = [model]
+    name, field, models = "", None, [model]
+    value: Any = values
     for part in location:
         if isinstance(part, int) and models:
             name, value = f"{name}[{part}]", value[part]
