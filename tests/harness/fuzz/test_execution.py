@@ -24,7 +24,7 @@ from fuzz.changes import edited, edits, get, places
 from fuzz.tally import attempt
 from fuzz.test_runs import ARRAYS, CONFIGS, DESCRIPTION, LAYERS, TABLE, VALUES
 from fuzz.test_templates import TEXTS as TEMPLATES
-from guiderail.diagrams.tasks.part.file import read_task_file, task_folder_digest
+from guiderail.diagrams.tasks.part.file import FILE_FORMAT, read_task_file, task_folder_digest
 from guiderail.diagrams.tasks.part.task import write_workcell
 from guiderail.models.certificate import checker
 from guiderail.models.common.errors import InputError
@@ -183,7 +183,7 @@ eval_set: [{episodes: 2, file: "{name}-{digest}.csv"}]
 folder: "{method}-{seed}"
 """
 TASK = {
-    "format": "guiderail part task 1", "name": "parts/pin",
+    "format": FILE_FORMAT, "name": "parts/pin",
     "plug": {"source": "p.stl", "visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01,
              "pieces": [{"file": "part.obj", "modulus": 1e9}]},
     "socket": {"source": "s.stl", "visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01,
@@ -330,6 +330,11 @@ def kind(request, tmp_path_factory):
     write_files(folder, files)
     read(folder)  # imports what reading needs
     return folder, files, read
+
+
+def test_task_folder_of_the_campaign_is_valid(tmp_path):
+    write_files(tmp_path, TASK_FILES)
+    write_workcell(tmp_path, read_task_file(tmp_path))
 
 
 @given(st.data())
