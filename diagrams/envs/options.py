@@ -363,7 +363,8 @@ def _example(field: FieldInfo) -> str:
         return ""
     lengths = {getattr(item, "min_length", None) for item in (*field.metadata, *_metadata_of(field.annotation))}
     (number,) = (lengths - {None}) or {0}
-    example = (field.examples or [field.default or tuple(0.001 * (index + 1) for index in range(number or 2))])[0]
+    default = () if field.is_required() else field.default
+    example = (field.examples or [default or tuple(0.001 * (index + 1) for index in range(number or 2))])[0]
     return f"{number or 'several'} numbers, such as {','.join(f'{entry:g}' for entry in example)}"
 
 

@@ -116,6 +116,22 @@ def test_invalid_task_is_refused_by_the_name_of_its_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"motion": {"travel": 0.02, "rim": 0.01, "push": -0.004}}, "motion.push must be at least 0, not -0.004"),
+        ({"motion": {"rim": 0.01}}, "motion.travel is missing"),
+        ({"motion": {"travel": 0.02, "rim": 0.01, "pusch": 0}}, "motion has no option 'pusch'.*push"),
+        ({"plug": part("plug", pieces=[{"file": "plug.obj", "modulus": -1.0}])}, r"plug\.pieces\[0\]\.modulus must be"),
+        ({"plug": part("plug", center="middle")}, "plug.center must be 3 numbers, such as .*, not 'middle'"),
+        ({"place": [0.5]}, r"place must be 3 numbers, such as 0.55,0,0.15, not \[0.5\]"),
+    ],
+)
+def test_message_names_the_whole_path_of_an_option(changes, says, tmp_path):
+    with pytest.raises(InputError, match=says):
+        read_task_file(write(tmp_path / "wrong", **changes))
+
+
+@pytest.mark.parametrize(
     ("options", "remedy"),
     [
         ({"bound": 0.003}, "between phases: leave it out"),
