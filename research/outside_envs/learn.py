@@ -33,7 +33,6 @@ NUM_DEMONSTRATIONS = 10
 LEARNING_STARTS = 120  # transitions with random actions
 GRADIENT_STEPS = 2  # per transition
 NUM_RETURN_STEPS = 5  # transitions of a return: the reward of a success comes after some forty decisions
-TARGET_ENTROPY_PER_ACTION = -2.0  # Stable-Baselines3's default is −1; less noise spoils fewer attempts
 LEARNING_RATE, LAST_LEARNING_RATE = 5e-4, 1e-4  # falls in the second half of the training
 AVERAGE_DECAY = 0.999  # per transition, of the running average of the actor's weights that is evaluated
 Row = dict[str, Any]
@@ -99,7 +98,11 @@ def summarize(rows: list[Row]) -> dict[str, Any]:
 
 
 def train(
-    env: Any, episodes: int, seed: int, demonstrated: list[tuple[Any, ...]] | None = None
+    env: Any,
+    episodes: int,
+    seed: int,
+    demonstrated: list[tuple[Any, ...]] | None = None,
+    entropy_per_action: float = -2.0,
 ) -> tuple[Any, list[Row]]:
     """Train TQC; return the model, with the averaged actor, and the row of every episode.
 
@@ -111,6 +114,7 @@ def train(
         seed: Seed of the learner.
         demonstrated: Transitions of `WithHidden` that are half of every batch (RLPD), as arguments of a replay
             buffer's `add`.
+        entropy_per_action: As in `OutsideTask`.
     """
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import configure
@@ -148,7 +152,7 @@ def train(
     model = FastTqc(
         policy, WithHidden(env), seed=seed, learning_rate=learning_rate, gamma=0.98, batch_size=64,
         learning_starts=LEARNING_STARTS, train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
-        target_entropy=TARGET_ENTROPY_PER_ACTION * env.action_space.shape[0],
+        target_entropy=entropy_per_action * env.action_space.shape[0],
         top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={
             "net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15, "activation_fn": NormalizedReLU,
@@ -275,7 +279,7 @@ def main() -> None:
             result["held_out"] = evaluate_baselines(task, env, args.held_out)
         else:
             demonstrated = demonstrate_transitions(task, env, NUM_DEMONSTRATIONS) if label == "rlpd" else None
-            model, rows = train(env, args.episodes, seed, demonstrated)
+            model, rows = train(env, args.episodes, seed, demonstrated, task.entropy_per_action)
             result |= {"training": summarize(rows), "curve": [int(row["success"]) for row in rows]}
             result["held_out"] = {"learned": evaluate(env, policy_of(model), args.held_out)}
             print(label, seed, result["held_out"]["learned"], flush=True)

@@ -122,6 +122,7 @@ TASK = OutsideTask(
     # Peg's head in the frame of the assumed hole, grasp along the peg, lag of the hand, last blocked position, phase.
     # With all 26 entries the policy depends on irrelevant ones, such as the peg's first position.
     observed=(3, 4, 5, 6, 12, 13, 14, 19, 20, 21, 22),
+    entropy_per_action=-1.0,
     schedule={name: np.zeros(3) for name in ("reach", "grasp")}
     | {name: np.array([0.0, -0.6, 0.3]) for name in ("carry", "insert")}
     | {name: np.array([0.0, 0.5, 0.3]) for name in ("retract", "insert 2")}

@@ -77,6 +77,8 @@ class OutsideTask:
         schedule: Fixed action of each segment, by name; together the actions search without observations.
         observed: Indices of the entries that a policy with guidance observes, of the environment's observation followed
             by phase and command; all if empty.
+        entropy_per_action: Target entropy of the policy for each entry of an action; −1 is Stable-Baselines3's default,
+            and less noise spoils fewer attempts.
     """
 
     parts: Mapping[str, Part]
@@ -89,6 +91,7 @@ class OutsideTask:
     scripted: Callable[[Any], np.ndarray]
     schedule: Mapping[str, np.ndarray] = field(default_factory=dict)
     observed: Sequence[int] = ()
+    entropy_per_action: float = -2.0
 
     def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
         """Return the segments, from `count` demonstrations recorded with a seed."""
