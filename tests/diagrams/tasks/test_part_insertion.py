@@ -360,7 +360,7 @@ def test_bounds_of_a_push_and_a_long_hold_are_accepted(tmp_path):
     # At the end, the command pushes the plug down by 4 mm.
     upper = [[*row[:2], height, *row[3:]] for row, height in zip(BY_PHASE["upper"], (0.03, -0.003), strict=True)]
     folder = write(tmp_path / "accepted", bounds=BY_PHASE | {"upper": upper}, tolerance={"steps": 51})
-    EnvConfig.resolve(str(folder), {})
+    assert EnvConfig.resolve(str(folder), {}).make_task().file.tolerance.steps == 51
 
 
 def test_scene_has_the_box_of_each_phase(tmp_path):

@@ -334,7 +334,9 @@ def kind(request, tmp_path_factory):
 
 def test_task_folder_of_the_campaign_is_valid(tmp_path):
     write_files(tmp_path, TASK_FILES)
-    write_workcell(tmp_path, read_task_file(tmp_path))
+    file = read_task_file(tmp_path)
+    write_workcell(tmp_path, file)
+    assert file.name == TASK["name"]
 
 
 @given(st.data())
