@@ -22,7 +22,7 @@ import numpy as np
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guided.guide import Guide
 from research.outside_envs.table import print_table
-from research.outside_envs.task import OutsideTask
+from research.outside_envs.task import LearnerSettings, OutsideTask
 
 TASKS = ("peg", "assembly", "nut")
 METHODS = ("kgrl", "skgrl", "residual", "clipped_residual", "tqc", "rlpd")  # the last two are without guidance
@@ -30,11 +30,8 @@ TOLERANCE = 1e-9  # largest violation of a constraint that is not counted [unit 
 HELD_OUT_SEED = 10_000
 SELECTION_SEED = 5_000  # seed of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
-LEARNING_STARTS = 120  # transitions with random actions
-GRADIENT_STEPS = 2  # per transition
-NUM_RETURN_STEPS = 5  # transitions of a return: the reward of a success comes after some forty decisions
 LEARNING_RATE, LAST_LEARNING_RATE = 5e-4, 1e-4  # falls in the second half of the training
-AVERAGE_DECAY = 0.999  # per transition, of the running average of the actor's weights that is evaluated
+ENTROPY_FALL = (0.4, 0.9)  # fractions of the training between which the target entropy falls
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -101,8 +98,8 @@ def train(
     env: Any,
     episodes: int,
     seed: int,
+    settings: LearnerSettings,
     demonstrated: list[tuple[Any, ...]] | None = None,
-    entropy_per_action: float = -2.0,
 ) -> tuple[Any, list[Row]]:
     """Train TQC; return the model, with the averaged actor, and the row of every episode.
 
@@ -112,9 +109,9 @@ def train(
         env: Environment with `hidden` values.
         episodes: Number of training episodes.
         seed: Seed of the learner.
+        settings: Settings of the learner.
         demonstrated: Transitions of `WithHidden` that are half of every batch (RLPD), as arguments of a replay
             buffer's `add`.
-        entropy_per_action: As in `OutsideTask`.
     """
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import configure
@@ -125,6 +122,7 @@ def train(
     from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
     rows: list[Row] = []
+    first, last = settings.entropy_per_action
 
     class Recorder(BaseCallback):
         row: Row
@@ -132,7 +130,7 @@ def train(
 
         def _on_training_start(self) -> None:
             self.row = {}
-            self.average = AveragedModel(self.model.actor, multi_avg_fn=get_ema_multi_avg_fn(AVERAGE_DECAY))
+            self.average = AveragedModel(self.model.actor, multi_avg_fn=get_ema_multi_avg_fn(settings.average_decay))
 
         def _on_step(self) -> bool:
             self.average.update_parameters(self.model.actor)
@@ -142,6 +140,9 @@ def train(
                 self.row = {}
                 if len(rows) % 20 == 0:
                     print(f"episode {len(rows)}: {sum(row['success'] for row in rows[-20:])} of 20", flush=True)
+            fraction = (len(rows) / episodes - ENTROPY_FALL[0]) / (ENTROPY_FALL[1] - ENTROPY_FALL[0])
+            entropy = first + np.clip(fraction, 0.0, 1.0) * (last - first)
+            self.model.target_entropy = entropy * env.action_space.shape[0]
             return len(rows) < episodes
 
     def learning_rate(_: float) -> float:
@@ -151,8 +152,8 @@ def train(
     policy = asymmetric_policy(FastTqc.policy_aliases["MlpPolicy"], env.observation_space.shape[0])
     model = FastTqc(
         policy, WithHidden(env), seed=seed, learning_rate=learning_rate, gamma=0.98, batch_size=64,
-        learning_starts=LEARNING_STARTS, train_freq=1, gradient_steps=GRADIENT_STEPS, n_steps=NUM_RETURN_STEPS,
-        target_entropy=entropy_per_action * env.action_space.shape[0],
+        learning_starts=settings.learning_starts, train_freq=1, gradient_steps=settings.gradient_steps,
+        n_steps=settings.return_steps, target_entropy=first * env.action_space.shape[0],
         top_quantiles_to_drop_per_net=2, tau=0.01, buffer_size=100_000, device="cpu",
         policy_kwargs={
             "net_arch": [128, 128], "n_critics": 2, "n_quantiles": 15, "activation_fn": NormalizedReLU,
@@ -166,7 +167,7 @@ def train(
             model.action_space,
             device="cpu",
             gamma=model.gamma,
-            n_steps=NUM_RETURN_STEPS,
+            n_steps=settings.return_steps,
         )
         for transition in demonstrated:
             buffer.add(*transition)
@@ -278,8 +279,9 @@ def main() -> None:
         if is_baselines:
             result["held_out"] = evaluate_baselines(task, env, args.held_out)
         else:
+            settings = task.settings if env.has_wrapper_attr("guide") else LearnerSettings()
             demonstrated = demonstrate_transitions(task, env, NUM_DEMONSTRATIONS) if label == "rlpd" else None
-            model, rows = train(env, args.episodes, seed, demonstrated, task.entropy_per_action)
+            model, rows = train(env, args.episodes, seed, settings, demonstrated)
             result |= {"training": summarize(rows), "curve": [int(row["success"]) for row in rows]}
             result["held_out"] = {"learned": evaluate(env, policy_of(model), args.held_out)}
             print(label, seed, result["held_out"]["learned"], flush=True)

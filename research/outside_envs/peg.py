@@ -17,7 +17,7 @@ from research.outside_envs.sawyer import (
     scripted,
     to_action,
 )
-from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
+from research.outside_envs.task import LearnerSettings, OutsideTask, Part, Recording, num_steps
 
 OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
 HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
@@ -119,12 +119,15 @@ TASK = OutsideTask(
     pose=pose,
     to_action=to_action,
     scripted=scripted(SawyerPegInsertionSideV3Policy()),
-    # Peg's head in the frame of the assumed hole, grasp along the peg, lag of the hand, last blocked position, phase.
-    # With all 26 entries the policy depends on irrelevant ones, such as the peg's first position.
-    observed=(3, 4, 5, 6, 12, 13, 14, 19, 20, 21, 22),
-    entropy_per_action=-1.0,
-    schedule={name: np.zeros(3) for name in ("reach", "grasp")}
-    | {name: np.array([0.0, -0.6, 0.3]) for name in ("carry", "insert")}
-    | {name: np.array([0.0, 0.5, 0.3]) for name in ("retract", "insert 2")}
-    | {name: np.array([0.0, 0.9, 0.3]) for name in ("retract 2", "insert 3")},
+    # Grasp along the peg, last blocked position, phase. With all 26 entries the policy depends on irrelevant ones, such
+    # as the peg's first position.
+    observed=(6, 19, 20, 21, 22),
+    action_dims=(1, 2),
+    decisions=("retract", "retract 2"),  # an action lasts for an attempt
+    settings=LearnerSettings(60, 20, 3, 0.97, (-1.0, -4.0)),
+    schedule={
+        "reach": np.array([-0.6, 0.3]),
+        "retract": np.array([0.5, 0.3]),
+        "retract 2": np.array([0.9, 0.3]),
+    },
 )

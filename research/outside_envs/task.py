@@ -62,6 +62,26 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class LearnerSettings:
+    """Settings of TQC that depend on the number of transitions of an episode.
+
+    Attributes:
+        learning_starts: Transitions with random actions.
+        gradient_steps: Gradient steps per transition.
+        return_steps: Transitions of a return.
+        average_decay: Decay per transition of the running average of the actor's weights, which is evaluated.
+        entropy_per_action: Target entropy of the policy for each entry of an action, at the beginning and at the end
+            of the training. Stable-Baselines3's default is −1; less noise spoils fewer attempts.
+    """
+
+    learning_starts: int = 120
+    gradient_steps: int = 2
+    return_steps: int = 5  # the reward of a success comes after some forty decisions
+    average_decay: float = 0.999
+    entropy_per_action: tuple[float, float] = (-2.0, -2.0)
+
+
+@dataclass(frozen=True)
 class OutsideTask:
     """A task in an environment of another package.
 
@@ -74,11 +94,14 @@ class OutsideTask:
         pose: (env, observation) → commanded pose (O,), at which a motion begins.
         to_action: (env, observation, command, extra) → the environment's own action.
         scripted: (env) → the environment's own action by the scripted policy, which observes the hidden goal.
-        schedule: Fixed action of each segment, by name; together the actions search without observations.
+        schedule: Fixed action in each segment in which a decision is made; together the actions search without
+            observations.
         observed: Indices of the entries that a policy with guidance observes, of the environment's observation followed
             by phase and command; all if empty.
-        entropy_per_action: Target entropy of the policy for each entry of an action; −1 is Stable-Baselines3's default,
-            and less noise spoils fewer attempts.
+        action_dims: Indices of the outputs that an action moves; all by default.
+        decisions: Names of segments; an action is applied until one of them begins. If empty, an action is applied for
+            `ACTION_REPEAT` steps.
+        settings: Settings of the learner with guidance.
     """
 
     parts: Mapping[str, Part]
@@ -91,7 +114,9 @@ class OutsideTask:
     scripted: Callable[[Any], np.ndarray]
     schedule: Mapping[str, np.ndarray] = field(default_factory=dict)
     observed: Sequence[int] = ()
-    entropy_per_action: float = -2.0
+    action_dims: Sequence[int] | None = None
+    decisions: Sequence[str] = ()
+    settings: LearnerSettings = LearnerSettings()
 
     def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
         """Return the segments, from `count` demonstrations recorded with a seed."""
@@ -125,10 +150,14 @@ class OutsideTask:
         env = self.make_env(seed)
         if guidance == "none":
             return RepeatedAction(env, segments, self.pose)
-        guided = GuidedEnv(
-            env, demonstrations=None if isinstance(guidance, Guide) else segments, guidance=guidance,
-            pose=self.pose, to_action=self.to_action, period=self.period, action_repeat=ACTION_REPEAT,
+        is_fitted = isinstance(guidance, Guide)
+        guided: gymnasium.Env = GuidedEnv(
+            env, demonstrations=None if is_fitted else segments, action_dims=None if is_fitted else self.action_dims,
+            guidance=guidance, pose=self.pose, to_action=self.to_action, period=self.period,
+            action_repeat=ACTION_REPEAT,
         )  # fmt: skip
+        if self.decisions:
+            guided = HeldAction(guided, self.decisions)
         if not self.observed:
             return guided
         observed = np.array(self.observed)
@@ -139,6 +168,27 @@ class OutsideTask:
 def num_steps(parts: Mapping[str, Part]) -> int:
     """Return the largest number of control steps of a motion."""
     return sum(part.steps + part.dwell for part in parts.values())
+
+
+class HeldAction(gymnasium.Wrapper):
+    """Wrapper that applies an action until one of the segments `decisions` begins, or until the episode ends."""
+
+    def __init__(self, env: GuidedEnv, decisions: Sequence[str]):
+        super().__init__(env)
+        self._decisions = tuple(decisions)
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Apply an action (A,); rewards and fallbacks are added up, and the violation is the largest one."""
+        total, worst, fallbacks, has_begun = 0.0, -np.inf, 0, False
+        guide, terminated, truncated = self.env.get_wrapper_attr("guide"), False, False
+        while not (has_begun or terminated or truncated):
+            before = guide.segment_name
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total, fallbacks = total + float(reward), fallbacks + info["fallback"]
+            worst = float(np.maximum(worst, info["constraint_violation"]))  # NaN if one is NaN
+            has_begun = guide.segment_name != before and guide.segment_name in self._decisions
+        info = {**info, "constraint_violation": worst, "fallback": fallbacks}
+        return observation, total, terminated, truncated, info
 
 
 class RepeatedAction(gymnasium.Wrapper):

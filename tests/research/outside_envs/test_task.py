@@ -13,7 +13,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from research.outside_envs import learn
 from research.outside_envs.table import print_table, read_rows
-from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
+from research.outside_envs.task import ACTION_REPEAT, LearnerSettings, OutsideTask, Part, Recording, num_steps
 
 PARTS = {
     "approach": Part(12, "start", -1.0),
@@ -86,6 +86,21 @@ def test_part_of_a_recording_is_reversed():
 def test_fitted_guide_serves_the_next_seed(segments):
     guide = TASK.make("kgrl", 0, segments).guide
     assert TASK.make(guide, 1, segments).guide is guide
+
+
+def test_action_lasts_until_a_segment_of_a_decision_begins(segments):
+    task = replace(TASK, decisions=("retract",), observed=(1, 2), action_dims=(1,))
+    env = task.make("kgrl", 0, segments)
+    assert env.action_space.shape == (1,)
+    observation, _ = env.reset(seed=0)
+    assert observation.shape == env.observation_space.shape == (2,)
+    _, first, *_, info = env.step(np.array([0.5]))
+    assert info["segment"] == "retract"
+    assert 27 <= info["control_steps"] <= 27 + ACTION_REPEAT
+    assert info["constraint_violation"] <= 1e-9
+    _, second, _, truncated, info = env.step(np.array([-0.5]))
+    assert truncated
+    assert first + second == -info["control_steps"] == -num_steps(PARTS)
 
 
 def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
@@ -165,9 +180,9 @@ def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
 
 def test_critics_observe_the_hidden_values_and_the_actor_does_not(segments):
     env = TASK.make("kgrl", 0, segments)
-    model, rows = learn.train(env, 16, 0)
+    model, rows = learn.train(env, 16, 0, LearnerSettings())
     assert len(rows) == 16
-    assert model.num_timesteps > learn.LEARNING_STARTS
+    assert model.num_timesteps > LearnerSettings.learning_starts
     observation, _ = env.reset(seed=0)
     known = [np.append(observation, value).astype(np.float32) for value in (0.0, 0.7)]
     assert np.array_equal(*(model.predict(one, deterministic=True)[0] for one in known))
