@@ -90,12 +90,12 @@ motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, m
 
 outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, in an environment of its own, hours (downloads 3 GB)
 	$(OUTSIDE)/bin/python -m pytest -q -c /dev/null --noconftest tests/research/outside_envs
-	for task in peg assembly; do for method in kgrl residual clipped_residual tqc rlpd; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method $$method --seeds 20 21 22 23 24 --out runs/outside; \
-	  done; done
-	for task in peg assembly nut; do \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method baselines --out runs/outside; \
-	  $(OUTSIDE)/bin/python -m research.outside_envs.learn $$task --method kgrl --seeds 20 21 22 23 24 --out runs/outside; done
+	learn="$(OUTSIDE)/bin/python -m research.outside_envs.learn"; \
+	for method in kgrl residual clipped_residual tqc rlpd; do \
+	  $$learn peg --method $$method --seeds $$(seq 50 59) --out runs/outside; \
+	  $$learn assembly --method $$method --seeds $$(seq 20 24) --out runs/outside; \
+	  [ $$method = rlpd ] || $$learn nut --method $$method --seeds $$(seq 20 24) --out runs/outside; done; \
+	for task in peg assembly nut; do $$learn $$task --method baselines --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
