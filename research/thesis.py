@@ -190,9 +190,10 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
     ("layer_norm", lambda p: p.layer_norm, "layer normalization"),
     (
         "constant_episodes",
-        lambda p: p.constant_episodes > 0,
+        lambda p: p.constant_episodes > 0 and not p.init_from,  # it counts the episodes of the earlier run
         "the first {constant_episodes} episodes repeat one action each",
     ),
+    ("init_from", lambda p: bool(p.init_from), "learning continues from an earlier run"),
     ("ez_greedy", lambda p: p.ez_greedy > 0, "temporally extended exploration (εz-greedy)"),
     (
         "demonstration_episodes",
