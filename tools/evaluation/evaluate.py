@@ -27,8 +27,8 @@ from guiderail.tools.evaluation.evaluation import (
     Evaluation,
     compare,
     episodes_file,
-    has_rows,
     load_or_compute,
+    read_complete,
     statistics,
 )
 from guiderail.tools.evaluation.forks import check_processes, forked_map
@@ -52,7 +52,7 @@ from guiderail.tools.evaluation.subject import (
 )
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.tables import read_table, table_text
+from guiderail.tools.tables import table_text
 from guiderail.tools.visualization.style import is_demonstrated
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
@@ -295,7 +295,9 @@ def evaluate(
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {name: _episodes_file(subject, name, where, how, functions.get(name)) for name in (POLICY, *others)}
         stored = {
-            name: read_table(file) for name in others if (file := files[name]) is not None and has_rows(file, episodes)
+            name: rows
+            for name in others
+            if (file := files[name]) is not None and (rows := read_complete(file, episodes)) is not None
         }
         missing = {name: make for name, make in others.items() if name not in stored}
         skipped = [name for name, make in missing.items() if not is_compatible(make, evaluation_env)]

@@ -36,17 +36,23 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: i
     Raises:
         InputError: If the file is damaged or cannot be written.
     """
-    if not has_rows(file, episodes):
-        rows = compute()
-        if not len(rows):
-            return rows
-        write_atomically(file, table_text(rows).encode())
+    if (stored := read_complete(file, episodes)) is not None:
+        return stored
+    rows = compute()
+    if not len(rows):
+        return rows
+    write_atomically(file, table_text(rows).encode())
     return read_table(file)
 
 
-def has_rows(file: Path, episodes: int | None = None) -> bool:
-    """Return True if a table exists and has a row for each of `episodes`; raise an InputError if it is damaged."""
-    return file.exists() and (episodes is None or len(read_table(file)) == episodes)
+def read_complete(file: Path, episodes: int | None = None) -> pd.DataFrame | None:
+    """Return the rows of a table; None if it does not exist, or does not have a row for each of `episodes`.
+
+    Raises:
+        InputError: If the table is damaged.
+    """
+    rows = read_table(file) if file.exists() else None
+    return None if rows is None or (episodes is not None and len(rows) != episodes) else rows
 
 
 def episodes_file(

@@ -30,7 +30,7 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_run
-from guiderail.tools.evaluation.evaluation import has_rows, load_or_compute
+from guiderail.tools.evaluation.evaluation import load_or_compute, read_complete
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
@@ -336,7 +336,7 @@ def _is_evaluated(job: Job, episodes: int, eval_set: EvalSet) -> bool:
     """Return True if all episodes of an evaluation set are stored; a damaged table is refused when it is read."""
     file = _evaluated_file(job, episodes, eval_set)[0]
     try:
-        return has_rows(file, eval_set.episodes)
+        return read_complete(file, eval_set.episodes) is not None
     except InputError:
         return True
 
