@@ -13,6 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import norm
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
@@ -187,17 +188,17 @@ class CartesianPositionController(LeafSystem):
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
         if velocities is not None:
             # The solver satisfies limits only to its tolerance; the command satisfies them exactly.
-            discrete_state.set_value(self._command, np.clip(q + self._period * velocities, *limits))
+            # np.clip is slower: it inspects its arguments in Python.
+            next_q = q + self._period * velocities
+            discrete_state.set_value(self._command, np.minimum(np.maximum(next_q, limits[0]), limits[1]))
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
         """Return the tool velocity [rotational, translational] (6,) that reaches X_TPd in one period, within limits."""
         turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
-        return np.concatenate(
-            [
-                _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational),
-                _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational),
-            ]
-        )
+        V = np.empty(6)
+        V[:3] = _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational)
+        V[3:] = _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational)
+        return V
 
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
@@ -221,5 +222,5 @@ def _within(values: np.ndarray, limits: tuple[np.ndarray, np.ndarray]) -> bool:
 
 def _limited(velocity: np.ndarray, limit: float) -> np.ndarray:
     """Return the velocity scaled down to the speed limit."""
-    speed = float(np.linalg.norm(velocity))
+    speed = norm(velocity)
     return velocity if speed <= limit else velocity * (limit / speed)

@@ -1,7 +1,9 @@
 """Contact between two sets of bodies, checked at every plant step."""
 
 from collections.abc import Sequence
+from itertools import product
 
+import numpy as np
 from pydrake.common.value import Value
 from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
@@ -10,6 +12,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+
+ZERO, ONE = np.zeros(1), np.ones(1)  # the values of flags; converting lists takes longer than the check of a contact
 
 
 class ContactDetector(LeafSystem):
@@ -46,10 +50,10 @@ class ContactDetector(LeafSystem):
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
     ):
         super().__init__()
-        self._bodies = {int(body.index()) for body in bodies}
-        self._obstacles = {int(body.index()) for body in obstacles}
-        if self._bodies & self._obstacles:
+        indices, others = ({int(body.index()) for body in group} for group in (bodies, obstacles))
+        if indices & others:
             raise InputError("a body can't collide with itself: bodies and obstacles overlap")
+        self._pairs = set(product(indices, others)) | set(product(others, indices))
         self._body_of = {
             geometry: int(body.index())
             for body in (*bodies, *obstacles)
@@ -73,24 +77,23 @@ class ContactDetector(LeafSystem):
         largest: float | None = None
         for i in range(results.num_point_pair_contacts()):
             pair = results.point_pair_contact_info(i)
-            if self._is_collision(int(pair.bodyA_index()), int(pair.bodyB_index())):
+            if (int(pair.bodyA_index()), int(pair.bodyB_index())) in self._pairs:
                 f = pair.contact_force()
                 largest = max(largest or 0.0, float(f @ f) ** 0.5)
         for i in range(results.num_hydroelastic_contacts()):
             info = results.hydroelastic_contact_info(i)
             surface = info.contact_surface()
-            bodies = [self._body_of.get(geometry) for geometry in (surface.id_M(), surface.id_N())]
-            if self._is_collision(*bodies):
+            if (self._body_of.get(surface.id_M()), self._body_of.get(surface.id_N())) in self._pairs:
                 f = info.F_Ac_W().translational()
                 largest = max(largest or 0.0, float(f @ f) ** 0.5)
         return largest
 
-    def _is_collision(self, a: int | None, b: int | None) -> bool:
-        return (a in self._bodies and b in self._obstacles) or (b in self._bodies and a in self._obstacles)
-
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         force = self._largest_force(context)
-        discrete_state.set_value(self._collision, [float(force is not None)])
-        discrete_state.set_value(self._contact_force, [force or 0.0])
-        if force is not None:
-            discrete_state.set_value(self._has_collided, [1.0])
+        if force is None:
+            discrete_state.set_value(self._collision, ZERO)
+            discrete_state.set_value(self._contact_force, ZERO)
+        else:
+            discrete_state.set_value(self._collision, ONE)
+            discrete_state.set_value(self._contact_force, [force])
+            discrete_state.set_value(self._has_collided, ONE)

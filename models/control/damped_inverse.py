@@ -26,10 +26,10 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
         The joint velocities (n,), and True if J is regular: then nothing is damped and J v = V.
     """
     U, sigma, WT = np.linalg.svd(TOOL_SCALE[:, None] * J, full_matrices=False)
-    inverse = sigma / np.maximum(sigma, REGULAR) ** 2
-    preferred_modes = WT @ preferred
-    v = preferred + WT.T @ (inverse * (U.T @ (TOOL_SCALE * V)) - inverse * sigma * preferred_modes)
-    return v, bool(sigma[-1] >= REGULAR)
+    is_regular = bool(sigma[-1] >= REGULAR)
+    inverse = sigma / (sigma if is_regular else np.maximum(sigma, REGULAR)) ** 2
+    v = preferred + WT.T @ (inverse * (U.T @ (TOOL_SCALE * V)) - inverse * sigma * (WT @ preferred))
+    return v, is_regular
 
 
 def is_following(J: np.ndarray, v: np.ndarray, V: np.ndarray) -> bool:
