@@ -107,6 +107,11 @@ def register_guidance(
     return add
 
 
+def is_demonstrated(guidance: str | None) -> bool:
+    """Return True if an action of zero reproduces the demonstration, so that its success needs no learning."""
+    return guidance in GUIDANCE.names() and GUIDANCE.get(str(guidance)).demonstrates
+
+
 def possible_guidance(provided: Collection[str]) -> list[str]:
     """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
     return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]

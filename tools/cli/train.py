@@ -65,6 +65,13 @@ def train(
             "--pictures/--no-pictures",
         ),
     ] = None,
+    evaluate: Annotated[
+        int | None,
+        option(
+            "Number of held-out episodes of the policy at the end, without baselines; guiderail evaluate RUN compares "
+            "it with them.  [default: none]"
+        ),
+    ] = None,
     human_in_the_loop: Annotated[
         bool,
         option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
@@ -90,6 +97,8 @@ def train(
     a checkpoint, the policy, a learning curve and a page that shows held-out episodes. An interrupted run is resumed
     with --resume and ends in the same result.
     """
+    if evaluate is not None and evaluate < 1:
+        raise InputError(f"--evaluate is the number of held-out episodes: give at least 1, not {evaluate}")
     task, folders = (None, ()) if task is None else cli.find_task(task, imports)
     modules = (*folders, *(imports or ()))
     if task is not None and not modules and not resume:
@@ -146,6 +155,8 @@ def train(
             raise InputError("training on hardware has no human in the loop: leave --human-in-the-loop out")
         if log:
             raise InputError("training on hardware writes no learning log: leave --log out")
+        if evaluate is not None:
+            raise InputError("after training on hardware, use guiderail evaluate RUN: leave --evaluate out")
         if settings.get("num_envs", "0") != "0":
             raise InputError("there is one robot: leave --num-envs out")
         from guiderail.tools.hardware.train import train_on_robot
@@ -184,7 +195,15 @@ def train(
         pictures=pictures is not False,
         make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
     )
-    print_result(run.summary, as_json)
+    held_out: dict[str, Any] = {}
+    if evaluate is not None:
+        from guiderail.tools.evaluation.evaluate import evaluate_trained
+        from guiderail.tools.evaluation.evaluation import statistics
+        from guiderail.tools.learning.run_folder import RunFolder
+
+        rows = evaluate_trained(RunFolder(run.path), run.config, evaluate)
+        held_out = {"held_out_episodes": len(rows), **statistics(rows, "held_out_")}
+    print_result(run.summary | held_out, as_json)
 
 
 def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:

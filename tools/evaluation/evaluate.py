@@ -12,9 +12,11 @@ import gymnasium
 import numpy as np
 import pandas as pd
 
+from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES, POSE_SIZE
+from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
@@ -28,6 +30,7 @@ from guiderail.tools.evaluation.evaluation import (
     compare,
     episodes_file,
     load_or_compute,
+    policy_digest,
     read_complete,
     statistics,
 )
@@ -53,7 +56,6 @@ from guiderail.tools.evaluation.subject import (
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
-from guiderail.tools.visualization.style import is_demonstrated
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
@@ -191,6 +193,30 @@ def evaluate_once(
         file = episodes_file(folder, name, config, environment, about=about, **how)
         rows = load_or_compute(file, compute, how.get("episodes"))
     return rows if len(rows) else None
+
+
+def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.DataFrame:
+    """Return held-out episodes of a run's policy in its own environment, one row each.
+
+    They are stored in the run's folder; stored ones are returned. The number of processes is that of the cores.
+
+    Raises:
+        InputError: If the run has no policy, a stored file is damaged or cannot be written, or `episodes` is not a
+            whole number of at least 1.
+    """
+    policy = Policy.load(folder.path)
+    rows = evaluate_once(
+        folder.path / POLICY_FOLDER,
+        POLICY,
+        config,
+        lambda env: policy,
+        config.environment,
+        about=policy_digest(folder.path),
+        episodes=episodes,
+        seed=HELD_OUT_SEED,
+        processes=None,
+    )
+    return pd.DataFrame() if rows is None else rows
 
 
 def evaluate(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
@@ -34,7 +35,7 @@ from guiderail.tools.evaluation.subject import (
 )
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import is_demonstrated, label, legend, new_figure, save_figure
+from guiderail.tools.visualization.style import label, legend, new_figure, save_figure
 
 Environment = Mapping[str, Any]
 

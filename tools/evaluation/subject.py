@@ -13,6 +13,7 @@ from typing import Any
 
 import gymnasium
 
+from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import TASKS, known_tasks
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
@@ -26,7 +27,6 @@ from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_se
 from guiderail.tools.files import path_exists
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
-from guiderail.tools.visualization.style import is_demonstrated
 
 
 def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:

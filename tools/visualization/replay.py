@@ -19,6 +19,7 @@ from pydrake.geometry import Rgba, Role
 from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import is_task_folder
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
@@ -30,7 +31,6 @@ from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
 from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_page, write_atomically
-from guiderail.tools.visualization.style import is_demonstrated
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -15,18 +15,16 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import known_tasks
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.evaluation.evaluate import evaluate_once
+from guiderail.tools.evaluation.evaluate import evaluate_once, evaluate_trained
 from guiderail.tools.evaluation.evaluation import (
     BASELINES_FOLDER,
     POLICY,
-    POLICY_FOLDER,
-    policy_digest,
     stored_episodes,
 )
 from guiderail.tools.evaluation.metrics import TOLERANCE
@@ -36,7 +34,7 @@ from guiderail.tools.experiments.declaration import source_file
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_columns, read_table
-from guiderail.tools.visualization.style import color, is_demonstrated, label
+from guiderail.tools.visualization.style import color, label
 
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
@@ -288,17 +286,8 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
 def _evaluate(run: Run, episodes: int) -> None:
     """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
     environment = run.config.environment
-    policy = Policy.load(run.path)
+    evaluate_trained(RunFolder(run.path), run.config, episodes)
     evaluation: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
-    evaluate_once(
-        run.path / POLICY_FOLDER,
-        POLICY,
-        run.config,
-        lambda env: policy,
-        environment,
-        about=policy_digest(run.path),
-        **evaluation,
-    )
     is_demonstration = is_demonstrated(environment.get("guidance"))
     for name in BASELINES:
         stored_name = "demonstration" if name == "zero" and is_demonstration else name

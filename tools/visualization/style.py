@@ -16,11 +16,6 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.tools.files import check_picture, write_atomically
 
 
-def is_demonstrated(guidance: str | None) -> bool:
-    """Return True if an action of zero reproduces the demonstration, so that its success needs no learning."""
-    return guidance in GUIDANCE.names() and GUIDANCE.get(str(guidance)).demonstrates
-
-
 def label(guidance: str) -> str:
     """Return the label of a guidance in a legend."""
     return GUIDANCE.get(guidance).label if guidance in GUIDANCE.names() else guidance

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import gymnasium
 import numpy as np
+import pandas as pd
 import pytest
 import typer
 
@@ -51,6 +52,8 @@ def trained(bead_run):
         (["train", "Bead", "--out", "new", "--episodes", "0"], "at least one episode"),
         (["train", "Bead", "--out", "new", "--episodes", "1000000001"], "at most 1000000000 episodes"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
+        (["train", "Bead", "--out", "new", "--evaluate", "0"], "give at least 1, not 0"),
+        (["train", "Bead", "--out", "new", "--station", "hardware", "--evaluate", "3"], "leave --evaluate out"),
         (["train", "Bead", "--out", "new", "--seed", "-1"], "a seed is a whole number"),
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),
         (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "did you mean batch_size?"),
@@ -222,6 +225,18 @@ def test_train_writes_all_files_of_a_run(capsys, tmp_path):
     assert err.index("training is complete; drawing the learning curve") > err.index("Bead 2/2")
     expected = {"config.yaml", "episodes.csv", "checkpoint", "policy.safetensors", "policy.json", "learning_curve.png"}
     assert expected <= {path.name for path in (tmp_path / "run").iterdir()}
+
+
+def test_train_evaluates_its_policy_on_request(capsys, tmp_path):
+    options = ["--episodes", 1, "--set", "net_arch=8", "--no-pictures", "--json"]
+    code, out, _ = call(capsys, "train", "Bead", "--out", tmp_path / "run", "--evaluate", 3, *options)
+    assert code == 0
+    result = json.loads(out)
+    assert result["held_out_episodes"] == 3
+    (stored,) = (tmp_path / "run" / "held_out").glob("policy-*.csv")
+    assert result["held_out_success_rate"] == pd.read_csv(stored)["success"].mean()
+    evaluated = json.loads(call(capsys, "evaluate", tmp_path / "run", "--episodes", 3, "--json")[1])
+    assert result["held_out_mean_return"] == evaluated["mean_return"]
 
 
 def test_evaluate_prints_one_json_object(capsys, trained):
