@@ -101,7 +101,10 @@ class Job:
         given["settings"] = settings
         environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
         given |= {"imports": study.imports, "seed": self.seed}
-        return configure(study.task, environment, episodes=max(episodes, 1), **given)
+        config = configure(study.task, environment, episodes=max(episodes, 1), **given)
+        if config.learner.stop_after_successes:
+            raise InputError("the runs of a study have equal lengths: leave the setting stop_after_successes out")
+        return config
 
     @cached_property
     def folder(self) -> RunFolder:

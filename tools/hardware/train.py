@@ -82,6 +82,8 @@ def train_on_robot(
         config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
+    if config.learner.stop_after_successes:
+        raise InputError("the operator ends training on a robot: leave the setting stop_after_successes out")
     config = replace(config, simulated_driver=connection.sim)
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
         folder.write_config(config)

@@ -156,10 +156,15 @@ class ParallelLearner(Learner):
         row = rollout(self._env, act, recorder, *self._callbacks, index=index)
         return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)
 
+    def finish(self) -> None:
+        """End the actors, whose episodes nothing will be learned from."""
+        self.close()
+
     def close(self) -> None:
         """End the actors."""
         if self._forks is not None:
             self._forks.close()
+            self._forks = None
 
     def metrics(self) -> Mapping[str, float]:
         """Return the metrics that the learner recorded since the last call."""

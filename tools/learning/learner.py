@@ -64,6 +64,8 @@ class LearnerConfig:
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
+        stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
+            never. The run may then be resumed, but does not continue.
         takes_images: True if the learner's networks take observations with images.
     """
 
@@ -74,6 +76,7 @@ class LearnerConfig:
     symmetry: bool | Literal["near"] = False
     pipelined: bool = False
     num_envs: Annotated[NonNegative, Field(le=1024)] = 0
+    stop_after_successes: NonNegative = 0
 
 
 class Learner(Callback, ABC):

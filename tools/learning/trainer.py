@@ -189,6 +189,8 @@ def _train(
     num_demonstrated = 0 if demonstrator is None else config.learner.demonstration_episodes
     training_time, saving_time, last_saving_time = 0.0, 0.0, 0.0
     for episode in range(len(rows), config.episodes):
+        if _ends_with_successes(rows, config.learner.stop_after_successes):
+            break
         started = time.perf_counter()
         act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner.act
         if config.learner.num_envs:
@@ -211,6 +213,7 @@ def _train(
         learning_log.record(rows, learner.metrics)
         saving_time_with_next = step_log.seconds + saving_time + last_saving_time
         is_last = episode + 1 == config.episodes or (sb3_callbacks is not None and sb3_callbacks.is_stopped)
+        is_last = is_last or _ends_with_successes(rows, config.learner.stop_after_successes)
         if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode == 0 or is_last:
             started = time.perf_counter()
             _save(folder, config, rows, learner, env, supervised)
@@ -220,6 +223,7 @@ def _train(
         if is_last:
             break
     learner.finish()
+    remove_step_logs(folder.steps, len(rows))  # of episodes that actors simulated ahead of an early end
     learning_log.record(rows, learner.metrics, is_finished=True)
     try:
         policy = learner.policy({"task": config.task, **described_observation(env)})
@@ -231,6 +235,12 @@ def _train(
         raise InputError(f"{type(learner).__name__}.policy must return a Policy, not {brief(policy)}")
     policy.save(folder.path, write=write_atomically)
     return rows
+
+
+def _ends_with_successes(rows: Sequence[Mapping[str, Any]], number: int) -> bool:
+    """Return True if the last `number` episodes are successes of the learner itself; False if `number` is 0."""
+    last = rows[-number:] if number else []
+    return len(last) == number > 0 and all(row["success"] and not row.get("is_demonstration") for row in last)
 
 
 def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored: int, folder: RunFolder) -> None:

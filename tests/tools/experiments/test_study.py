@@ -421,6 +421,7 @@ WRONG = [
     ({"learner": {"settings": {"init_from": None}}}, "init_from names the folder of a run, not None"),
     ({"methods": {"one": {"learner": {"settings": {"init_from": "{method}"}}}}}, "the placeholders are {seed}"),
     ({"methods": {"learner": {"seeds": [True]}}}, "input should be a valid integer, not True"),
+    ({"learner": {"settings": {"stop_after_successes": 3}}}, "runs of a study have equal lengths"),
     ({"after_episodes": [0]}, "greater than or equal to 1"),
     ({"after_episodes": [True]}, "input should be a valid integer, not True"),
     ({"after_episodes": [5], "learner": {"episodes": 1}}, "no method trains for 5 episodes"),

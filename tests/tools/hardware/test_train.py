@@ -547,14 +547,15 @@ def test_run_is_resumed_with_the_kind_of_driver_that_it_began_with(sim, words, t
         train_on_robot(None, tmp_path, connection, environment={"station": "hardware"}, given={}, resume=True)
 
 
-def test_train_raises_when_demonstrations_are_requested(tmp_path):
-    with pytest.raises(InputError, match="demonstration_episodes"):
+@pytest.mark.parametrize("setting", ["demonstration_episodes", "stop_after_successes"])
+def test_settings_without_meaning_on_a_robot_are_refused(setting, tmp_path):
+    with pytest.raises(InputError, match=f"leave the setting {setting} out"):
         train_on_robot(
             "BncConnector",
             tmp_path / "run",
             RobotConnection(sim=True),
             environment={"station": "hardware", "guidance": "kgrl"},
             given={},
-            settings={"demonstration_episodes": 1},
+            settings={setting: 1},
         )
     assert not (tmp_path / "run").exists()

@@ -16,7 +16,9 @@ from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
+from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
+from guiderail.tools.learning import actors, trainer
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
@@ -168,6 +170,43 @@ def test_stopped_run_is_ended_early(changes, episodes, bead_config, tmp_path, mo
     run_training(stopped, resumed_config(stopped, None, {}, {"episodes": episodes}, None), resume=True)
     assert_same_run(short, stopped)
     assert stopped.config() == short.config()
+
+
+@pytest.mark.parametrize("num_envs", [0, 3])
+def test_run_ends_after_successes_in_a_row_also_if_it_is_resumed(num_envs, bead_config, tmp_path, monkeypatch):
+    successes = dict(enumerate([1, 1, 0, 1, 1, 1, 1, 1]))
+    own_row = trainer.rollout
+
+    def row_of(*arguments, index, **how):
+        return own_row(*arguments, index=index, **how) | {"success": successes[index]}
+
+    for module in (trainer, actors):
+        monkeypatch.setattr(module, "rollout", row_of)
+    learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
+    config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
+    run_training(whole, config)
+    assert [row["success"] for row in whole.episodes().to_dict("records")] == [1, 1, 0, 1, 1, 1]
+    assert len(list(whole.steps.glob("*.parquet"))) == 6
+    assert Policy.load(whole.path)
+
+    def stop(row):
+        if row["episode"] == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_training(stopped, config, report=stop)
+    run_training(stopped, config, resume=True)
+    assert_same_run(whole, stopped)
+    run_training(stopped, config, resume=True)
+    assert_same_run(whole, stopped)
+
+
+def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "rollout", lambda *a, own=trainer.rollout, **how: own(*a, **how) | {"success": 1})
+    learner = replace(bead_config.learner, stop_after_successes=2, demonstration_episodes=2)
+    folder = RunFolder(tmp_path / "run")
+    run_training(folder, replace(bead_config, learner=learner), demonstrator=zero_policy)
+    assert len(folder.episodes()) == 4
 
 
 def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
