@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ COLUMNS = (
 )  # fmt: skip
 README_COLUMNS = (
     "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
-    "training episodes per seed (seeds)", "stopped in training, guided [%]",
-    "stopped in training, residual RL [%]",
+    "episodes with violations, guided / residual RL [%]", "stopped in training, guided / residual RL [%]",
+    "training episodes per seed (seeds)",
 )  # fmt: skip
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
@@ -54,9 +54,9 @@ def task_table(task: str, tables: Path) -> str:
 
 
 def readme_table(tables: Path) -> str:
-    """Return the Markdown table of the README: a row for each section, hard tasks first."""
+    """Return the Markdown table of the README: a row for each section of a hard task."""
     rows = []
-    for section in sorted((s for sections in SECTIONS.values() for s in sections), key=lambda s: "hard" not in s.title):
+    for section in (one for sections in SECTIONS.values() for one in sections if ", hard" in one.title):
         named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
         guided = [named[name] for name in section.guided if name in named]
         if not guided:
@@ -71,9 +71,9 @@ def readme_table(tables: Path) -> str:
                 "; ".join(f"{_label(row)} {_percent((row, seeds))}" for row, seeds in guided),
                 _percent(residual),
                 f"{_percent(scripted)} / {_percent(random)}",
+                _compared(_violated, guided, residual),
+                _compared(_stopped, guided, residual),
                 "; ".join(efforts),
-                "; ".join(f"{row.name.split(',')[0]} {_stopped(seeds)}" for row, seeds in guided),
-                _stopped(residual[1]) if residual else "–",
             )
         )
     return _markdown(README_COLUMNS, rows)
@@ -275,12 +275,12 @@ def _forces(parts: Sequence[pd.DataFrame]) -> str:
 
 
 def _success(seeds: pd.DataFrame) -> str:
-    """Return the mean success [%] with the range over several seeds; a single seed is marked."""
-    rates = 100 * seeds["success_rate" if _is_evaluated(seeds) else "training_success_rate"].astype(float)
+    """Return the mean held-out success [%] with the range over several seeds; a single seed is marked."""
+    rates = 100 * seeds["success_rate"].astype(float)
     span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
     is_single = len(seeds) == 1 and _is_trained(seeds)
     mean = f"{rates.mean():.{int(99.5 <= rates.mean() < 100)}f}"  # 99.6 is not written as 100
-    return f"{mean}{' (one seed)' if is_single else span}{'' if _is_evaluated(seeds) else ' in training'}"
+    return f"{mean}{' (one seed)' if is_single else span}"
 
 
 def _percent(result: tuple[Row, pd.DataFrame] | None) -> str:
@@ -300,6 +300,22 @@ def _effort(row: Row, seeds: pd.DataFrame) -> str:
     if number := demonstrated_episodes(row):
         demonstrated = f", {number} of them demonstrated"
     return f"{episodes}{demonstrated} ({len(seeds)})"
+
+
+def _compared(
+    share: Callable[[pd.DataFrame], str],
+    guided: Sequence[tuple[Row, pd.DataFrame]],
+    residual: tuple[Row, pd.DataFrame] | None,
+) -> str:
+    """Return a share of the guided methods, by name if they differ, and of residual RL; a dash without it."""
+    shares = [share(seeds) for _, seeds in guided]
+    named = "; ".join(f"{row.name.split(',')[0]} {one}" for (row, _), one in zip(guided, shares, strict=True))
+    return f"{named if len(set(shares)) > 1 else shares[0]} / {share(residual[1]) if residual else '–'}"
+
+
+def _violated(seeds: pd.DataFrame) -> str:
+    """Return the share of held-out episodes with a command outside the constraints [%]."""
+    return f"{100 * seeds['violating_episodes'].sum() / seeds['episodes'].sum():.0f}"
 
 
 def _stopped(seeds: pd.DataFrame) -> str:

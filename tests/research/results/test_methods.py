@@ -28,11 +28,10 @@ def test_readme_has_the_table_of_the_stored_results():
     assert update_readme(readme, readme_table(TABLES)) == readme, "the README is stale: python -m research.results"
 
 
-def test_readme_table_has_at_most_ten_rows_with_hard_ones_first():
+def test_readme_table_has_at_most_ten_rows_of_hard_tasks():
     titles = [row[0] for row in rows(readme_table(TABLES))]
-    assert len(titles) <= 10
-    hard = ["hard" in title for title in titles]
-    assert hard == sorted(hard, reverse=True)
+    assert 4 <= len(titles) <= 10
+    assert all("hard" in title for title in titles)
 
 
 def test_pages_have_the_stored_results(tmp_path):
@@ -92,7 +91,8 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
     ]
     (row,) = rows(readme_table(tmp_path))
     effort = "60 (1); residual RL: 60 (2)"
-    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", effort, "KGRL 3", "6"]
+    # 3 of 200 held-out episodes with violations are 1.5 %, 4 of 60 + 3 of 60 stopped ones 6 %.
+    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "0 / 2", "3 / 6", effort]
 
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
@@ -139,7 +139,7 @@ def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
     line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,0\n"
     (tmp_path / "peers_connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
-    assert rows(readme_table(tmp_path))[0][-2:] == ["KGRL –", "–"]
+    assert rows(readme_table(tmp_path))[0][5] == "– / –"
 
 
 def test_training_success_is_marked_when_not_evaluated(tmp_path):
@@ -150,14 +150,12 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
     )
     (row,) = rows(task_table("NarrowPassage", tmp_path))
     assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "–", "0, 3, never", "none", "(3.0)"]
-    (row,) = rows(readme_table(tmp_path))
-    assert row[1] == "KGRL 58 (25–100) in training"
 
 
 def test_results_with_the_offset_of_the_run_are_marked():
     table = {row[0]: row for row in rows(readme_table(TABLES))}
     assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99.5 (96–100) †", "100 †", "98 / 52"]
-    assert table["Grid clamp, hard"][4] == "60, 3 of them demonstrated (10); residual RL: 60 (5)"
+    assert table["Grid clamp, hard"][6] == "60, 3 of them demonstrated (10); residual RL: 60 (5)"
     assert "†" not in "".join(table["Connector, hard"])
     (clamp,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp")
     (sentence,) = offsets(clamp, TABLES)
@@ -167,7 +165,8 @@ def test_results_with_the_offset_of_the_run_are_marked():
 
 def test_spilled_episodes_count_as_stopped():
     table = {row[0]: row for row in rows(readme_table(TABLES))}
-    assert table["Pouring, hard"][5] == "RL-SCT 31"
+    assert table["Pouring, hard"][5] == "31 / –"
+    assert table["Narrow passage, hard"][5] == "sKGRL 36; KGRL 41 / 63"
 
 
 def test_update_readme_refuses_a_text_without_markers():
