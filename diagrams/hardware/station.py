@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 from pydrake.common.value import Value
@@ -53,6 +54,8 @@ from guiderail.systems.support.declarations import output_getter
 from guiderail.systems.torque_publisher import TorquePublisher
 from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 from guiderail.systems.wrench_tare import WrenchTare
+
+PROCESS_CHECK_PERIOD = 0.5  # period of checks of the robot's program while its first status is awaited [s]
 
 
 @register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)
@@ -254,8 +257,10 @@ class HardwareStation(Station):
     get_fault_output_port = output_getter("fault", "reason of a stop, (1,), a code of `Fault`")
     get_arm_state_output_port = output_getter("arm_state", "arm's state, (1,), a number of `ArmState`")
 
-    def start(self, simulator: Simulator) -> None:
+    def start(self, simulator: Simulator, check_process: Callable[[], object] | None = None) -> None:
         """Wait for the robot's first status, and initialize a simulator that contains this station.
+
+        `check_process` is called while it waits; it raises an error if the robot's program has ended.
 
         Raises:
             InputError: If no status arrives in time, or a `PoseDriver` cannot be configured.
@@ -265,7 +270,9 @@ class HardwareStation(Station):
         while self.driver.read() is None:
             if (left := end - time.monotonic()) <= 0.0:
                 raise InputError(f"no robot answers on {self.driver}: start its driver, and check the address")
-            self.driver.receive(left)
+            if check_process is not None:
+                check_process()
+            self.driver.receive(min(left, PROCESS_CHECK_PERIOD))
         if isinstance(self.driver, PoseDriver):
             self.driver.configure(make_robot_impedance(self.controller_plant, self.impedance))
         self.receive(simulator.get_mutable_context())

@@ -148,7 +148,7 @@ class SkillExecutor:
         """
         duration = min(MAX_WARM_UP_TIME, 0.5 * self._skill_station.status_limits.settling_time)
         simulator = Simulator(self._diagram)
-        self._skill_station.start(simulator)
+        self._skill_station.start(simulator, self._clock.check_robot)
         self._clock.begin()
         self._clock.advance(simulator, self._skill_station, round(duration / self._skill_station.period))
 

@@ -164,7 +164,7 @@ def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarr
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
     if max_wrench is not None:
         station.GetInputPort("max_wrench").FixValue(simulator.get_mutable_context(), max_wrench)
-    station.start(simulator)
+    station.start(simulator, clock.check_robot)
     clock.begin()
     return simulator
 

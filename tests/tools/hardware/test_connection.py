@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from contextlib import contextmanager
 from ipaddress import ip_address
 from pathlib import Path
@@ -17,6 +18,8 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.hardware.clock import WallClock
 from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli.main import main
@@ -29,6 +32,7 @@ from guiderail.tools.hardware.connection import (
     watch_process,
 )
 from guiderail.tools.hardware.executor import recordings_folder
+from guiderail.tools.hardware.preflight import start_simulator
 
 MINE = """
 from guiderail.diagrams.tasks.bnc_connector.task import BncConnector
@@ -119,6 +123,16 @@ def test_clock_raises_when_the_simulated_driver_has_ended():
         process.wait()
         with pytest.raises(DriverEndedError, match=r"the simulated driver has ended .exit code 3.: start again"):
             clock.advance(Simulator(ConstantVectorSource([0.0])), SimpleNamespace(), 1)
+
+
+def test_simulated_driver_that_ends_before_its_first_status_is_not_waited_for():
+    station = HardwareStation(BncWorkcell(), IiwaDriver("memq://"), robot_timeout=60.0)
+    clock, start = WallClock(station.driver), time.monotonic()
+    with subprocess_tied_to_parent("raise SystemExit(3)") as process:
+        watch_process(clock, process)
+        with pytest.raises(DriverEndedError, match="exit code 3"):
+            start_simulator(station, clock, None)
+    assert time.monotonic() - start < 30.0
 
 
 def test_unusable_surroundings_are_refused_before_the_driver_starts(tmp_path, monkeypatch):
