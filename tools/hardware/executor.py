@@ -295,7 +295,7 @@ class SkillExecutor:
         return write_record(step_log_file(folder, number), write)
 
 
-def _record_size(num_steps: int) -> int:
+def record_size(num_steps: int) -> int:
     """Return an upper estimate of the size of the recording of `num_steps` control steps [bytes]."""
     columns = 16 + sum(SIGNALS.values()) + len(JOINT_SIGNALS) * MAX_JOINTS
     return 200_000 + 10 * columns * num_steps
@@ -348,7 +348,7 @@ def deploy(
     task = EnvConfig.resolve(config.task, environment).make_task()
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no start pose for an arm: deploy the policy of an insertion")
-    check_room(step_log_file(recordings, 0), _record_size(task.num_steps))
+    check_room(step_log_file(recordings, 0), record_size(task.num_steps))
     if force_limit is not None:
         if not force_limit <= task.collision.above:
             raise InputError(

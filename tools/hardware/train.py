@@ -13,13 +13,15 @@ from typing import Any
 import gymnasium
 import pandas as pd
 
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.step_log import step_log_file, table
-from guiderail.tools.files import write_atomically
+from guiderail.tools.files import check_room, write_atomically
 from guiderail.tools.hardware.connection import Log, RobotConnection
+from guiderail.tools.hardware.executor import record_size
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.learner import LEARNERS, described_observation, learner_arguments
@@ -62,8 +64,8 @@ def train_on_robot(
 
     Raises:
         InputError: If the task cannot be trained on hardware, a setting is invalid or needs demonstrations, the folder
-            exists or, with `resume`, contradicts an argument or the kind of driver, no robot answers, or a check fails
-            or is not confirmed.
+            exists, has no room for the step log or, with `resume`, contradicts an argument or the kind of driver, no
+            robot answers, or a check fails or is not confirmed.
     """
     folder = RunFolder(out)
     options = connection.environment_options(str(environment["station"]))
@@ -85,6 +87,9 @@ def train_on_robot(
     if config.learner.stop_after_successes:
         raise InputError("the operator ends training on a robot: leave the setting stop_after_successes out")
     config = replace(config, simulated_driver=connection.sim)
+    if config.step_log:
+        num_steps = EnvConfig.resolve(config.task, config.environment).make_task().num_steps
+        check_room(step_log_file(folder.steps, 0), config.episodes * record_size(num_steps))
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
         folder.write_config(config)
         try:

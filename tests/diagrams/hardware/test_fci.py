@@ -462,6 +462,8 @@ def test_station_stops_the_robot_after_a_reflex(robot):
 class LoopClock:
     """Clock that advances a station by its own period."""
 
+    check_robot = None
+
     def begin(self):
         pass
 

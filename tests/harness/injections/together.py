@@ -16,6 +16,7 @@ class Together:
     """
 
     clock: float | None = None
+    check_robot = None
 
     def __init__(self, workcell, lcm, start, has_monitor=True):
         self.robot = SimulatedIiwa(workcell, lcm)

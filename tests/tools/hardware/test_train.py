@@ -3,6 +3,7 @@
 from contextlib import contextmanager
 from dataclasses import replace
 from signal import SIGTERM, raise_signal
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -558,4 +559,12 @@ def test_settings_without_meaning_on_a_robot_are_refused(setting, tmp_path):
             given={},
             settings={setting: 1},
         )
+    assert not (tmp_path / "run").exists()
+
+
+def test_folder_without_room_for_the_step_log_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=9))
+    environment = {"station": "hardware", "guidance": "kgrl"}
+    with pytest.raises(InputError, match="has room for 9 bytes"):
+        train_on_robot("BncConnector", tmp_path / "run", RobotConnection(sim=True), environment=environment, given={})
     assert not (tmp_path / "run").exists()
