@@ -79,7 +79,7 @@ class CartesianImpedanceController(LeafSystem):
     J is the Jacobian of P, e the pose error, V the velocity of P and N the projector into the null space; see
     `impedance_torques`. The stiffness K may be given in the axes of any frame. The orientation error is computed from
     quaternions, so no orientation is singular. The damping D follows from K and the arm's inertia in its present
-    posture. If commands stop, the last valid one remains in force (`LastValidPose`).
+    posture. If commands stop, the last valid one is followed (`LastValidPose`).
 
     .. pydrake_system::
 
@@ -100,10 +100,10 @@ class CartesianImpedanceController(LeafSystem):
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
     is not connected, commands never time out. ``max_wrench`` is (8,), limits of [fx fy fz tx ty tz] along the axes of
     the gains, of the norm of the force and of the norm of the torque [N, Nm]; it lowers the bound and cannot raise it.
-    While one of its numbers is NaN or negative, the last valid one remains in force (`LastValidBound`).
+    While one of its numbers is NaN or negative, its last valid value is used (`LastValidBound`).
     ``generalized_force`` is (n,), joint torques [Nm], in the order of the plant's velocities, as ``estimated_state``.
-    The actuation port of a plant has the order of its actuators; if this is another one, connect it by a `MatrixGain`
-    with the matrix ``plant.MakeActuationMatrix().T``. ``impedance_wrench`` is (6,), force first, in the axes of T.
+    If the plant's actuators have another order, connect its actuation port by a `MatrixGain` with the matrix
+    ``plant.MakeActuationMatrix().T``. ``impedance_wrench`` is (6,), force first, in the axes of T.
     ``saturation`` (1,) is 1 while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid
     command is available.
 

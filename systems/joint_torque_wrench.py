@@ -35,8 +35,8 @@ class JointTorqueWrench(LeafSystem):
     is (6,), at the tool center P in the axes of T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without
     direct feedthrough: one sample old, and zero after an initialization. The first sample initializes the filter,
     because a filter that starts at zero would not have reached the sensors' bias when it is tared. Samples that are not
-    finite are skipped, and torques are clipped to `MAX_TORQUE`, so that the filter forgets a single false sample of any
-    size within a few time constants.
+    finite are skipped. Torques are clipped to `MAX_TORQUE`, so that the effect of a single false sample of any size
+    decays within some time constants.
 
     Args:
         plant: Model of the arm alone, finalized.

@@ -13,11 +13,11 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class PoseRateLimiter(LeafSystem):
     """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the blend factor is zero or NaN the output is the measured pose. While it is positive the output moves from
+    While the blend factor is zero or NaN, the output is the measured pose. While it is positive the output moves from
     there towards the desired pose; if it is positive at initialization, the output starts from the pose measured then.
     In each period the position moves along a straight line by at most speed times period; each angle turns separately,
-    in the shorter direction. A desired pose within the speed limits is output unchanged. A desired pose that is not
-    finite is ignored, and so is a measured pose: the last output is kept.
+    in the shorter direction. A desired pose within the speed limits is output unchanged. A desired or measured
+    pose that is not finite is ignored: the last output is kept.
 
     .. pydrake_system::
 

@@ -5,13 +5,13 @@ are the impulse responses. Its half-width along a direction is the sum of the ab
 that direction. Three regimes are certified:
 
 - *free*: all sequences, until a constraint becomes active. These bounds are exact.
-- *always*: all sequences. The window of a step is this step and its H future points with constraints. Where no
-  constraint of the window can be active (with a history: before the first step where one can), the bounds are those of
-  *free*. Elsewhere, a constrained output is bounded by the constraints themselves.
+- *always*: all sequences. The window of a step is this step and its H future points with constraints. The bounds are
+  those of *free* at steps where no constraint of the window can be active. With a history, they are those of *free*
+  only before the first step where one can. Elsewhere, a constrained output is bounded by the constraints themselves.
   Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
   a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
-  corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖²,
-  where the multipliers at a corner bound ‖v‖ from below (weak duality). So an output exceeds the range of the outputs
+  corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖².
+  The multipliers at a corner give a lower bound of ‖v‖ (weak duality). So an output exceeds the range of the outputs
   at the corners by at most ‖v − v̄‖ times the output's largest displacement per unit of correction. With a history,
   corrections feed back: an unconstrained output that is coupled to a constrained one has no bound in this regime.
 - *budgeted*, with a history: all sequences whose corrections satisfy a budget. A corrected command equals the command
@@ -35,7 +35,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 CELLS = {1: 16, 2: 24, 3: 3}  # number of actions → number of cells along each; 1 for more actions
 MAX_ACTIONS = 6  # largest number of actions whose corners are enumerated
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
-BORDER = 1e-6  # slack, relative to the terms of a constraint, up to which the constraint counts as active
+BORDER = 1e-6  # slack below which a constraint counts as active, relative to the constraint's terms
 CORNER_MARGIN = 1e-8  # margin of the corrections at corners, so that the checker's rounding cannot make them infeasible
 
 
@@ -46,8 +46,8 @@ class CertifiedBounds:
     free: Bounds  # bounds until a constraint becomes active
     always: Bounds  # bounds for all sequences
     can_be_active: np.ndarray  # mask (N,) of the steps at which some actions make a constraint of the window active
-    # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F): for the T steps of `can_be_active`, the corners of
-    # the K cells along each of A actions, the points of the window, and its F constraints each. Empty with a history.
+    # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F): T steps of `can_be_active`, corners of the cells
+    # (K along each of A actions), points of the window, and constraints of each point. Empty with a history.
     multipliers: np.ndarray
     budgeted: BudgetedBounds | None = None  # bounds for corrections within a budget, or None
 

@@ -234,7 +234,10 @@ def _validate(
 
 
 def _select(candidates: Sequence[Candidate]) -> Candidate:
-    """Return the candidate of strongest regularization, and for it of the widest kernel, among the best ones."""
+    """Select the strongest regularization among the best candidates, and for it the widest kernel.
+
+    If no candidate stays within the spread, select the one with the largest share.
+    """
     best = [c for c in candidates if c.worse <= 1.0 and c.share >= MIN_SHARE]
     if best:
         return min(best, key=lambda c: (-c.lambda_, -c.length_scale))

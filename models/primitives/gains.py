@@ -2,7 +2,7 @@
 
 The null-space projector is about the size of the posterior's variance: if demonstrations vary by millimeters, a raw
 action of size one barely moves the output. Without active constraints the map from the history to the next point is
-linear, and two numbers that describe a gain follow from it exactly, for the action repeat that is used:
+linear. Two numbers that describe a gain are computed from this map exactly, for a given action repeat:
 
 - authority: displacement by a constant action of ±1, in demonstration standard deviations;
 - exploration RMS: root mean square of the displacement by uniform white actions in ±1, in the same unit.
@@ -40,8 +40,8 @@ def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.n
 
     The RMS of uniform actions in ±1 is 1/√3. With the factor √3 they cause an RMS of κ standard deviations if outputs
     are not coupled and a command depends on one action only, as in KGRL. Displacement and deviation are RMS over the
-    whole motion, so that regions dominate in which the demonstrations vary widely and leave room to explore. The result
-    does not depend on the action repeat, because a constant action is the same for every action repeat.
+    whole motion. Regions in which the demonstrations vary widely therefore have the most influence. The result does
+    not depend on the action repeat, because a constant action is the same for every action repeat.
 
     Args:
         primitive: Primitive to calibrate.
@@ -66,7 +66,7 @@ def rms_gains(
     """Compute gains (O,) with which uniform white actions in ±1 cause an RMS of κ demonstration standard deviations.
 
     Exploration strategies must agree in this RMS before their smoothness is compared. Outputs are coupled through the
-    demonstrations' correlations; the gains solve for all of them together.
+    demonstrations' correlations, so one system of equations determines all gains.
 
     Args:
         primitive: Primitive to calibrate.
@@ -155,7 +155,7 @@ def check_action_scale(action_scale: float) -> None:
 
 def _check_response(primitive: LcNsKmp, response: np.ndarray) -> None:
     if not (response > 0).all():
-        raise InputError(f"null-space actions do nothing to this primitive (beta = {primitive.beta}): use beta > 0")
+        raise InputError(f"null-space actions do not move this primitive (beta = {primitive.beta}): use beta > 0")
 
 
 def _explored_mask(primitive: LcNsKmp, outputs: np.ndarray | None) -> np.ndarray:

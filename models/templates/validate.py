@@ -137,7 +137,7 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
                     f"input leads there (nearest {best:.3g}, threshold {threshold:.3g})",
                 )
         if all(template.distance(number, X, frames) < lowest for X, frames in starts):
-            yield Finding(False, f"{state.name}: every pose is below the threshold; the state is left immediately")
+            yield Finding(False, f"{state.name}: every sampled pose is below the threshold; the state is left at once")
 
 
 def _greedy(

@@ -39,8 +39,8 @@ class CommandValidity:
     def is_valid(self, context: Context, time: float) -> bool:
         """Return True if the present command is valid; `context` is the system's.
 
-        Its age is computed for `time` [s], the time of a check, and its lead for the time of the context, which may be
-        up to a period later.
+        Staleness is checked for `time` [s], the time of a check. Whether the time stamp is in the future is checked for
+        the time of the context, which may be up to a period later.
         """
         if not all(abs(number) <= _MAX_COORDINATE for number in self._desired_pose.Eval(context).tolist()):
             return False  # for NaN too
@@ -53,10 +53,10 @@ class CommandValidity:
 class LastValidPose:
     """Desired pose to follow: the present command while it is valid, otherwise the last valid one.
 
-    The last valid pose and the time of the last check are discrete states, updated by a periodic event. Validity is
-    evaluated for the time of the last check, not for the present time: outputs that depend on it are then computed
-    again only when the command changes or an event occurs. A command becomes stale at the first event after its
-    timeout; a new command is valid at once, unless it is too far in the future at that time. Before the first valid
+    The last valid pose and the time of the last check are discrete states, updated by a periodic event. A command's age
+    is computed at the last check, not at the present time, so that outputs are computed again only when the command
+    changes or an event occurs. A command becomes stale at the first event after its timeout; a new command is valid at
+    once, unless its time stamp is then too far in the future. Before the first valid
     command the pose is the one measured at initialization, which must be finite. While the blend factor is zero, the
     robot is not controlled, and the last valid pose is the measured one: a robot without a valid command is held where
     control begins.

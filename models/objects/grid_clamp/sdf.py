@@ -94,7 +94,7 @@ def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[s
 
 
 def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
-    """Return the folder with the files of clamp and table: this one for default arguments, else a temporary one."""
+    """Return the folder with the files of clamp and table: the package's for default arguments, or a temporary one."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
     return generate_assets(files, dimensions, friction)
