@@ -83,7 +83,7 @@ class SceneCache:
 
 
 def _key(frame: bytes) -> tuple[str, ...]:
-    """Return type, path or name, and property of a frame; a later frame with the same key replaces it."""
+    """Return a frame's type, its path or name, and its property; a later frame with this key replaces it."""
     unpacker = msgpack.Unpacker(max_buffer_size=0)
     unpacker.feed(frame)
     fields = {"type": "", "path": "", "name": "", "property": ""}

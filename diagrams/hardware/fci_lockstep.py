@@ -22,7 +22,7 @@ from guiderail.models.common.errors import brief
 logger = logging.getLogger(__name__)
 
 LOCKSTEP_PORT = 1339  # the robot's own ports are 1337 and 1338
-MAX_WAIT = 3600.0  # longest wait for an answer [s]; a socket refuses timeouts of centuries
+MAX_WAIT = 3600.0  # longest wait for an answer [s]; a socket refuses a very long timeout
 
 
 class FciLockstepClock(Clock):

@@ -72,9 +72,9 @@ class HardwareStation(Station):
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
     `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
     reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. With a `PoseDriver` there is no
-    input ``max_wrench``, because the robot's own controller has the bound of the impedance. In addition to every
-    station's ports there are these outputs. As in Drake's own stations, the driver's name and a dot precede the names
-    of joint ports:
+    input ``max_wrench``, because the robot's own controller bounds the wrench, and its bound is fixed. In addition
+    to every station's ports it has these outputs. As in Drake's own stations, the driver's name and a dot precede the
+    names of joint ports:
 
     =====================  =====  =====================================================================================
     output                 size   meaning
@@ -123,19 +123,19 @@ class HardwareStation(Station):
             period: Period of a command [s]; the driver's by default.
             wrench_time_constant: Time constant of the wrench estimate's low-pass filter [s].
             robot_timeout: Longest time that `start` waits for the robot [s].
-            end_effector: Tool on the flange, or its name; a gripper has a driver of its own, and stays open here.
+            end_effector: Tool on the flange, or its name; a gripper is modeled open and is not commanded.
             robot: The arm, or its name.
             robot_url: Address of the robot: LCM's URL, or a host; LCM's default if empty.
             limits: Limits of measurements and torques; `safety_limits` by default.
             status_limits: Limits of a status; by default they follow from the joints' velocity limits, the period and
-                the driver's hold-off.
+                the driver's `hold_off`.
             tare: True subtracts the wrench that is measured after the start, when the tool must be free, from the
                 output `wrench`. The safety limits apply to the wrench before the subtraction.
             control_period: Time between commands of a skill [s], a whole multiple of `period`.
 
         Raises:
             InputError: If the robot has no driver or does not fit it (`check_robot`), the address is unusable, the
-                settling time is shorter than the driver's hold-off, or the control period is no multiple of `period`.
+                settling time is shorter than the driver's `hold_off`, or the control period is no multiple of `period`.
         """
         super().__init__()
         robot = find_robot(robot)
@@ -227,7 +227,7 @@ class HardwareStation(Station):
             tare = WrenchTare(period, *tare_steps(period))
             add_system(builder, "tare", tare, measured_wrench=measured_wrench)
             measured_wrench = tare.get_tared_wrench_output_port()
-        # A robot's own controller has the bound of the impedance, which cannot change.
+        # With a `PoseDriver`, the robot's own controller bounds the wrench, and its bound is fixed.
         max_wrench = None
         if tank is not None and not isinstance(self.driver, PoseDriver):
             max_wrench = tank.get_max_wrench_input_port()
@@ -360,8 +360,8 @@ class HardwareStation(Station):
         """Return the largest joint torques of the impedance's wrench, as shares of their limits, (n,).
 
         The joint positions are (n,) [rad]. The wrench is limited along and about each axis of the target separately;
-        the worst corner of this box of wrenches counts. The torque limiter clips at 1; without it, the driver's reflex
-        would stop the arm at 1 / `TORQUE_SHARE`.
+        the worst corner of this box of wrenches counts. The torque limiter clips at a share of 1. The driver's reflex
+        stops the arm at a share of 1 / `TORQUE_SHARE`, which clipped torques do not reach.
         """
         J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         limits = to_wrench_order(self.impedance.limits)

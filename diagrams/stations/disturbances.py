@@ -178,7 +178,7 @@ class DisturbedStation(Station):
 
 
 def _without_replaced_errors(disturbances: Disturbances, station: Station) -> SensorErrors:
-    """Return the errors that are added to a station's ports, without those that its joint torques already have."""
+    """Return the errors to add at a station's ports, without those that its joint torque errors already cause."""
     errors = disturbances.errors
     if errors.joint_torque is None:
         return errors
@@ -202,7 +202,7 @@ def disturbed(
 
     Args:
         build: Builder of the station; it needs the parameter `impedance` for an `impedance` or a stiffness factor.
-        disturbances: Disturbances of the station; for a robot only `sensing` and `tare`, of which the tare applies.
+        disturbances: Disturbances of the station; for a robot only `sensing` and `tare`, and only a tare is applied.
         is_simulated: False for a robot.
         name: Name of the station, for messages.
         impedance: Impedance of the task; the builder's own by default, or `Impedance()` if it declares none and there
@@ -222,7 +222,7 @@ def disturbed(
     if not disturbances.is_active:
         return build(**arguments)
     if not is_simulated and disturbances.is_named_only:
-        # A real robot has its own sensor errors; of the setting only the tare applies.
+        # A real robot has its own sensor errors, so only the tare of the setting is used.
         can_tare = "tare" in inspect.signature(build).parameters
         return build(**arguments, **({"tare": True} if can_tare and disturbances.errors.tare else {}))
     if not is_simulated:
@@ -254,6 +254,6 @@ def _disturbed_period(d: Disturbances, station: Station) -> float:
         return whole_multiple(period, station.time_step)
     except InputError:
         raise InputError(
-            f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole number of the "
-            f"plant's {station.time_step:g} s"
+            f"clock_factor {d.clock_factor:g} makes a control period of {period:g} s: it must be a whole multiple of "
+            f"the plant's time step of {station.time_step:g} s"
         ) from None

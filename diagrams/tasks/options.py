@@ -60,7 +60,7 @@ class FixtureOffsetOptions(Options):
         "per_run", description="offset of the fixture: sampled per run or per episode; none: within 0.3 mm per episode"
     )
     offset_range: OffsetRange | None = Field(
-        None, description="smallest and largest offset of the fixture [m]; default: that of fixture_offset"
+        None, description="smallest and largest offset of the fixture [m]; default: depends on fixture_offset"
     )
 
     @field_validator("offset_range")

@@ -281,7 +281,7 @@ class BncConnector(DemonstratedInsertion):
         return LinearConstraints.box(-bound, bound)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return D and y0 of the estimate of height and turn; the lateral offset is only checked, by a pull."""
+        """Return D and y0 that estimate height and turn; no lateral offset is estimated, so a pull confirms a lock."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0

@@ -91,7 +91,7 @@ def test_disturbed_clock_is_a_multiple_of_the_plant_s_own_step():
     env = make_env("GridClamp", clock_factor=1.25, **fine)
     assert env.task.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
     for factor, options in ((1.3, fine), (1.5, {"time_step": CONTROL_PERIOD})):
-        with pytest.raises(InputError, match="whole number of the plant's"):
+        with pytest.raises(InputError, match="whole multiple of the plant's"):
             make_env("GridClamp", clock_factor=factor, **options)
 
 

@@ -292,5 +292,5 @@ def test_part_surfaces_are_refused_when_a_mask_has_too_few_bits():
 
 
 def test_disturbed_clock_is_a_multiple_of_the_station_s_step():
-    with pytest.raises(InputError, match=r"whole number of the plant's 0\.02 s"):
+    with pytest.raises(InputError, match=r"whole multiple of the plant's time step of 0\.02 s"):
         make_env("GridClamp", station="mujoco", clock_factor=1.5, time_step=0.02)
