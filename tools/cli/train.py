@@ -68,13 +68,13 @@ def train(
     evaluate: Annotated[
         int | None,
         option(
-            "Number of held-out episodes of the policy at the end, without baselines; guiderail evaluate RUN compares "
-            "it with them.  [default: none]"
+            "Number of held-out episodes that evaluate the policy at the end; guiderail evaluate RUN also evaluates "
+            "baselines.  [default: none]"
         ),
     ] = None,
     human_in_the_loop: Annotated[
         bool,
-        option("A supervisor watches in the browser, corrects, stops and labels successes.", "--human-in-the-loop"),
+        option("A supervisor in the browser corrects the policy, stops and labels episodes.", "--human-in-the-loop"),
     ] = False,
     robot_url: cli.RobotUrl = None,
     robot: cli.Robot = None,

@@ -116,7 +116,7 @@ def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
     samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)
     if samples * (1 + demonstrations.num_outputs) > MAX_NUMBERS:
         raise InputError(
-            f"--rate {rate:g} makes {samples:.3g} samples, and a file holds {MAX_NUMBERS} numbers: give a lower one"
+            f"--rate {rate:g} makes {samples:.3g} samples; a file holds at most {MAX_NUMBERS} numbers: give a lower one"
         )
     times, outputs = [], []
     for index, (t, y) in enumerate(zip(demonstrations.times, demonstrations.outputs, strict=True)):

@@ -15,7 +15,7 @@ from rich.text import Text
 from guiderail.tools.experiments.engines.engine import Outcome
 from guiderail.tools.experiments.job import count_attempts
 
-MAX_SHOWN = 20  # largest number of jobs in the table; the number of others is shown
+MAX_SHOWN = 20  # largest number of jobs in the table; the others are counted below it
 TERMINAL_PERIOD, LOG_PERIOD = 1.0, 60.0  # time between two updates [s]
 
 

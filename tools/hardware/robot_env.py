@@ -37,7 +37,7 @@ MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece
 HOLD_STEPS = 25  # control steps of a push
 ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
 RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
-NO_POSE = np.full(6, np.nan)  # no command: a station without one holds the arm where it took control
+NO_POSE = np.full(6, np.nan)  # no valid command: the station holds the arm where it took control
 
 
 class RobotStoppedError(Exception):
@@ -59,8 +59,8 @@ class RobotEnv(DiagramEnv):
     reset, it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that
     was stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
 
-    Motions between episodes keep the bound of the force that was in force at the end of the episode; the first approach
-    has the bound with which an episode begins.
+    Motions between episodes keep the force bound of the end of the episode. The first approach has the force bound
+    with which an episode begins.
 
     A success by pose is confirmed by the task's `hold_tests`; if the workpiece gives way, `termination` is
     "did_not_hold". Episodes that end as "stopped" or "did_not_hold" must not be learned from.
@@ -69,7 +69,7 @@ class RobotEnv(DiagramEnv):
     `free_workpiece` has the operator release it by hand.
 
     Attributes:
-        fault: Fault that ended the last episode, or NONE.
+        fault: Reason of the newest stop since the episode began, or NONE.
         preflight: Pre-flight checks, to be run before anything moves.
     """
 
@@ -119,7 +119,7 @@ class RobotEnv(DiagramEnv):
         self._hold_tests, self._snaps_in = hold_tests, snaps_in
         self._steps = round(task.control_period / station.period)
         self._station, self._is_stepping = transfer_station, False
-        # The first approach has the bound with which an episode begins.
+        # The first approach has the force bound with which an episode begins.
         max_wrench = station.read_max_wrench(station.GetMyContextFromRoot(task.diagram.CreateDefaultContext()))
         self.preflight = PreflightChecks(transfer_station, clock, start, self._steps, max_wrench)
         self._last_transfer: Simulator | None = None
@@ -282,7 +282,7 @@ class RobotEnv(DiagramEnv):
     # Motions between episodes.
 
     def _command(self, pose: np.ndarray) -> None:
-        """Command a pose (6,) of the transfer station for a control step."""
+        """Command a pose (6,) to the transfer station for one control step."""
         self._transfer_station.get_desired_pose_input_port().FixValue(
             self._transfer_simulator.get_mutable_context(), pose
         )
@@ -377,7 +377,7 @@ class RobotEnv(DiagramEnv):
             self._clock.begin()  # no command was sent yet: the time since the last status must not count as a gap
         elapsed = 0.0
         while self._arm_state != ArmState.RUNNING:
-            self._command(NO_POSE)  # the pose of a single status may be wrong: the station holds the arm
+            self._command(NO_POSE)  # not the measured pose, because a single status may be wrong
             elapsed += self.task.control_period
             if elapsed > RESUME_TIMEOUT:
                 reason = describe_stop(self._active_fault, self._station.driver)

@@ -1,10 +1,10 @@
 """SAC and TQC of Stable-Baselines3 with a faster training step: the same update in fewer PyTorch calls.
 
 `FastTrainingStep` is a mixin that replaces `train` of a Stable-Baselines3 algorithm. All critics are evaluated as one
-batched network, both batches of an update pass the actor at once, the parameters of a network are in one buffer, and
-the gradients are explicit formulas, so that no unused gradient is computed. `FastSac` and `FastTqc` are the two
-algorithms with this mixin. `python -m research.benchmarks learner` compares their duration with Stable-Baselines3's; a
-test compares the parameters.
+batched network. The actor evaluates the states and the next states of an update in one batch. The parameters of a
+network are in one buffer. Gradients are explicit formulas, so that no unused gradient is computed. `FastSac` and
+`FastTqc` have this mixin. `python -m research.benchmarks learner` compares their duration with that of
+Stable-Baselines3, and a test compares the parameters.
 """
 
 import math
@@ -62,8 +62,8 @@ class Linear:
     def input_gradient(self, d: torch.Tensor, shared: bool, columns: slice = slice(None)) -> torch.Tensor:
         """Return the gradient with respect to `columns` of the input, (n or 1, batch, columns).
 
-        `d` is the gradient with respect to the outputs, (n, batch, outputs). If the n networks have one input,
-        `shared`, the gradient is summed over them.
+        `d` is the gradient with respect to the outputs, (n, batch, outputs). `shared` is True if the n networks have
+        one common input; the gradient is then summed over them.
         """
         by_network = torch.bmm(d, self.weight[:, :, columns])
         return by_network.sum(0, keepdim=True) if shared and self._networks > 1 else by_network

@@ -162,8 +162,8 @@ class ViaPointCorrections:
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
         """Return the via-points so far with those of an episode's corrections.
 
-        The new via-points replace all old ones from less than `VIA_POINT_SPACING` steps before the first new one to
-        less than `VIA_POINT_SPACING` steps after the last.
+        Old via-points between the first and the last new one, and less than `VIA_POINT_SPACING` steps outside of this
+        interval, are removed.
 
         Args:
             offsets: Corrections (A,) by control step, in units of a full action.

@@ -171,7 +171,7 @@ class Side:
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
-    """Return the default path of a run's page, which is in the current folder if `run` is no folder, or a task's."""
+    """Return the default path of a page: in the folder `run`, or in the current one if `run` is no folder of a run."""
     name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
     return run / name if run.is_dir() and not is_task_folder(run) else Path(name)
 
