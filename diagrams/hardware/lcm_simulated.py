@@ -63,7 +63,7 @@ class SimulatedIiwa(Diagram):
             workcell: Fixture in the world and held workpiece.
             lcm: The bus.
             time_step: Time step of the plant [s], a divisor of the status period.
-            end_effector: Tool on the flange, or its name; a gripper has a driver of its own, and stays open here.
+            end_effector: Tool on the flange, or its name; a gripper is modeled open and is not commanded.
             directives: Model directives of the surroundings.
 
         Raises:
