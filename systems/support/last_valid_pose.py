@@ -56,10 +56,9 @@ class LastValidPose:
     The last valid pose and the time of the last check are discrete states, updated by a periodic event. A command's age
     is computed at the last check, not at the present time, so that outputs are computed again only when the command
     changes or an event occurs. A command becomes stale at the first event after its timeout; a new command is valid at
-    once, unless its time stamp is then too far in the future. Before the first valid
-    command the pose is the one measured at initialization, which must be finite. While the blend factor is zero, the
-    robot is not controlled, and the last valid pose is the measured one: a robot without a valid command is held where
-    control begins.
+    once, unless its time stamp is then too far in the future. Before the first valid command the pose is the one
+    measured at initialization, which must be finite. While the blend factor is zero, the robot is not controlled, and
+    the last valid pose is the measured one: a robot without a valid command is held where control begins.
 
     Args:
         system: System under construction, in which two states and two events are declared.
