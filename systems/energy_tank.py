@@ -57,7 +57,7 @@ class EnergyTank(LeafSystem):
     desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite, reference
     and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,), limits of
     [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. While a number of
-    ``max_wrench`` is NaN or negative, the last valid one remains in force (`LastValidBound`). ``energy`` is (1,), the
+    ``max_wrench`` is NaN or negative, the last valid one applies (`LastValidBound`). ``energy`` is (1,), the
     content [J].
 
     Args:

@@ -361,7 +361,7 @@ class HardwareStation(Station):
 
         The joint positions are (n,) [rad]. The wrench is limited along and about each axis of the target separately;
         the worst corner of this box of wrenches counts. The torque limiter clips at a share of 1. The driver's reflex
-        stops the arm at a share of 1 / `TORQUE_SHARE`, which clipped torques do not reach.
+        stops the arm at a share of at least 1 / `TORQUE_SHARE`, which clipped torques do not reach.
         """
         J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         limits = to_wrench_order(self.impedance.limits)

@@ -76,7 +76,7 @@ class HiddenOffsets(ABC):
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the offsets of fixture and workpiece, (2,) or longer; `options` is an instance of `InsertionReset`."""
-        # Every reset takes equally many numbers from `rng`, used or not: an episode's samples depend only on its seed.
+        # Every reset takes equally many numbers from `rng`, used or not: what it samples depends only on its seed.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:

@@ -37,7 +37,8 @@ class Candidate:
     length_scale: float  # ℓ of the kernel [unit of the input]
     lambda_: float  # λ = β
     # RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in standard
-    # deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread.
+    # deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread, unless that of
+    # every candidate does.
     error: float
     worse: float  # mean excess over the best candidate's squared error, in standard errors over the demonstrations
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean

@@ -10,7 +10,7 @@ from guiderail.systems.support import declarations as declare
 class LastValidBound:
     """Configured bound of a wrench, lowered to the numbers at an optional input port.
 
-    While a number at the port is NaN or negative, the last valid one remains in force, before the first one 0. It does
+    While a number at the port is NaN or negative, the last valid one applies, before the first one 0. It does
     not count as 0: with a bound of 0 there is no damping either, and a moving arm would coast. The last valid numbers
     are a discrete state, updated by a periodic event.
 

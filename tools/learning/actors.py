@@ -75,7 +75,7 @@ class ParallelLearner(Learner):
                 have forks.
         """
         if not isinstance(learner, OffPolicyLearner):
-            raise InputError("only an off-policy learner has parallel actors: choose sac or tqc, or --num-envs 0")
+            raise InputError("only an off-policy learner has parallel actors: choose tqc, sac, td3 or crossq")
         if not can_fork():
             raise InputError("parallel actors are forks, which this process cannot have: leave num_envs out")
         if has_image(env.observation_space):

@@ -68,7 +68,7 @@ class PipelinedLearner(Learner):
             InputError: If the learner is not an `OffPolicyLearner`.
         """
         if not isinstance(acting, OffPolicyLearner):
-            raise InputError("only an off-policy learner can be pipelined: choose sac or tqc, or --set pipelined=false")
+            raise InputError("only an off-policy learner can be pipelined: choose tqc, sac, td3 or crossq")
         self._acting, self._waits, self._excluded = acting, waits, excluded
         self._transitions: list[Transition] = []
         self._pending: list[Transition] | None = None  # a finished episode that is not submitted yet
