@@ -18,7 +18,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds
-from guiderail.models.primitives.full_turns import Orientation
+from guiderail.models.primitives.full_turns import Orientation, continued_angles, continued_vectors
 from guiderail.models.primitives.poses import pose_rotation
 
 MIN_PERIODS = 4  # minimum duration of a segment's demonstrations [control periods]
@@ -93,17 +93,9 @@ class Frame:
             rotation = rotation.from_matrix(self.R.T if is_inverse else self.R) * rotation
             result[3:] = rotation.as_euler("ZYX") if orientation == "euler_zyx" else rotation.as_rotvec()
         if near is not None and len(output) == 6:
-            result[3:] = _continued(result[3:], near[3:], orientation)
+            continued = continued_angles if orientation == "euler_zyx" else continued_vectors
+            result[3:] = continued(result[None, 3:], near[3:])[0]
         return result
-
-
-def _continued(angles: np.ndarray, near: np.ndarray, orientation: Orientation) -> np.ndarray:
-    """Return the equivalent angles (3,) nearest to `near` (3,)."""
-    if orientation == "euler_zyx":
-        return angles - 2 * np.pi * np.round((angles - near) / (2 * np.pi))
-    size = float(np.linalg.norm(angles))
-    axis = angles / size if size > 1e-9 else near / max(float(np.linalg.norm(near)), 1e-300)
-    return (size + 2 * np.pi * np.round((axis @ near - size) / (2 * np.pi))) * axis
 
 
 Constraints = LinearConstraints | DemonstratedBounds | MotionConstraints
