@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import gymnasium
@@ -17,7 +17,7 @@ from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.hardware.clock import Clock
 from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.station import HardwareStation
-from guiderail.diagrams.tasks.insertion import HoldTest
+from guiderail.diagrams.tasks.insertion import HoldTest, InsertionTask
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.joint_status import Fault
@@ -77,8 +77,6 @@ class RobotEnv(DiagramEnv):
         self,
         task: TaskDiagram,
         station: HardwareStation,
-        transfer_station: HardwareStation,
-        start: np.ndarray,
         clock: Clock,
         *,
         action_repeat: int,
@@ -86,17 +84,13 @@ class RobotEnv(DiagramEnv):
         confirm_resume: Callable[[str], None],
         free_workpiece: Callable[[str], None],
         log: Log,
-        hold_tests: Callable[[np.ndarray], Sequence[HoldTest]],
-        snaps_in: bool = False,
         randomize_parts: Callable[[np.random.Generator, Mapping[str, Any]], dict[str, Any]] | None = None,
     ):
         """Connect to the robot.
 
         Args:
-            task: Diagram of the task.
-            station: Hardware station of the diagram.
-            transfer_station: Clone of the station, for the motions between episodes.
-            start: Pose at which an episode starts, (6,).
+            task: Diagram of an insertion, built from its declaration.
+            station: Hardware station of the diagram; a clone of it makes the motions between episodes.
             clock: Clock of both stations.
             action_repeat: Control steps per action.
             keys: The operator's keys.
@@ -104,8 +98,6 @@ class RobotEnv(DiagramEnv):
             free_workpiece: Function called with the reason why a workpiece has to be released by hand; returns when it
                 is released and the arm may move again, or raises.
             log: Function that shows a message.
-            hold_tests: Function that returns the pushes that confirm a success, for its measured pose (6,).
-            snaps_in: True if the arm cannot pull out a workpiece after a success.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
                 moves the parts as a reset in simulation does, and returns what was sampled. None for a real robot.
 
@@ -113,15 +105,16 @@ class RobotEnv(DiagramEnv):
             InputError: If no robot answers.
         """
         super().__init__(task, action_repeat=action_repeat)
-        self._randomize_parts = randomize_parts
-        self._task_station, self._transfer_station, self._start, self._clock = station, transfer_station, start, clock
+        declared: InsertionTask = task.declaration
+        self._start, self._randomize_parts = declared.start_pose(np.random.default_rng(0)), randomize_parts
+        self._task_station, self._transfer_station, self._clock = station, station.clone(declared.workcell()), clock
         self._keys, self._confirm_resume, self._free_workpiece, self._log = keys, confirm_resume, free_workpiece, log
-        self._hold_tests, self._snaps_in = hold_tests, snaps_in
+        self._hold_tests, self._snaps_in = declared.hold_tests, declared.snaps_in
         self._steps = round(task.control_period / station.period)
-        self._station, self._is_stepping = transfer_station, False
+        self._station, self._is_stepping = self._transfer_station, False
         # The first approach has the force bound with which an episode begins.
         max_wrench = station.read_max_wrench(station.GetMyContextFromRoot(task.diagram.CreateDefaultContext()))
-        self.preflight = PreflightChecks(transfer_station, clock, start, self._steps, max_wrench)
+        self.preflight = PreflightChecks(self._transfer_station, clock, self._start, self._steps, max_wrench)
         self._last_transfer: Simulator | None = None
         self._return_path: list[np.ndarray] = []  # poses (6,) of the way back; the last one is next
         self._must_be_freed = ""  # reason why the workpiece has to be released by hand before the arm resumes

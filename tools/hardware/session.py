@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
@@ -62,7 +61,6 @@ def robot_session(
     station = make_station(task)
     assert isinstance(station, HardwareStation)
     diagram = build_task_diagram(task, station, make_guidance(task, station))
-    start = task.start_pose(np.random.default_rng(0))
     with (
         connection.simulated_driver(config.task, station.driver.url, config.imports) as process,
         operator_keys() as keys,
@@ -92,16 +90,12 @@ def robot_session(
         env = RobotEnv(
             diagram,
             station,
-            station.clone(task.workcell()),
-            start,
             clock,
             action_repeat=config.action_repeat,
             keys=keys,
             confirm_resume=lambda reason: ask(reason, "Resume from where it is?"),
             free_workpiece=free_workpiece,
             log=log,
-            hold_tests=task.hold_tests,
-            snaps_in=task.snaps_in,
             randomize_parts=randomize_parts,
         )
         confirm_checks(env.preflight, log, assume_yes=assume_yes)

@@ -51,19 +51,15 @@ def make(patch, start, **options):
     task = build_task_diagram(declared, station, make_guidance(declared, station))
     clock, keys, requests = Together(declared.workcell(), lcm, start), OperatorKeys(), []
     begin = declared.start_pose(np.random.default_rng(0))
-    transfer_station = station.clone(declared.workcell())
     env = RobotEnv(
         task,
         station,
-        transfer_station,
-        begin,
         clock,
         action_repeat=5,
         keys=keys,
         confirm_resume=requests.append,
         free_workpiece=requests.append,
         log=lambda text: None,
-        hold_tests=declared.hold_tests,
     )
     env.clock, env.keys, env.asked, env.begin = clock, keys, requests, begin
     return env
