@@ -71,18 +71,13 @@ def _bootstrap(values: np.ndarray, statistic: Any, resamples: int = RESAMPLES) -
 
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
-    """Return the 95 % Wilson interval of a success rate over at least one episode."""
+    """Return the 95 % Wilson interval of a success rate over at least one episode.
+
+    The episodes of several seeds are not pooled into one interval, because they are not independent: all episodes of
+    one seed use the same policy.
+    """
     interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
-
-
-def wilson_of_each(successes: Sequence[int], episodes: Sequence[int]) -> list[tuple[float, float]]:
-    """Return the 95 % Wilson interval of each seed's success rate.
-
-    The episodes of all seeds are not pooled into one interval, because they are not independent: all episodes of one
-    seed use the same policy.
-    """
-    return [wilson(won, of) for won, of in zip(successes, episodes, strict=True)]
 
 
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

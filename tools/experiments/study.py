@@ -22,7 +22,7 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.evaluation.metrics import statistics_of, wilson_of_each
+from guiderail.tools.evaluation.metrics import statistics_of, wilson
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep, source_file
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
 from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, check_source, is_done, run_job
@@ -349,5 +349,5 @@ def _success(rows: pd.DataFrame, method: str, eval_set: str) -> tuple[float, flo
         return None
     episodes = selected["episodes"].astype(int)
     successes = (selected["success_rate"] * episodes).astype(float).round().astype(int)
-    lows, highs = zip(*wilson_of_each(successes, episodes), strict=True)
+    lows, highs = zip(*map(wilson, successes, episodes), strict=True)
     return successes.sum() / episodes.sum(), min(lows), max(highs)

@@ -19,7 +19,7 @@ from guiderail.tools.evaluation.metrics import (
     interquartile_mean,
     median_survival,
     survival,
-    wilson_of_each,
+    wilson,
 )
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
@@ -130,10 +130,9 @@ def _held_out(data: ReportData) -> Table:
         ["study", "method", "policy", "after_episodes", "eval_set"], sort=False
     ):
         successes, episodes = int(group["successes"].sum()), int(group["episodes"].sum())
-        intervals = wilson_of_each(group["successes"], group["episodes"])
         of_seeds = ", ".join(
-            f"{row.successes}/{row.episodes} ({low:.1%} to {high:.1%})"
-            for row, (low, high) in zip(group.itertuples(), intervals, strict=True)
+            "{}/{} ({:.1%} to {:.1%})".format(*counted, *wilson(*counted))
+            for counted in zip(group["successes"], group["episodes"], strict=True)
         )
         is_learned = policy == LEARNED
         name = str(method) if is_learned or str(method) == str(policy) else f"{method}: {policy}"
