@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
@@ -23,13 +23,6 @@ KEY_PAIRS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "Key
 GAMEPAD_AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
 
 
-class Teleoperator(Protocol):
-    """Source of an operator's inputs; implemented by `MeshcatDevice` and `MeshcatPanel`."""
-
-    def read(self) -> np.ndarray:
-        """Return the present inputs, (n,)."""
-
-
 @dataclass(frozen=True)
 class Slider:
     """Slider of a page."""
@@ -41,7 +34,7 @@ class Slider:
     speed: float = 0.0  # change of the value per second at full deflection of its gamepad axis; 0: no axis moves it
 
 
-class MeshcatPanel(Teleoperator):
+class MeshcatPanel:
     """Sliders and buttons of a Meshcat page, each with keys; a gamepad moves the sliders.
 
     A value of a slider that is not finite is ignored: the slider returns to its last finite value.
