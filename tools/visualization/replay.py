@@ -8,7 +8,7 @@ import json
 import logging
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -132,11 +132,6 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
     return (VIOLATION, 1.0) if has_rotations else ("mm", 1.0 / MM)
 
 
-def state_names(task: Any) -> Sequence[str]:
-    """Return the names of the states of a task's template, in order; empty without a template."""
-    return [state.name for state in task.template().template.states] if "template" in type(task).provides() else []
-
-
 def _encode(poses: np.ndarray) -> str:
     """Return poses (n, 7) as float32 in base64; the first pose alone if all are equal."""
     poses = poses.astype("<f4")
@@ -237,10 +232,11 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     camera = next(iter(views.values()), scene.viewpoint)
     if camera is not None:
         meshcat.SetCameraPose(*(np.array(point) for point in camera))
+    has_template = task is not None and "template" in type(task).provides()
     data = {
         "sides": recorded,
         "violation": {"unit": unit, "scale": scale},
-        "states": [] if task is None else list(state_names(task)),
+        "states": [state.name for state in task.template().template.states] if has_template else [],
         "pale": PALE,
         "transparency": TRANSPARENCY,
     }
@@ -296,14 +292,14 @@ def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, color: tup
     meshcat.SetTriangleMesh(name, vertices.T, faces.T, Rgba(*color))
 
 
-def tube(points: np.ndarray, radius: float, sides: int = 5) -> tuple[np.ndarray, np.ndarray]:
-    """Return the vertices (V, 3) and triangles (T, 3) of a tube.
+def tube(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the vertices (V, 3) and triangles (T, 3) of a tube with a cross section of five sides.
 
     Args:
         points: Points of a path (n, 3) [m], at least two; the tube passes through every third one and the last.
         radius: Radius of the tube [m].
-        sides: Number of sides of its cross section.
     """
+    sides = 5
     points = np.vstack([points[:-1:3], points[-1:]])
     along = np.gradient(points, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
