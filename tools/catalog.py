@@ -48,11 +48,6 @@ def describe_all() -> dict[str, Any]:
     }
 
 
-def is_declared(task: str) -> bool:
-    """Return True if a task is declared with `register_task`, and not only registered with Gymnasium."""
-    return task in TASKS.names()
-
-
 def describe_task(name: str) -> dict[str, Any]:
     """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options.
 
@@ -82,7 +77,7 @@ def describe_task_options(name: str) -> dict[str, str]:
     Raises:
         InputError: If there is no task of that name.
     """
-    if not is_declared(name):
+    if name not in TASKS.names():
         return {key: f"{value!r}" for key, value in task_options(name).items()}
     config = EnvConfig.resolve(name, {})
     declared = TASKS.get(name)

@@ -21,7 +21,7 @@ def list_(
     With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
     a table. `guiderail list --json` also prints descriptions, ports, and options with their ranges.
     """
-    from guiderail.diagrams.tasks.registry import IMPORT_HINT
+    from guiderail.diagrams.tasks.registry import IMPORT_HINT, TASKS
     from guiderail.tools.imports import import_modules
 
     import_modules(imports or ())
@@ -42,11 +42,10 @@ def list_(
     elif name in cli.LISTED:
         print_result({name: cli.LISTED[name]()}, as_json)
     elif name in cli.LISTED["tasks"]():
-        from guiderail.tools.catalog import describe_task, describe_task_options, is_declared
+        from guiderail.tools.catalog import describe_task, describe_task_options
 
-        print_result(
-            describe_task(name) if as_json and is_declared(name) else describe_task_options(name), as_json, "_"
-        )
+        is_described = as_json and name in TASKS.names()
+        print_result(describe_task(name) if is_described else describe_task_options(name), as_json, "_")
     else:
         known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORT_HINT)
         raise InputError(f"there is no list of {name!r}: {known}")
