@@ -122,6 +122,7 @@ def train(
     if resume and out is not None:
         environment = _with_stored_robot(out, environment)
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
+    choices: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
     if num_envs is not None:
         cli.check_same("num_envs", settings.setdefault("num_envs", str(num_envs)), str(num_envs))
     if out is None:
@@ -134,16 +135,8 @@ def train(
 
         refuse_existing_run(out)
         check_log_formats(log or ())
-        check_choices(
-            task,
-            guidance=environment.get("guidance"),
-            station=environment.get("station"),
-            algorithm=algorithm,
-            preset=preset,
-            settings=settings,
-            episodes=episodes,
-            seed=seed,
-        )
+        kinds = {name: environment.get(name) for name in ("guidance", "station")}
+        check_choices(task, settings=settings, **kinds, **choices)
         check_declared_options(task, environment)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
         from guiderail.tools.datasets.validate import warn_of_deviation
@@ -161,8 +154,7 @@ def train(
             raise InputError("there is one robot: leave --num-envs out")
         from guiderail.tools.hardware.train import train_on_robot
 
-        given: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
-        given |= {"step_log": step_log, "imports": modules}
+        given = choices | {"step_log": step_log, "imports": modules}
         result = train_on_robot(
             task,
             out,
@@ -183,17 +175,14 @@ def train(
         task,
         out,
         environment=environment,
-        algorithm=algorithm,
-        preset=preset,
         settings=settings,
-        episodes=episodes,
-        seed=seed,
         resume=resume,
         imports=modules,
         step_log=step_log,
         log=log or (),
         pictures=pictures is not False,
         make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
+        **choices,
     )
     held_out: dict[str, Any] = {}
     if evaluate is not None:
