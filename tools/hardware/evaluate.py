@@ -91,8 +91,7 @@ def evaluate_on_robot(
     with RunFolder(path.parent).locked():
         if path.exists():
             raise InputError(f"{path} already exists: name another folder with --out, or remove it")
-        with robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
-            env = session.env
+        with robot_session(config, connection, assume_yes=assume_yes, log=log) as (env, _):
             act = own_policy if make_policy is None else make_policy(env)
             assert act is not None
             with (

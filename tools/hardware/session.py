@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -28,20 +27,13 @@ from guiderail.tools.hardware.sim_driver import PartRandomizer, publish_part_off
 from guiderail.tools.learning.run_folder import RunConfig
 
 
-@dataclass(frozen=True)
-class RobotSession:
-    """Session at a robot."""
-
-    env: RobotEnv  # environment, with confirmed pre-flight checks
-    # Function that returns statistics of the intervals between statuses so far; empty in lockstep.
-    timing: Callable[[], Mapping[str, Any]]
-
-
 @contextmanager
 def robot_session(
     config: RunConfig, connection: RobotConnection, *, assume_yes: bool, log: Log
-) -> Iterator[RobotSession]:
-    """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the session.
+) -> Iterator[tuple[RobotEnv, Callable[[], Mapping[str, Any]]]]:
+    """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the environment.
+
+    Also yielded is a function that returns statistics of the intervals between statuses so far; empty in lockstep.
 
     With a simulated driver, a reset samples the offsets of the parts as in simulation, and the fixture is taken away
     where the operator of a robot releases the workpiece. With `assume_yes`, the checks need no confirmation; resuming
@@ -103,4 +95,4 @@ def robot_session(
             log(NO_REALTIME_PRIORITY)
         log(keys.describe(has_pauses=True))
         keys.is_moving = True
-        yield RobotSession(env, lambda: connection.timing(station, wall_clock))
+        yield env, lambda: connection.timing(station, wall_clock)

@@ -90,19 +90,17 @@ def train_on_robot(
     if config.step_log:
         num_steps = EnvConfig.resolve(config.task, config.environment).make_task().num_steps
         check_room(step_log_file(folder.steps, 0), config.episodes * record_size(num_steps))
-    with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as session:
+    with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as (env, timing):
         folder.write_config(config)
         try:
             with (
                 garbage_collection_disabled(),
                 EpisodeProgress(config.episodes, name=config.task, asks=True) as progress,
             ):
-                rows = _train(
-                    folder, config, session.env, waits=connection.synchronous, resume=resume, report=progress.update
-                )
+                rows = _train(folder, config, env, waits=connection.synchronous, resume=resume, report=progress.update)
         finally:
-            timing = pd.Series(dict(session.timing()), dtype=object)
-            write_atomically(folder.path / "hardware.json", timing.to_json(indent=2).encode() + b"\n")
+            intervals = pd.Series(dict(timing()), dtype=object)
+            write_atomically(folder.path / "hardware.json", intervals.to_json(indent=2).encode() + b"\n")
     num_excluded = sum(not row["learned_from"] for row in rows)
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": num_excluded}
 

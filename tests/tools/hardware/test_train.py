@@ -31,7 +31,7 @@ from guiderail.tools.hardware.evaluate import evaluate_on_robot
 from guiderail.tools.hardware.operator import OperatorKeys
 from guiderail.tools.hardware.preflight import SPEED
 from guiderail.tools.hardware.robot_env import RobotEnv
-from guiderail.tools.hardware.session import RobotSession, robot_session
+from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.hardware.sim_driver import START
 from guiderail.tools.hardware.train import _train, train_on_robot
 from guiderail.tools.learning.pipelined import PipelinedLearner
@@ -107,7 +107,7 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     @contextmanager
     def fake_session(config, connection, *, assume_yes, log):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
-        yield RobotSession(env, dict)
+        yield env, dict
 
     monkeypatch.setattr("guiderail.tools.hardware.evaluate.robot_session", fake_session)
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
