@@ -119,8 +119,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         if not is_whole(action_repeat, 1):
             raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
-        if not is_whole(history, 1):
-            raise InputError(f"history is a number of outputs, at least 1, not {brief(history)}")
+        settings = GuideSettings(action_scale, action_dims, history, history_variance, horizon, orientation)
         if period is not None and not (isinstance(period, Real) and 0.0 < period < np.inf):
             raise InputError(f"the period of the environment must be a positive number of seconds, not {brief(period)}")
         for what, function in (("pose", pose), ("to_action", to_action), ("template_frames", template_frames)):
@@ -153,7 +152,6 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         elif guidance in PRIMITIVE_GUIDANCE and (template is not None or template_frames is not None):
             raise InputError(f"guidance={guidance!r} does not use a template: leave it out, or use guidance='template'")
         else:
-            settings = GuideSettings(action_scale, action_dims, int(history), history_variance, horizon, orientation)
             self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
         self.action_repeat, self._observe = int(action_repeat), observed
         self._pose, self._to_action = pose, to_action
