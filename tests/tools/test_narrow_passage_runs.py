@@ -14,7 +14,6 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.datasets.validate import validate_demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
-from guiderail.tools.evaluation.rollout import reset_held_out
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
@@ -71,7 +70,7 @@ def test_held_out_starts_differ_and_follow_the_seed():
     usual = env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy()
     starts = []
     for seed in (1, 2, 1):
-        reset_held_out(env, seed)
+        env.reset(seed=seed, options={"held_out": True})
         starts.append(env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy())
     assert not np.array_equal(usual, starts[0])
     assert not np.array_equal(starts[0], starts[1])

@@ -133,12 +133,12 @@ def rollout(
         act = as_policy(act)
     if seed is not None and (seed := as_whole(seed, "a seed")) < 0:
         raise InputError(f"a seed is a whole number of at least 0, not {seed}")
-    if held_out:
-        observation = reset_held_out(env, seed or 0, **(options or {}))
-    else:
-        observation, _ = env.reset(seed=seed, options=None if options is None else dict(options))
     base: Any = env.unwrapped
     is_own = hasattr(base, "trace")
+    given = None if options is None else dict(options)
+    if held_out:  # an environment from outside this package has no such option: its conditions depend on the seed
+        seed, given = seed or 0, {"held_out": True, **(given or {})} if is_own else given or None
+    observation, _ = env.reset(seed=seed, options=given)
     if isinstance(act, Callback) and act not in callbacks:
         callbacks = (act, *callbacks)
     for callback in callbacks:
@@ -222,16 +222,6 @@ class Paths(EnvCallback):
         """Return the columns `commanded` and `measured`."""
         trace = self.base.trace
         return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
-
-
-def reset_held_out(env: gymnasium.Env, seed: int, **options: Any) -> np.ndarray:
-    """Start an episode with held-out conditions and return its first observation; `options` are passed to the reset.
-
-    An environment from outside this package has no option `held_out`: its conditions depend on the seed.
-    """
-    if not hasattr(env.unwrapped, "trace"):
-        return env.reset(seed=seed, options=options or None)[0]
-    return env.reset(seed=seed, options={"held_out": True} | options)[0]
 
 
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
