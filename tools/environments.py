@@ -83,16 +83,12 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
         return folder_digest
     digest = hashlib.blake2b(folder_digest.encode(), digest_size=16)
     for file in files:
-        digest.update(_read(file))
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise InputError(f"{file} cannot be read ({error.strerror}): restore it") from error
+        digest.update(len(content).to_bytes(8, "big") + content)
     return digest.hexdigest()
-
-
-def _read(file: Path) -> bytes:
-    try:
-        content = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file} cannot be read ({error.strerror}): restore it") from error
-    return len(content).to_bytes(8, "big") + content
 
 
 def task_options(task: str) -> dict[str, Any]:
