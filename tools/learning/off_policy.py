@@ -58,6 +58,7 @@ class OffPolicyLearner(Learner):
         algorithm: Class of the algorithm; a subclass sets it.
         fast_algorithm: The same algorithm with a faster training step, or None; used if `training_step` is "fast", on
             the CPU, without dropout and without convolutions.
+        own_settings: Names of settings of a subclass's `Config` that the algorithm takes as arguments of the same name.
         config: Settings of the learner.
         model: Instance of the algorithm.
         averaged: Exponential moving average of the actor; None if `actor_ema` is 0.
@@ -71,6 +72,7 @@ class OffPolicyLearner(Learner):
     Config = OffPolicyConfig
     algorithm: ClassVar[type]
     fast_algorithm: ClassVar[type | None] = None
+    own_settings: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -120,7 +122,7 @@ class OffPolicyLearner(Learner):
             "policy_kwargs": networks,
             "seed": seed,
             "device": config.device,
-            **self.algorithm_arguments(config),
+            **{name: getattr(config, name) for name in self.own_settings},
         }
         is_fast = config.training_step == "fast" and not config.dropout and not is_encoded and config.device == "cpu"
         is_fast = is_fast and self.fast_algorithm is not None
@@ -183,10 +185,6 @@ class OffPolicyLearner(Learner):
         self.random, self.greedy_successes = np.random.default_rng(seed), 0
         if self.selection is not None:  # its actors succeeded in another environment
             self.selection = CheckpointSelection(self.config.selection_window)
-
-    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
-        """Return further arguments of the algorithm, from settings that a subclass adds to its `Config`."""
-        return {}
 
     def is_learning(self) -> bool:
         """Return True once there are `learning_starts` transitions; until then actions are uniformly random."""
@@ -468,12 +466,8 @@ class Td3Learner(OffPolicyLearner):
 
     Config = Td3Config
     algorithm = TD3
+    own_settings = ("policy_delay", "target_policy_noise", "target_noise_clip")
     config: Td3Config
-
-    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
-        """Return the settings of the delayed actor and of the target actions."""
-        names = ("policy_delay", "target_policy_noise", "target_noise_clip")
-        return {name: getattr(config, name) for name in names}
 
     def explore(self, observation: np.ndarray) -> np.ndarray:
         """Return the action plus noise, clipped to the action space."""
@@ -488,8 +482,5 @@ class CrossQLearner(OffPolicyLearner):
 
     Config = CrossQConfig
     algorithm = CrossQ
+    own_settings = ("policy_delay",)
     config: CrossQConfig
-
-    def algorithm_arguments(self, config: Any) -> dict[str, Any]:
-        """Return the settings of the delayed actor."""
-        return {"policy_delay": config.policy_delay}
