@@ -177,7 +177,6 @@ def _completion(choices: str | None) -> Callable[[str], list[str]] | None:
 
 
 Json = Annotated[bool, option("Print one JSON object.", "--json")]
-Run = Annotated[Path, argument("Folder of a run of guiderail train.", "RUN")]
 Subject = Annotated[
     str,
     argument(
