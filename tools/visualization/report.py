@@ -1,13 +1,17 @@
-"""Report of runs and studies as one self-contained page."""
+"""Report of runs and studies as one self-contained page, with its figures."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import matplotlib
 import numpy as np
 import pandas as pd
 
@@ -15,6 +19,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import (
     TOLERANCE,
     VIOLATION,
+    bootstrap_band,
     episodes_to_convergence,
     interquartile_mean,
     median_survival,
@@ -24,8 +29,8 @@ from guiderail.tools.evaluation.metrics import (
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
-from guiderail.tools.visualization import report_figures as figures
 from guiderail.tools.visualization.report_data import LEARNED, ReportData, Run, command, flat, gather
+from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
@@ -82,13 +87,18 @@ def render(data: ReportData, describe_differences: DescribeDifferences | None = 
     runs, tasks = data.runs, data.tasks
     seeds = len({run.config.seed for run in runs})
     episodes = _count(sum(len(run.episodes) for run in runs), "training episode")
-    lead = f"{_count(len(runs), 'run')}, {_count(seeds, 'seed')}, {episodes}"
     commands, commands_of_runs = _commands(data)
     has_held_out = len(data.held_out) > 0
+    if runs:
+        lead = f"{', '.join(tasks)}: {_count(len(runs), 'run')}, {_count(seeds, 'seed')}, {episodes}."
+    elif has_held_out and (data.held_out["policy"] == LEARNED).any():
+        lead = "Tables of studies, without their runs."
+    else:
+        lead = "Baseline policies."
     return PAGE.render(
         title=data.name,
-        lead=f"{', '.join(tasks)}: {lead}." if runs else _lead(data),
-        held_out={"table": _held_out(data), "figure": figures.held_out(data)} if has_held_out else None,
+        lead=lead,
+        held_out={"table": _held_out(data), "figure": _held_out_figure(data)} if has_held_out else None,
         tasks=[_task(data, task, describe_differences) for task in tasks],
         tolerance=f"{TOLERANCE:g}",
         commands=commands,
@@ -103,11 +113,11 @@ def _task(data: ReportData, task: str, describe_differences: DescribeDifferences
     if any((run.episodes["peak_force"] > 0).any() for runs in methods.values() for run in runs):
         curves["mean_squared_force"] = "mean squared force [N²]"
     drawn = [
-        figures.curve(data, task, name, label)
+        _curve(data, task, name, label)
         for name, label in curves.items()
         if all(name in run.episodes for run in data.runs)
     ]
-    drawn.insert(2, figures.survival_curve(data, task))
+    drawn.insert(2, _survival_curve(data, task))
     safety = {name: [run.safety for run in runs] for name, runs in methods.items()}
     differing, common = _configuration(methods)
     return {
@@ -273,11 +283,96 @@ def _study_commands(counts: pd.DataFrame) -> list[str]:
     return commands
 
 
-def _lead(data: ReportData) -> str:
-    """Return the first sentence of a report without runs."""
-    has_learned = len(data.held_out) > 0 and (data.held_out["policy"] == LEARNED).any()
-    return "Tables of studies, without their runs." if has_learned else "Baseline policies."
-
-
 def _count(number: int, noun: str) -> str:
     return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+# Figures, as SVG elements of the page.
+
+SIZE = (4.6, 3.0)  # size of a figure [in]; two fit side by side on a wide screen
+STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that coinciding curves can be distinguished
+
+
+def _curve(data: ReportData, task: str, column: str, label: str) -> str:
+    """Return the curve of a column over the training episodes: the mean over seeds and its bootstrap band."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(1, 1, SIZE)
+        axis = axes[0, 0]
+        colors = data.colors(task)
+        for (name, runs), dash in zip(data.methods(task).items(), cycle(DASHES), strict=False):
+            values = [run.episodes[column].to_numpy(float) for run in runs]
+            shade, text = colors[name], _label(name, runs)
+            draw_runs(axis, values, color=shade, label=text, band=bootstrap_band, linestyle=dash)
+        axis.set(xlabel="training episode", ylabel=f"{label}, mean of {WINDOW}")
+        if column == "success":
+            axis.set_ylim(-0.04, 1.04)
+        legend_above(axis, columns=2)
+        return _svg(figure, f"{label} over the training episodes of {task}")
+
+
+def _survival_curve(data: ReportData, task: str) -> str:
+    """Return the Kaplan-Meier curve: fraction of runs not yet converged, over the training episodes."""
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(1, 1, SIZE)
+        axis = axes[0, 0]
+        colors = data.colors(task)
+        for (name, runs), dash in zip(data.methods(task).items(), cycle(DASHES), strict=False):
+            after, lengths = (
+                [episodes_to_convergence(run.episodes) for run in runs],
+                [len(run.episodes) for run in runs],
+            )
+            steps, left = survival(after, lengths)
+            steps, left = np.append(steps, max(lengths)), np.append(left, left[-1])
+            axis.step(steps, left, where="post", color=colors[name], linestyle=dash, label=_label(name, runs))
+            if None in after:
+                axis.plot(steps[-1], left[-1], "|", color=colors[name], markersize=9)
+        axis.set(xlabel="training episodes", ylabel="fraction not converged", ylim=(-0.04, 1.04))
+        axis.set_xlim(left=0)
+        legend_above(axis, columns=2)
+        return _svg(figure, f"fraction of the runs of {task} that have not converged, over the training episodes")
+
+
+def _held_out_figure(data: ReportData) -> str:
+    """Return the held-out success at each seed's last checkpoint, with Wilson intervals; baseline policies are gray."""
+    rows, keys = data.held_out, ["study", "method", "policy", "seed", "eval_set"]
+    rows = rows[rows["after_episodes"] == rows.groupby(keys)["after_episodes"].transform("max")]
+    groups = list(rows.groupby(["study", "method", "policy", "eval_set"], sort=False))
+    has_studies, has_eval_sets = rows["study"].nunique() > 1, rows["eval_set"].nunique() > 1
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(1, 1, (1.35 * SIZE[0], 0.6 + 0.13 * len(rows) + 0.2 * len(groups)))
+        axis, place, ticks = axes[0, 0], 0.0, []
+        for (study, method, policy, eval_set), group in groups:
+            first = place
+            for row in group.itertuples():
+                low, high = wilson(row.successes, row.episodes)
+                shade = "#1f77b4" if policy == LEARNED else "0.6"
+                axis.plot([low, high], [place, place], color=shade, linewidth=2, alpha=0.55, solid_capstyle="butt")
+                axis.plot(row.successes / row.episodes, place, "o", color=shade, markersize=4)
+                place -= 1.0
+            parts = [str(method), *([] if policy == LEARNED else [str(policy)])]
+            parts += [str(study)] * has_studies + [str(eval_set)] * has_eval_sets
+            ticks.append((0.5 * (first + place + 1.0), ", ".join(dict.fromkeys(parts))))
+            place -= 1.5
+        axis.set_yticks([at for at, _ in ticks], [text for _, text in ticks])
+        axis.set(
+            xlim=(-0.02, 1.02),
+            ylim=(place + 1.5, 1.0),
+            xlabel="success on held-out episodes, each seed with its 95 % interval",
+        )
+        axis.grid(axis="x", color="0.9")
+        axis.set_axisbelow(True)
+        return _svg(figure, "success on held-out episodes, each seed with its Wilson interval")
+
+
+def _label(name: str, runs: list[Run]) -> str:
+    return f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})"
+
+
+def _svg(figure: Any, description: str) -> str:
+    """Return a figure as an SVG element, which keeps its aspect ratio at any width."""
+    content = io.StringIO()
+    figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
+    text = content.getvalue()
+    text = text[text.index("<svg") :]
+    return text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)

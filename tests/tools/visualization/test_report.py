@@ -23,9 +23,8 @@ from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.curves import plot_run
-from guiderail.tools.visualization.report import SAFETY_COLUMNS, _safety, write_report
+from guiderail.tools.visualization.report import SAFETY_COLUMNS, _safety, _svg, write_report
 from guiderail.tools.visualization.report_data import command, gather
-from guiderail.tools.visualization.report_figures import _svg
 from guiderail.tools.visualization.style import new_figure
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
