@@ -171,7 +171,7 @@ def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mappi
 
 def start_or_resume(
     task: str | None,
-    out: Path | None,
+    out: Path,
     *,
     environment: Mapping[str, Any],
     algorithm: str | None = None,
@@ -202,10 +202,8 @@ def start_or_resume(
     The task's scripted policy acts in the learner's `demonstration_episodes`.
 
     Raises:
-        InputError: As `train`, or if `out` is missing, or `task` without `resume`.
+        InputError: As `train`, or if `task` is missing without `resume`.
     """
-    if out is None:
-        raise InputError("the run needs a folder: name one with --out RUN")
     folder = RunFolder(out)
     episodes = None if episodes is None else check_episodes(episodes)
     seed = None if seed is None else check_seed(seed)
