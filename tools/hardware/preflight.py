@@ -83,6 +83,7 @@ class PreflightChecks:
     """Pre-flight checks of a station that receives statuses and sends nothing.
 
     Attributes:
+        driver: Driver of the robot; its `error` is the reason why the robot stopped by itself earlier, if it is known.
         simulator: Simulator of the station, with the newest status.
     """
 
@@ -107,28 +108,14 @@ class PreflightChecks:
             InputError: If no robot answers.
         """
         self._station, self._clock, self._start, self._num_steps = station, clock, start, num_steps
-        self._max_wrench = max_wrench
+        self._max_wrench, self.driver = max_wrench, station.driver
         self.simulator = start_simulator(station, clock, max_wrench)
-        self._commands_before = station.driver.num_foreign_commands
+        self._commands_before = self.driver.num_foreign_commands
         self._receive_statuses()
-
-    @property
-    def error(self) -> str:
-        """Reason why the robot stopped by itself earlier; empty if there is none or it is unknown."""
-        return self._station.driver.error
-
-    def clear_error(self) -> None:
-        """Clear the robot's error and receive new statuses; the arm does not move.
-
-        Raises:
-            InputError: If the error persists.
-        """
-        self._station.driver.recover()
-        self.repeat()
 
     def run(self) -> list[Check]:
         """Return the checks on the newest status."""
-        num_commands = self._station.driver.num_foreign_commands - self._commands_before
+        num_commands = self.driver.num_foreign_commands - self._commands_before
         return check_robot(self._station, self.simulator.get_context(), self._start, num_commands)
 
     def repeat(self) -> list[Check]:
@@ -146,10 +133,10 @@ class PreflightChecks:
 
     def _receive_statuses(self) -> None:
         """Receive `NUM_STATUSES`; nothing is sent, and a safety monitor's first heartbeat may take a status or two."""
-        driver, before = self._station.driver, self._station.driver.num_statuses
+        before = self.driver.num_statuses
         self._clock.advance(self.simulator, self._station, NUM_STATUSES)
-        if driver.num_statuses == before:
-            raise InputError(f"no statuses arrive any more on {driver}: start its driver again")
+        if self.driver.num_statuses == before:
+            raise InputError(f"no statuses arrive any more on {self.driver}: start its driver again")
 
 
 def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:
@@ -261,11 +248,12 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an
             error and nothing is asked.
     """
-    if checks.error:
+    if error := checks.driver.error:
         if assume_yes:
-            raise InputError(f"the robot reports {checks.error}: look at it, and start again without --yes")
-        confirm(f"The robot reports {checks.error}. Clear the error? The arm does not move.")
-        checks.clear_error()
+            raise InputError(f"the robot reports {error}: look at it, and start again without --yes")
+        confirm(f"The robot reports {error}. Clear the error? The arm does not move.")
+        checks.driver.recover()  # raises an InputError if the error persists
+        checks.repeat()
     results = checks.run()
     for check in results:
         log(f"{MARKS[check.passed]}  {check.name:<12}{check.description}")
