@@ -91,26 +91,16 @@ class RunFolder:
 
     Attributes:
         path: The folder.
+        checkpoint: File that `--resume` continues from.
+        steps: Folder of the step log; see `guiderail.tools.evaluation.step_log`.
+        logs: Folder of the learning logs, such as those of TensorBoard.
     """
 
     def __init__(self, path: Path | str):
         """Construct the interface of the folder `path`, which need not exist."""
         self.path = Path(path)
-
-    @property
-    def checkpoint(self) -> Path:
-        """File that `--resume` continues from."""
-        return self.path / "checkpoint" / "state.safetensors"
-
-    @property
-    def steps(self) -> Path:
-        """Folder of the step log; see `guiderail.tools.evaluation.step_log`."""
-        return self.path / "steps"
-
-    @property
-    def logs(self) -> Path:
-        """Folder of the learning logs, such as those of TensorBoard."""
-        return self.path / "logs"
+        self.checkpoint = self.path / "checkpoint" / "state.safetensors"
+        self.steps, self.logs = self.path / "steps", self.path / "logs"
 
     @property
     def state(self) -> str:
