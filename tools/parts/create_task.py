@@ -185,7 +185,11 @@ def create_task(
     both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping, yaw)
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
     deviation = max(part.repair.moved + surface.deviation for part, surface in zip(parts, both, strict=True))
-    log(_describe_surfaces(parts, both, deviation, clearance))
+    counts = ", ".join(
+        f"{name} {sum(len(triangles) for _, triangles in part.bodies)} → {surface.num_triangles}"
+        for part, (name, surface) in zip(parts, surfaces.items(), strict=True)
+    )
+    log(f"triangles: {counts}; {_describe_deviation(1e3 * deviation, 1e3 * clearance)}")
     # Symmetry augmentation leaves turns unchanged, but a reflection reverses the turn that the policy searches for.
     sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path, first + second)
     log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
@@ -223,16 +227,6 @@ def create_task(
 def _seconds_since(start: float) -> float:
     """Return the CPU time since `start`, a result of `cpu_time`, for a table [s]."""
     return round(cpu_time() - start, 2)
-
-
-def _describe_surfaces(
-    parts: Sequence[Part], surfaces: Sequence[ContactSurface], deviation: float, clearance: float
-) -> str:
-    counts = ", ".join(
-        f"{name} {sum(len(triangles) for _, triangles in part.bodies)} → {surface.num_triangles}"
-        for name, part, surface in zip(("plug", "socket"), parts, surfaces, strict=True)
-    )
-    return f"triangles: {counts}; {_describe_deviation(1e3 * deviation, 1e3 * clearance)}"
 
 
 def _describe_deviation(deviation: float, clearance: float | None) -> str:
