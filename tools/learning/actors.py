@@ -18,15 +18,15 @@ from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, h
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
-from guiderail.tools.learning.sb3 import load_module
+from guiderail.tools.learning.sb3 import load_module, module_arrays, restore_modules
 
-Weights = dict[str, dict[str, np.ndarray]]
+Weights = dict[str, np.ndarray]  # parameters and buffers of the modules that a learner acts with, as MODULE/NAME
 
 
 class Snapshot(NamedTuple):
     """State of a learner that an actor needs."""
 
-    weights: Weights  # parameters by module and name
+    weights: Weights
     transitions: int  # number of transitions that the learner has learned from
     greedy_successes: int  # number of consecutive successes in greedy episodes
 
@@ -111,7 +111,7 @@ class ParallelLearner(Learner):
             self._exchange(None)
         learner, episode = self._learner, self._simulated.pop(index)
         weights, actor = self._snapshots[self._required(index)].weights, copy.deepcopy(learner.actor())
-        load_module(actor, weights.get("averaged", weights["actor"]))
+        load_module(actor, entries_of(weights, "averaged") or entries_of(weights, "actor"))
         learner.start_recorded(episode.is_greedy, actor)
         for transition in episode.transitions:
             learner.on_step(transition)
@@ -184,10 +184,9 @@ class ParallelLearner(Learner):
         arrays, values = self._learner.state()
         stored = {f"learner/{name}": array for name, array in arrays.items()}
         stored |= {
-            f"snapshot/{number}/{module}/{name}": array
+            f"snapshot/{number}/{name}": array
             for number, snapshot in self._snapshots.items()
-            for module, weights in snapshot.weights.items()
-            for name, array in weights.items()
+            for name, array in snapshot.weights.items()
         }
         snapshots = {str(number): [one.transitions, one.greedy_successes] for number, one in self._snapshots.items()}
         return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
@@ -201,8 +200,7 @@ class ParallelLearner(Learner):
         self._learner.restore(entries_of(arrays, "learner"), values["learner"])
         self._snapshots = {}
         for number, counts in values["snapshots"].items():
-            weights = {name: entries_of(arrays, f"snapshot/{number}/{name}") for name in _modules(self._learner)}
-            self._snapshots[int(number)] = Snapshot(weights, *counts)
+            self._snapshots[int(number)] = Snapshot(entries_of(arrays, f"snapshot/{number}"), *counts)
         self._learned = self._assigned = values["learned"]
 
 
@@ -240,16 +238,12 @@ def _modules(learner: OffPolicyLearner) -> dict[str, Any]:
 
 def copy_weights(learner: OffPolicyLearner) -> Weights:
     """Return a copy of the weights that a learner acts with."""
-    return {
-        name: {key: value.detach().cpu().numpy().copy() for key, value in module.state_dict().items()}
-        for name, module in _modules(learner).items()
-    }
+    return {name: array.copy() for name, array in module_arrays(_modules(learner), {}).items()}
 
 
 def load_weights(learner: OffPolicyLearner, weights: Weights) -> None:
     """Set the weights that a learner acts with."""
-    for name, module in _modules(learner).items():
-        load_module(module, weights[name])
+    restore_modules(weights, _modules(learner), {})
 
 
 def _snapshot(learner: OffPolicyLearner) -> Snapshot:

@@ -92,16 +92,16 @@ def module_arrays(
 
 
 def restore_modules(
-    tensors: Mapping[str, torch.Tensor],
+    arrays: Mapping[str, Any],
     modules: Mapping[str, torch.nn.Module],
     optimizers: Mapping[str, torch.optim.Optimizer],
 ) -> None:
-    """Set modules and optimizers from the arrays that `module_arrays` returned, given as tensors."""
+    """Set modules and optimizers from the arrays that `module_arrays` returned, for optimizers given as tensors."""
     for name, module in modules.items():
-        load_module(module, entries_of(tensors, name))
+        load_module(module, entries_of(arrays, name))
     for name, optimizer in optimizers.items():
         moments: dict[int, dict[str, torch.Tensor]] = {}
-        for key, value in entries_of(tensors, f"optimizer/{name}").items():
+        for key, value in entries_of(arrays, f"optimizer/{name}").items():
             index, moment = key.split("/")
             moments.setdefault(int(index), {})[moment] = value
         optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
