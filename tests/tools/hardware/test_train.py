@@ -308,11 +308,11 @@ def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
     clock, requests, begin = ready
     commands = []
     clock.monitor._driver.lcm.Subscribe(IiwaDriver.command_channel, commands.append)
-    with begin() as robot:
+    with begin() as (env, _):
         assert (len(requests), commands) == (1, [])  # nothing was sent yet
         begun, step = [], clock.step
         monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
-        robot.env._take_control()
+        env._take_control()
         assert begun == [step]
 
 
@@ -326,19 +326,19 @@ def test_resuming_is_confirmed_and_releasing_unless_simulated(ready, monkeypatch
     monkeypatch.setattr(
         "guiderail.tools.hardware.session.publish_part_offsets", lambda driver, parts: offsets.append(parts)
     )
-    with begin(sim=sim, assume_yes=assume_yes) as robot:
-        robot.env._confirm_resume("stopped")
-        robot.env._free_workpiece("stuck")
+    with begin(sim=sim, assume_yes=assume_yes) as (env, _):
+        env._confirm_resume("stopped")
+        env._free_workpiece("stuck")
     assert [question.split()[0] for question in questions] == ["Resume"] + ["Release"] * (not sim)
     assert offsets == [[[1.0, 0.0], [0.0, 0.0]]] * sim
 
 
 def test_arm_does_not_resume_after_a_signal_that_ends_the_program(ready):
     begin = ready[2]
-    with begin(sim=True, assume_yes=True) as robot:
+    with begin(sim=True, assume_yes=True) as (env, _):
         raise_signal(SIGTERM)
         with pytest.raises(InputError, match="stopped by a signal"):
-            robot.env._confirm_resume("stopped")
+            env._confirm_resume("stopped")
 
 
 def test_commands_check_fails_when_another_program_commands(monkeypatch):
