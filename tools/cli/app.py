@@ -186,7 +186,6 @@ Subject = Annotated[
     ),
 ]
 Demonstrations = Annotated[Path, argument("Demonstrations: .npz, .csv or a folder of them.", "FILE")]
-DemonstrationsOut = Annotated[Path, option("File of demonstrations to write, .npz or .csv.")]
 Seed = Annotated[int, option("Seed of the first held-out episode; episode i has seed + i.")]
 Env = Annotated[
     list[str] | None,
@@ -228,9 +227,6 @@ TrustImports = Annotated[
     ),
 ]
 Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
-Baseline = Annotated[
-    str | None, option("Policy that acts in a TASK: scripted, {baselines}.  [default: scripted]", "--policy")
-]
 Baselines = Annotated[
     str | None,
     option(

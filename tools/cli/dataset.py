@@ -18,7 +18,7 @@ def import_(
     source: Annotated[
         Path, argument("LeRobot v3 dataset, ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
     ],
-    out: cli.DemonstrationsOut,
+    out: Annotated[Path, option("File of demonstrations to write, .npz or .csv.")],
     signal: Annotated[
         str | None, option("Topic or feature to import.  [default: the only one, or the only commanded one]")
     ] = None,

@@ -9,8 +9,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_progress, print_result
 
-Url = Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's default]")]
-
 
 @cli.command("deploy runs/connector --sim --yes")
 def deploy(
@@ -121,7 +119,7 @@ def sim_driver(
 
 @cli.command("safety-monitor --task BncConnector", "safety-monitor")
 def safety_monitor(
-    url: Url = "",
+    url: Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's default]")] = "",
     robot: Annotated[str, option("Robot arm.", choices="robots")] = "iiwa14",
     task: Annotated[
         str, option("Task with the workpiece that the arm carries: {tasks}.", choices="tasks")

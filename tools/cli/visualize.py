@@ -25,7 +25,9 @@ def visualize(
     seed: cli.Seed = 1_000_000,
     env: cli.Env = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
-    policy: cli.Baseline = None,
+    policy: Annotated[
+        str | None, option("Policy that acts in a TASK: scripted, {baselines}.  [default: scripted]")
+    ] = None,
     task: cli.PolicyTask = None,
     trust_policy: cli.TrustPolicy = False,
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
