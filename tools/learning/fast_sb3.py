@@ -273,7 +273,7 @@ class FastTrainingStep(_Algorithm):
         self._features, self._actions = critic.features_extractor.features_dim, self.action_space.shape[0]
         self._actor_features = actor.features_dim
         trunk, head = [self._actor_features, *actor.net_arch], [actor.net_arch[-1], self._actions]
-        shared = sum(_num_parameters(*pair) for pair in pairwise(trunk))
+        shared = sum((inputs + 1) * outputs for inputs, outputs in pairwise(trunk))
         values, gradient = actor.optimizer.values, actor.optimizer.gradient
         # The mean and the logarithm of the standard deviation are two networks on one trunk.
         self._actor = BatchedMLP(
@@ -458,13 +458,9 @@ class FastTqc(FastTrainingStep, TQC):
         return torch.full_like(values, -1 / values.numel())
 
 
-def _num_parameters(inputs: int, outputs: int) -> int:
-    return (inputs + 1) * outputs
-
-
 def _layers(values: torch.Tensor, gradient: torch.Tensor, sizes: list[int]) -> list[Linear]:
     """Return the layers of n networks whose parameters are the rows of `values`, layer by layer."""
     pairs = list(pairwise(sizes))
-    counts = [_num_parameters(*pair) for pair in pairs]
+    counts = [(inputs + 1) * outputs for inputs, outputs in pairs]
     parts = zip(values.split(counts, dim=1), gradient.split(counts, dim=1), pairs, strict=True)
     return [Linear(value, derivative, *pair) for value, derivative, pair in parts]
