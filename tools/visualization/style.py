@@ -59,11 +59,6 @@ def rolling(values: Sequence[float] | np.ndarray, window: int = WINDOW) -> np.nd
     return pd.Series(np.asarray(values, float)).rolling(window, min_periods=1).mean().to_numpy()
 
 
-def range_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the minimum and maximum over the first axis of `values` (runs, n)."""
-    return values.min(axis=0), values.max(axis=0)
-
-
 def draw_runs(
     axis: Axes,
     runs: Sequence[Sequence[float] | np.ndarray],
@@ -71,7 +66,7 @@ def draw_runs(
     color: str,
     label: str,
     window: int = WINDOW,
-    band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = range_band,
+    band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = lambda values: (values.min(0), values.max(0)),
     **line: Any,
 ) -> None:
     """Draw the learning curve of a method: the mean over runs of a moving mean, and a band.
@@ -82,7 +77,8 @@ def draw_runs(
         color: Color of line and band.
         label: Label for a legend.
         window: Episodes of the moving mean.
-        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each.
+        band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each; by default the
+            range of the runs.
         line: Further arguments of the line.
     """
     length = min(len(run) for run in runs)
