@@ -70,11 +70,12 @@ def teleoperate(
             raise InputError("--json prints what was demonstrated: give --record too")
     elif guidance is not None:
         raise InputError("a demonstration is recorded without guidance: leave --guidance out")
-    from guiderail.tools.teleop.recorder import teleoperate as run
+    from guiderail.tools.teleop import recorder
 
-    statistics = run(name, environment, record=record, log=print_progress)
-    if statistics is not None:
-        print_result(statistics, as_json)
+    if record is None:
+        recorder.teleoperate(name, environment, print_progress)
+    else:
+        print_result(recorder.record_demonstrations(name, environment, record, print_progress), as_json)
 
 
 @cli.command("sim-driver --seconds 60", "sim-driver")

@@ -446,23 +446,12 @@ class LiveView(EnvCallback):
         self.env.render()
 
 
-def teleoperate(
-    task: str,
-    environment: Mapping[str, Any],
-    *,
-    record: Path | None = None,
-    log: Callable[[str], None] = print,
-) -> dict[str, Any] | None:
-    """Let the operator act in place of the policy until Ctrl-C, or record demonstrations and return their statistics.
-
-    The operator gives the action of the task's guidance. With `record`, a new file .npz or .csv, the operator moves the
-    desired pose instead, and the demonstrations are written to that file.
+def teleoperate(task: str, environment: Mapping[str, Any], log: Callable[[str], None]) -> None:
+    """Let the operator act in place of the policy until Ctrl-C, by the action of the task's guidance.
 
     Raises:
-        InputError: If an action has more numbers than the device has inputs. With `record`, as `record_demonstrations`.
+        InputError: If an action has more numbers than the device has inputs.
     """
-    if record is not None:
-        return record_demonstrations(task, environment, record, log)
     env = make_environment(task, environment, render_mode="human")
     own, size = task_of(env, task), int(env.action_space.shape[0])  # type: ignore[index]
     if size > len(GAMEPAD_AXES):
