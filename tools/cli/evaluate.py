@@ -72,20 +72,15 @@ def evaluate(
                 "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
                 "--save, --signal, --processes, --trust-policy, --seed and --resample-offsets out"
             )
-        from guiderail.tools.evaluation.baselines import make_baseline
         from guiderail.tools.hardware.evaluate import evaluate_on_robot
-        from guiderail.tools.learning.run_folder import RunFolder
-        from guiderail.tools.pretrained import find_run
 
         connection = cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
-        config = RunFolder(find_run(Path(subject))).config()
         on_robot = evaluate_on_robot(
             Path(subject),
             connection,
             episodes,
             station=str(environment["station"]),
-            policy=policy or "",
-            make_policy=None if policy is None else make_baseline(config.task, policy, config.seed),
+            policy=policy,
             assume_yes=yes,
             out=out,
             log=print_message,

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import pandas as pd
 
 from guiderail.diagrams.hardware.clock import garbage_collection_disabled
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, PolicyFn, rollout
+from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, rollout
 from guiderail.tools.files import write_atomically, write_record
 from guiderail.tools.hardware.connection import Log, RobotConnection
 from guiderail.tools.hardware.executor import hardware_environment, recordings_folder
@@ -40,8 +40,7 @@ def evaluate_on_robot(
     episodes: int,
     *,
     station: str = "hardware",
-    policy: str = "",
-    make_policy: Callable[[gymnasium.Env], PolicyFn] | None = None,
+    policy: str | None = None,
     assume_yes: bool = False,
     out: Path | None = None,
     log: Log = print,
@@ -56,8 +55,7 @@ def evaluate_on_robot(
         connection: Connection to the robot driver.
         episodes: Number of episodes, at least 1.
         station: Name of a hardware station.
-        policy: Name of the policy that replaces the run's own, for the file name.
-        make_policy: Function that returns this policy for an environment.
+        policy: Name of a baseline or scripted policy that replaces the run's own; None for the run's own.
         assume_yes: Do not ask for confirmation.
         out: Folder of the rows; `recordings_folder` by default.
         log: Function that shows a message.
@@ -75,14 +73,15 @@ def evaluate_on_robot(
     folder = RunFolder(find_run(run))
     config = folder.config()
     config.refuse_changed_task(folder.path)
-    own_policy = Policy.load(folder.path) if make_policy is None else None
+    make_policy = None if policy is None else make_baseline(config.task, policy, config.seed)
+    own_policy = Policy.load(folder.path) if policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
     if environment.get("reward") != config.environment.get("reward"):
         log(
             f"mean_return is that of the reward {environment['reward']!r}, because the run's own needs simulation state"
         )
     config = replace(config, environment=environment | connection.environment_options(station))
-    path = (out or recordings_folder(run)) / f"episodes{'-' * bool(policy)}{policy}.csv"
+    path = (out or recordings_folder(run)) / ("episodes.csv" if policy is None else f"episodes-{policy}.csv")
     rows: list[dict[str, Any]] = []
 
     def write(file: Path) -> None:

@@ -113,7 +113,7 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
     env.keys.is_pause_requested = True
-    result = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
+    result = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero")
     assert (result["episodes"], result["success_rate"]) == (2, 0.0)
     assert (env.asked, env.keys.is_pause_requested) == (
         ["stop requested by the user"],
@@ -122,13 +122,13 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
-        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero")
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, RobotConnection(), 0)
     # Two evaluations at once, neither of which has a row yet, do not overwrite each other's file.
     elsewhere = tmp_path / "elsewhere"
     with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
-        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", make_policy=lambda env: still, out=elsewhere)
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", out=elsewhere)
     assert not list(elsewhere.glob("*.csv"))
 
 
