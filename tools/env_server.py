@@ -78,22 +78,18 @@ class EnvServer:
             if not isinstance(request, dict) or len(request) != 1 or next(iter(request)) not in ("reset", "action"):
                 raise InputError('a request is {"reset": SEED} or {"action": [...]}')
             if "reset" in request:
-                self._reset(request["reset"])
+                seed = request["reset"]
+                if seed is not None and (type(seed) is not int or not 0 <= seed < 2**31):
+                    raise InputError("a seed is a whole number from 0 to 2147483647, or null")
+                options = {} if seed is None else self._seeded
+                self._observation, self._info = self._env.reset(seed=seed, options=options)
+                self._is_done = False
             else:
-                self._step(request["action"])
+                self._observation, _, terminated, truncated, self._info = self._env.step(request["action"])
+                self._is_done = terminated or truncated
         except (InputError, gymnasium.error.ResetNeeded) as error:
             return {"error": str(error)}
         return self._state()
-
-    def _reset(self, seed: Any) -> None:
-        if seed is not None and (type(seed) is not int or not 0 <= seed < 2**31):
-            raise InputError("a seed is a whole number from 0 to 2147483647, or null")
-        self._observation, info = self._env.reset(seed=seed, options={} if seed is None else self._seeded)
-        self._info, self._is_done = info, False
-
-    def _step(self, action: Any) -> None:
-        self._observation, _, terminated, truncated, self._info = self._env.step(action)
-        self._is_done = terminated or truncated
 
     def _state(self) -> dict[str, Any]:
         context = self._station.GetMyContextFromRoot(self._env.simulator.get_context())
