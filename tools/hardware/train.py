@@ -25,7 +25,7 @@ from guiderail.tools.hardware.executor import record_size
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.learner import LEARNERS, described_observation, learner_arguments
-from guiderail.tools.learning.pipelined import PipelinedLearner
+from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, with_defaults
 from guiderail.tools.learning.trainer import restore_checkpoint, write_checkpoint
@@ -119,8 +119,7 @@ def _train(
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
     learner = PipelinedLearner(
         acting,
-        env,
-        named,
+        ((config.learner, SpacesOnlyEnv(env)), named),
         waits=waits,
         excluded=EXCLUDED_TERMINATIONS,
         niceness=NICENESS,

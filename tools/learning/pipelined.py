@@ -13,7 +13,6 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-import gymnasium
 import numpy as np
 import pyarrow as pa
 import torch
@@ -25,7 +24,7 @@ from guiderail.tools.evaluation.step_log import write_step_log
 from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import LEARNERS, Learner
-from guiderail.tools.learning.networks import SpacesOnlyEnv
+from guiderail.tools.learning.networks import SpacesOnlyEnv as SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
 
@@ -47,8 +46,7 @@ class PipelinedLearner(Learner):
     def __init__(
         self,
         acting: Learner,
-        env: gymnasium.Env,
-        arguments: dict[str, Any],
+        arguments: tuple[tuple[Any, ...], dict[str, Any]],
         *,
         waits: bool,
         excluded: tuple[str, ...] = (),
@@ -59,8 +57,7 @@ class PipelinedLearner(Learner):
 
         Args:
             acting: Learner that acts; its weights are replaced as they are learned.
-            env: Environment, of which the learner in the training process gets the spaces.
-            arguments: Keyword arguments of that learner, which has the configuration of `acting`.
+            arguments: Positional and keyword arguments of the learner in the training process, configuration first.
             waits: Wait at the start of an episode until its weights are learned, as described above.
             excluded: Terminations of episodes that are not learned from.
             niceness: Niceness of the training process.
@@ -80,7 +77,7 @@ class PipelinedLearner(Learner):
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([__name__])  # the fork server imports this module once for all runs of a study
         self._pipe, child_pipe = context.Pipe()
-        child_arguments = (child_pipe, niceness, tuple(imports), acting.config, SpacesOnlyEnv(env), arguments)
+        child_arguments = (child_pipe, niceness, tuple(imports), *arguments)
         self._process = context.Process(target=_serve, args=child_arguments, daemon=True)
         self._process.start()
         child_pipe.close()
@@ -252,7 +249,7 @@ def _process_ended_error() -> InputError:
 
 
 def _serve(
-    pipe: Connection, niceness: int, imports: tuple[str, ...], config: Any, env: gymnasium.Env, named: dict[str, Any]
+    pipe: Connection, niceness: int, imports: tuple[str, ...], given: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
     """Run the training process: answer requests until the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the acting one handles it
@@ -265,7 +262,7 @@ def _serve(
         from guiderail.tools.imports import import_modules  # imports Drake, which takes a second
 
         import_modules(imports)
-    learner: Any = LEARNERS.get(config.algorithm)(config, env, **named)
+    learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)
     while (message := requests.get()) != ("end",):
         name, *arguments = message
         try:

@@ -126,9 +126,10 @@ def run_training(
         stack.enter_context(folder.locked())
         stack.enter_context(closed_first.pop_all())  # the lock is released last, as all of these write into the folder
         if config.learner.pipelined:
-            from guiderail.tools.learning.pipelined import PipelinedLearner
+            from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 
-            learner = PipelinedLearner(learner, env, arguments, waits=True, imports=config.imports)
+            child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
+            learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
         elif config.learner.num_envs:
             from guiderail.tools.learning.actors import ParallelLearner
 

@@ -22,7 +22,7 @@ def make_learner(**more):
     preset = resolve_preset("tqc_contact", "sac", small)
     named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, space, **named)
-    return PipelinedLearner(acting, space, named, waits=True, **more), acting
+    return PipelinedLearner(acting, ((preset, space), named), waits=True, **more), acting
 
 
 def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):

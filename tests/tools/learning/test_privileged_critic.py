@@ -190,7 +190,7 @@ def test_pipelined_learner_restores_a_pending_episode():
         config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"train_freq": 1, "gradient_steps": 1})
         named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
         env = SpacesOnlyEnv(Vector())
-        return PipelinedLearner(TqcLearner(config, env, **named), env, named, waits=True)
+        return PipelinedLearner(TqcLearner(config, env, **named), ((config, env), named), waits=True)
 
     def episode(learner, seed):
         random = np.random.default_rng(seed)
