@@ -136,7 +136,11 @@ def choose_contact(
             snapped = frozenset(range(number - snapping, number)) if name == "plug" else frozenset()
             contact = Contact(name, tuple(pieces), deviation, snapped)
             _write_pieces(folder, contact, surfaces)
-            refusal = _refusal_of_drake(folder, make_file(contact, PUSHES[0]))
+            try:  # in a child process, because Drake may abort
+                run_isolated(_make_station, folder, make_file(contact, PUSHES[0]), cpu_seconds=CHECK_SECONDS)
+                refusal = ""
+            except IsolatedError as error:
+                refusal = str(error)
             seconds += cpu_time() - start
             if refusal:
                 report(f"{name}: Drake refuses its contact geometry ({refusal})")
@@ -169,15 +173,6 @@ def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
     seats = bool(choice.aligned.success)
     is_shallow = seats and choice.deepest <= allowed
     return seats, is_shallow, choice.speed >= MIN_SPEED, choice.speed if is_shallow else -choice.deepest
-
-
-def _refusal_of_drake(folder: Path, file: Any) -> str | None:
-    """Return the reason why Drake rejects the geometry, or None; Drake runs in a child process, as it may abort."""
-    try:
-        run_isolated(_make_station, folder, file, cpu_seconds=CHECK_SECONDS)
-    except IsolatedError as error:
-        return str(error)
-    return None
 
 
 def _make_station(folder: Path, file: Any) -> None:
