@@ -271,7 +271,14 @@ def _success_counts(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
 def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
     """Return the counts of a run's held-out episodes; evaluate it first unless exactly `episodes` are stored."""
     if episodes:
-        _evaluate(run, episodes)
+        environment = run.config.environment
+        evaluate_trained(RunFolder(run.path), run.config, episodes)
+        evaluation: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
+        is_demonstration = is_demonstrated(environment.get("guidance"))
+        for name in BASELINES:
+            stored_name = "demonstration" if name == "zero" and is_demonstration else name
+            make_policy = make_baseline(run.config.task, name, run.config.seed)
+            evaluate_once(run.path / BASELINES_FOLDER, stored_name, run.config, make_policy, environment, **evaluation)
     counts: dict[str, dict[str, Any]] = {}
     names = {"study": "", "part_of": "", "source": "", "method": run.method}
     run_columns = {**names, "seed": run.config.seed, "after_episodes": len(run.episodes)}
@@ -281,18 +288,6 @@ def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
             count = {"episodes": len(rows), "successes": int(rows["success"].sum())}
             counts[policy] = {**run_columns, "policy": policy, "eval_set": "held out", **count}
     return pd.DataFrame(list(counts.values()))
-
-
-def _evaluate(run: Run, episodes: int) -> None:
-    """Evaluate a run's policy and baseline policies on held-out episodes, unless they are stored in its folder."""
-    environment = run.config.environment
-    evaluate_trained(RunFolder(run.path), run.config, episodes)
-    evaluation: dict[str, Any] = {"episodes": episodes, "seed": HELD_OUT_SEED, "processes": None}
-    is_demonstration = is_demonstrated(environment.get("guidance"))
-    for name in BASELINES:
-        stored_name = "demonstration" if name == "zero" and is_demonstration else name
-        make_policy = make_baseline(run.config.task, name, run.config.seed)
-        evaluate_once(run.path / BASELINES_FOLDER, stored_name, run.config, make_policy, environment, **evaluation)
 
 
 def _name_methods(runs: list[Run]) -> None:
