@@ -316,7 +316,9 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
     observation_shape, action_shape = shapes(policy, env)
     takes = "cannot take these observations" if observation_shape is None else f"takes observations {observation_shape}"
     returns = "" if action_shape is None else f" and returns actions {action_shape}"
-    task, options = _task_options(env)
+    declaration = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
+    config = getattr(declaration, "config", None)  # None for an environment of another origin
+    task, options = ("", {}) if config is None else (config.task, config.options)
     changed = [
         f"{name}={brief(value)} instead of {brief(options[name])}"
         for name, value in (learned_in or {}).items()
@@ -367,13 +369,6 @@ def _only_shapes(policy: PolicyFn) -> tuple[tuple[int, ...] | None, tuple[int, .
         if len(found) > 1:
             break
     return found[0] if len(found) == 1 else (None, None)
-
-
-def _task_options(env: gymnasium.Env) -> tuple[str, dict[str, Any]]:
-    """Return the name of an environment's task and all its options; empty for an environment of another origin."""
-    declaration = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
-    config = getattr(declaration, "config", None)
-    return ("", {}) if config is None else (config.task, config.options)
 
 
 _MAX_FITTING = 2  # largest number of combinations that a message names
