@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import gymnasium
 import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
-from pydrake.systems.primitives import AffineSystem, Multiplexer, PassThrough, Saturation, TrajectorySource
+from pydrake.systems.primitives import AffineSystem, Multiplexer, Saturation, TrajectorySource
 from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
@@ -102,35 +102,29 @@ class Observation(Diagram):
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
             raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
-        signals = {term.signal for term in terms}
-        multiplexer = builder.AddNamedSystem(
-            _unused("observed", signals), Multiplexer([sizes[term.signal] for term in terms])
-        )
-        ports: dict[str, OutputPort] = {}
+        multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
+        clocks: dict[str, OutputPort] = {}
+        exported = set()
         if waits:
-            motion_time = builder.AddNamedSystem(
-                _unused(MOTION_TIME, signals), Saturation(np.zeros(1), np.full(1, duration))
-            )
+            motion_time = builder.AddNamedSystem(MOTION_TIME, Saturation(np.zeros(1), np.full(1, duration)))
             builder.ExportInput(motion_time.get_input_port(), MOTION_TIME)
+            exported.add(MOTION_TIME)
         for index, term in enumerate(terms):
-            if term.signal in CLOCKS and term.signal not in ports:
-                ports[term.signal] = _add_clock(builder, term.signal, duration, motion_time if waits else None)
-            elif term.signal not in ports:
-                signal = builder.AddNamedSystem(term.signal, PassThrough(sizes[term.signal]))
-                if waits and term.signal == MOTION_TIME:
-                    builder.ConnectInput(MOTION_TIME, signal.get_input_port())
-                else:
-                    builder.ExportInput(signal.get_input_port(), term.signal)
-                ports[term.signal] = signal.get_output_port()
-            builder.Connect(ports[term.signal], multiplexer.get_input_port(index))
+            if term.signal in CLOCKS:
+                if term.signal not in clocks:
+                    clocks[term.signal] = _add_clock(builder, term.signal, duration, motion_time if waits else None)
+                builder.Connect(clocks[term.signal], multiplexer.get_input_port(index))
+            elif term.signal in exported:
+                builder.ConnectInput(term.signal, multiplexer.get_input_port(index))
+            else:
+                builder.ExportInput(multiplexer.get_input_port(index), term.signal)
+                exported.add(term.signal)
         scale = np.concatenate([scale for _, _, scale in rows])
         center = np.concatenate([center for _, center, _ in rows])
         D = block_diag(*(selection for selection, _, _ in rows)) / scale[:, None]
-        scaled = add_system(
-            builder, _unused("scaled", signals), affine(D, -center / scale), multiplexer.get_output_port()
-        )
+        scaled = add_system(builder, "scaled", affine(D, -center / scale), multiplexer.get_output_port())
         limit = np.full(self.size, clip)
-        clipped = add_system(builder, _unused("clipped", signals), Saturation(-limit, limit), scaled.get_output_port())
+        clipped = add_system(builder, "clipped", Saturation(-limit, limit), scaled.get_output_port())
         builder.ExportOutput(clipped.get_output_port(), "observation")
         builder.BuildInto(self)
         self.space = gymnasium.spaces.Box(-clip, clip, (self.size,), np.float32)
@@ -143,13 +137,6 @@ class Observation(Diagram):
     def get_observation_output_port(self) -> OutputPort:
         """Return the port of the observation, (n,)."""
         return self.GetOutputPort("observation")
-
-
-def _unused(name: str, signals: Collection[str]) -> str:
-    """Return `name`, with underscores appended until no signal has this name."""
-    while name in signals:
-        name += "_"
-    return name
 
 
 def affine(D: np.ndarray, y0: np.ndarray | Sequence[float]) -> AffineSystem:
