@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -57,6 +57,9 @@ class MovableWorkcell(ABC):
 
     fixture: ClassVar[str]  # name of the fixture's body
     workpiece: ClassVar[str]  # name of the workpiece's body
+    # Surfaces without contact: names of the fixture's, then of the workpiece's. `drake:collision_filter_group` in an SDF
+    # file filters whole bodies only.
+    filtered_pairs: ClassVar[Sequence[tuple[Iterable[str], Iterable[str]]]] = ()
 
     @property
     @abstractmethod
@@ -90,6 +93,22 @@ class MovableWorkcell(ABC):
         plant.WeldFrames(plant.AddFrame(frame), body.body_frame())
         return body
 
+    def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+        """Exclude contact between the `filtered_pairs`."""
+        fixture, workpiece = (self._geometries(plant, scene_graph, name) for name in (self.fixture, self.workpiece))
+        manager = scene_graph.collision_filter_manager()
+        for first, second in self.filtered_pairs:
+            manager.Apply(
+                CollisionFilterDeclaration().ExcludeBetween(
+                    GeometrySet([fixture[name] for name in first]), GeometrySet([workpiece[name] for name in second])
+                )
+            )
+
+    def _geometries(self, plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:
+        inspector = scene_graph.model_inspector()
+        ids = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body))
+        return {inspector.GetName(geometry).split("::")[-1]: geometry for geometry in ids}
+
     def set_fixture_offset(self, plant: MultibodyPlant, plant_context: Context, X_TTactual: RigidTransform) -> None:
         """Move the fixture so that the task is done at the pose X_TTactual relative to the nominal target."""
         X_WF = self.X_WT @ X_TTactual @ self.X_FT.inverse()
@@ -103,31 +122,3 @@ class MovableWorkcell(ABC):
         """Return the pose of the workpiece relative to its goal in the actual fixture: the identity at the goal."""
         X_FWorkpiece = plant.GetFrameByName(self.workpiece).CalcPose(plant_context, plant.GetFrameByName(self.fixture))
         return self.X_FT.inverse() @ X_FWorkpiece
-
-
-def exclude_contacts(
-    plant: MultibodyPlant,
-    scene_graph: SceneGraph,
-    fixture: str,
-    workpiece: str,
-    pairs: Iterable[tuple[Iterable[str], Iterable[str]]],
-) -> None:
-    """Exclude contact between surfaces of fixture and workpiece; each pair names the fixture's surfaces first.
-
-    `drake:collision_filter_group` in an SDF file filters whole bodies only.
-    """
-    fixture_ids, workpiece_ids = (_geometries(plant, scene_graph, body) for body in (fixture, workpiece))
-    manager = scene_graph.collision_filter_manager()
-    for first, second in pairs:
-        manager.Apply(
-            CollisionFilterDeclaration().ExcludeBetween(
-                GeometrySet([fixture_ids[name] for name in first]),
-                GeometrySet([workpiece_ids[name] for name in second]),
-            )
-        )
-
-
-def _geometries(plant: MultibodyPlant, scene_graph: SceneGraph, body: str) -> dict[str, GeometryId]:
-    inspector = scene_graph.model_inspector()
-    ids = plant.GetCollisionGeometriesForBody(plant.GetBodyByName(body))
-    return {inspector.GetName(geometry).split("::")[-1]: geometry for geometry in ids}

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydrake.geometry import Box, SceneGraph
+from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -27,7 +27,7 @@ from guiderail.diagrams.envs.scene import (
 )
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
+from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import HARD, NOMINAL, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.offsets import reference_of_file
@@ -55,13 +55,6 @@ if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
 
-# Surfaces of jack and plug that cannot touch in a connector of these dimensions, or whose contact another pair carries.
-FILTERED_PAIRS = [
-    (("lug_0", "lug_1", "pad"), ("bore",)),
-    (("barrel", "pad"), ("slots",)),
-    (("lug_0", "lug_1", "barrel"), ("seat",)),
-]
-
 # The task board has no collision geometry, because the locked plug's mouth reaches slightly below the jack's bottom.
 # Size of the board, and its distance below the jack [m].
 BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]
@@ -80,6 +73,12 @@ class BncWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "jack"
     workpiece: ClassVar[str] = "plug"
+    # Surfaces that cannot touch in a connector of these dimensions, or whose contact another pair carries.
+    filtered_pairs = (
+        (("lug_0", "lug_1", "pad"), ("bore",)),
+        (("barrel", "pad"), ("slots",)),
+        (("lug_0", "lug_1", "barrel"), ("seat",)),
+    )
     dimensions: BncDimensions = field(default_factory=BncDimensions)  # dimensions of the connector
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the jack, (3,) [m]
     friction: float = FRICTION  # friction coefficient of the connector's metal
@@ -111,10 +110,6 @@ class BncWorkcell(MovableWorkcell):
         depth, width, thickness = BOARD
         below = RigidTransform(np.array(self.p_WJ) - [0.0, 0.0, BOARD_CLEARANCE + thickness / 2])
         plant.RegisterVisualGeometry(plant.world_body(), below, Box(depth, width, thickness), "board", BOARD_COLOR)
-
-    def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Allow only contacts of barrel with bore, lugs with slots, and pad with seat."""
-        exclude_contacts(plant, scene_graph, "jack", "plug", FILTERED_PAIRS)
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the collision surfaces of the jack, in J."""

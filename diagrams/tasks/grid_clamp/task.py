@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -17,7 +16,7 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.stations.workcell import MovableWorkcell, exclude_contacts
+from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, REWARDS, GridClampOptions
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
@@ -46,13 +45,6 @@ SEATED_HEIGHT = 0.5e-3  # [m] largest deviation of a seated clamp along z
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
 HOLES = tuple(f"hole_{number}" for number in range(5))
 PEGS = tuple(f"peg_{number}" for number in range(5))
-# All pairs of surfaces except each peg with its own hole, bead with lip, and pad with slab.
-FILTERED_PAIRS = [
-    *(((hole,), tuple(peg for peg in PEGS if peg[-1] != hole[-1])) for hole in HOLES),
-    (HOLES, ("bead", "pad")),
-    (("lip",), (*PEGS, "pad")),
-    (("slab",), (*PEGS, "bead")),
-]
 
 
 @dataclass(frozen=True)
@@ -61,6 +53,13 @@ class GridClampWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "table"
     workpiece: ClassVar[str] = "clamp"
+    # All pairs of surfaces except each peg with its own hole, bead with lip, and pad with slab.
+    filtered_pairs = (
+        *(((hole,), tuple(peg for peg in PEGS if peg[-1] != hole[-1])) for hole in HOLES),
+        (HOLES, ("bead", "pad")),
+        (("lip",), (*PEGS, "pad")),
+        (("slab",), (*PEGS, "bead")),
+    )
     dimensions: GridClampDimensions = field(default_factory=GridClampDimensions)  # dimensions of clamp and table
     p_WG: tuple[float, float, float] = (0.55, 0.0, 0.15)  # center of the middle hole in the table's face, (3,) [m]
     friction: float = FRICTION  # friction coefficient of pegs, holes and the table's face
@@ -83,10 +82,6 @@ class GridClampWorkcell(MovableWorkcell):
         """Add the table, and set the plant's stiction tolerance."""
         plant.set_stiction_tolerance(STICTION_TOLERANCE)
         super().add_fixture(plant)
-
-    def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Allow only contacts of each peg with its hole, bead with lip, and pad with slab."""
-        exclude_contacts(plant, scene_graph, "table", "clamp", FILTERED_PAIRS)
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the collision surfaces of the table, in G."""

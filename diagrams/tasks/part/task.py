@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
-from pydrake.geometry import SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
@@ -98,9 +97,6 @@ class PartWorkcell(MovableWorkcell):
         super().add_fixture(plant)
         for file in self.scenario:
             add_models(plant, file)
-
-    def filter_contacts(self, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
-        """Filter nothing: every piece of the plug may touch every piece of the socket."""
 
     def fixture_surfaces(self) -> list[Surface]:
         """Return the convex pieces of the socket.
