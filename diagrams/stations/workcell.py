@@ -57,8 +57,8 @@ class MovableWorkcell(ABC):
 
     fixture: ClassVar[str]  # name of the fixture's body
     workpiece: ClassVar[str]  # name of the workpiece's body
-    # Surfaces without contact: names of the fixture's, then of the workpiece's. `drake:collision_filter_group` in an SDF
-    # file filters whole bodies only.
+    # Surfaces without contact: names of the fixture's, then of the workpiece's. (`drake:collision_filter_group` in an
+    # SDF file filters whole bodies only.)
     filtered_pairs: ClassVar[Sequence[tuple[Iterable[str], Iterable[str]]]] = ()
 
     @property
