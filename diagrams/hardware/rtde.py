@@ -23,6 +23,7 @@ from guiderail.diagrams.hardware.driver import Check, PoseDriver, RobotImpedance
 from guiderail.models.common.errors import InputError, import_extra
 from guiderail.models.control.joint_status import MALFORMED_STATUS, JointStatus
 from guiderail.models.control.motion_constraints import MotionLimits
+from guiderail.models.robots.inverse_kinematics import pose_error
 from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import find_robot
 from guiderail.systems.support.drake_multibody import transform_to_vector
@@ -225,8 +226,7 @@ class RtdeDriver(PoseDriver):
             self._is_active, self._has_failed_to_stop = True, False
         # Computed by the station's model, so that driver and station agree; the robot's pose may differ by 1 mm.
         X_BaseActual = self._calc_pose(status.positions)
-        turn = (X_BaseTool.rotation() @ X_BaseActual.rotation().inverse()).ToAngleAxis()
-        error = np.concatenate([X_BaseTool.translation() - X_BaseActual.translation(), turn.angle() * turn.axis()])
+        error = pose_error(X_BaseTool, X_BaseActual)[[3, 4, 5, 0, 1, 2]]
         limits = impedance.max_wrench
         wrench = np.clip(impedance.stiffness @ error, -limits, limits)
         X_ControllerTool = X_ControllerBase @ X_BaseActual
