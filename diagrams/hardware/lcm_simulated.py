@@ -32,9 +32,7 @@ from guiderail.diagrams.stations.station import add_workcell_plant
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.models.common.parsing import follow_directives
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, MAX_SENDERS
-from guiderail.models.robots import DEFAULT_END_EFFECTOR
 from guiderail.models.robots.iiwa import IIWA14
-from guiderail.models.robots.robot import EndEffector
 
 ACKNOWLEDGED = "_TAKEN"  # suffix of the channel on which a `LockstepClock` acknowledges a status
 REPEAT_INTERVAL = 0.05  # wall clock time after which an unacknowledged status is sent again [s]
@@ -54,7 +52,6 @@ class SimulatedIiwa(Diagram):
         workcell: Workcell,
         lcm: DrakeLcmInterface,
         time_step: float = IiwaDriver.period,
-        end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
         directives: Sequence[ModelDirective] = (),
     ):
         """Construct the diagram.
@@ -63,7 +60,6 @@ class SimulatedIiwa(Diagram):
             workcell: Fixture in the world and held workpiece.
             lcm: The bus.
             time_step: Time step of the plant [s], a divisor of the status period.
-            end_effector: Tool on the flange, or its name; a gripper is modeled open and is not commanded.
             directives: Model directives of the surroundings.
 
         Raises:
@@ -74,12 +70,12 @@ class SimulatedIiwa(Diagram):
         builder.AddNamedSystem("lcm", LcmInterfaceSystem(lcm))
 
         def add(plant: MultibodyPlant) -> ArmModel:
-            arm = add_arm(plant, workcell, IIWA14, end_effector, as_rigid=True)
+            arm = add_arm(plant, workcell, IIWA14, as_rigid=True)
             follow_directives(plant, directives)
             return arm
 
         self.plant, self.scene_graph, self.arm = add_workcell_plant(builder, workcell, time_step, add)
-        self.controller_plant = ArmControllerPlant(workcell, IIWA14, end_effector)
+        self.controller_plant = ArmControllerPlant(workcell, IIWA14)
         BuildIiwaControl(
             builder,
             lcm,
