@@ -294,8 +294,12 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared, **config), builder)
 
 
-def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[MultibodyPlant, SceneGraph]:
-    """Add a plant with hydroelastic contact that falls back to point contact.
+def add_workcell_plant(
+    builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
+) -> tuple[MultibodyPlant, SceneGraph, Robot]:
+    """Add a finalized plant with the workcell's fixture, and the robot and workpiece that `add_robot` adds.
+
+    Contact is hydroelastic and falls back to point contact.
 
     Raises:
         InputError: If the time step is not positive.
@@ -303,14 +307,7 @@ def add_contact_plant(builder: DiagramBuilder, time_step: float) -> tuple[Multib
     if not time_step > 0.0:
         raise InputError(f"the plant's time step must be positive, not {time_step} s")
     contact = {"contact_model": "hydroelastic_with_fallback", "contact_surface_representation": "polygon"}
-    return add_plant(builder, time_step, **contact)
-
-
-def add_workcell_plant(
-    builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
-) -> tuple[MultibodyPlant, SceneGraph, Robot]:
-    """Add a finalized plant with the workcell's fixture, and the robot and workpiece that `add_robot` adds."""
-    plant, scene_graph = add_contact_plant(builder, time_step)
+    plant, scene_graph = add_plant(builder, time_step, **contact)
     workcell.add_fixture(plant)
     robot = add_robot(plant)
     plant.Finalize()
