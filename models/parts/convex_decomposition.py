@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from guiderail.models.common.errors import import_extra
-from guiderail.models.parts.solids import SCALE, SurfaceLocator, measure_distance, to_arrays
+from guiderail.models.parts.solids import SCALE, SurfaceLocator, hull_of, measure_distance, to_arrays
 
 MAX_PIECES = 300  # largest number of pieces; a base with two gears, between which a third is inserted, has 282
 MAX_FINE_PIECES = 800  # largest number of pieces of a fine decomposition; few of them are in contact at a time
@@ -96,7 +96,6 @@ def _with_large_faces(convex: Any) -> Any:
     """Remove vertices of a convex solid until no face is too small for Drake; return the new solid."""
     from pydrake.geometry import Convex  # imported here because it takes half a second
 
-    manifold3d = import_extra("manifold3d")
     points = to_arrays(convex)[0]
     while len(points) > 4:
         points = np.round(points, _DIGITS)
@@ -107,13 +106,13 @@ def _with_large_faces(convex: Any) -> Any:
             points = np.delete(points, corner, axis=0)
             continue
         # A face of Drake's hull may be several triangles in the file, one of them almost without area.
-        written = manifold3d.Manifold.hull_points(np.ascontiguousarray(points * SCALE))
+        written = hull_of(points)
         vertices, triangles = to_arrays(written)
         smallest, corner = _smallest_face(vertices, np.insert(triangles, 0, 3, axis=1).ravel().tolist())
         if smallest > _SMALLEST_FACE:
             return written
         points = np.delete(vertices, corner, axis=0)
-    return manifold3d.Manifold.hull_points(np.ascontiguousarray(points * SCALE))
+    return hull_of(points)
 
 
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.errors import import_extra
 from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.parts.mesh_file import obj_text
-from guiderail.models.parts.solids import to_arrays, vtk_text
+from guiderail.models.parts.solids import hull_of, to_arrays, vtk_text
 
 
 @dataclass(frozen=True)
@@ -63,16 +61,12 @@ def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
 
 
 def _hull_volume(piece: Piece) -> float:
-    return float(_hull(piece.points).volume()) if piece.suffix == ".obj" else 0.0
-
-
-def _hull(points: np.ndarray) -> Any:
-    return import_extra("manifold3d").Manifold.hull_points(np.ascontiguousarray(1e3 * points))
+    return float(hull_of(piece.points).volume()) if piece.suffix == ".obj" else 0.0
 
 
 def _rounded(piece: Piece) -> list[Piece]:
     """Return copies of a convex piece with vertices rounded to each of `_GRIDS`, if they span a volume."""
-    hulls = [_hull(np.unique(np.round(piece.points, digits), axis=0)) for digits in _GRIDS]
+    hulls = [hull_of(np.unique(np.round(piece.points, digits), axis=0)) for digits in _GRIDS]
     arrays = [to_arrays(hull) for hull in hulls if not hull.is_empty()]
     return [replace(piece, points=points, cells=cells) for points, cells in arrays]
 

@@ -27,6 +27,11 @@ def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
     return manifold3d.Manifold(mesh)
 
 
+def hull_of(points: np.ndarray) -> Any:
+    """Return the convex hull of points (P, 3) [m] as a solid; it is empty if they span no volume."""
+    return import_extra("manifold3d").Manifold.hull_points(np.ascontiguousarray(points * SCALE))
+
+
 def to_arrays(solid: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices (V, 3) [m] and triangles (T, 3) of a solid."""
     mesh = solid.to_mesh64()
