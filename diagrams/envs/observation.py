@@ -129,11 +129,6 @@ class Observation(Diagram):
         builder.BuildInto(self)
         self.space = gymnasium.spaces.Box(-clip, clip, (self.size,), np.float32)
 
-    @property
-    def signals(self) -> list[str]:
-        """Names of the input ports."""
-        return [self.get_input_port(index).get_name() for index in range(self.num_input_ports())]
-
     def get_observation_output_port(self) -> OutputPort:
         """Return the port of the observation, (n,)."""
         return self.GetOutputPort("observation")
