@@ -156,7 +156,7 @@ class ActiveConstraintProjector(LeafSystem):
         return self._violation(context, self._pose_port.Eval(context))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = declare.start_pose(self._pose_port, context)
+        measured = declare.start_pose(self._pose_port.Eval(context))
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
         # The state port cannot be used, because its source is initialized at this same instant.
         state = self._template.state_at(X_WE, frames)

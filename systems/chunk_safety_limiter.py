@@ -85,7 +85,7 @@ class ChunkSafetyLimiter(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the rest of the previous chunk is executed, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = declare.start_pose(self._pose_port, context)
+        measured = declare.start_pose(self._pose_port.Eval(context))
         try:
             first = self._guard.nearest_start(measured)
         except InputError:  # too far outside

@@ -75,7 +75,7 @@ class CommandDisturbance(LeafSystem):
         context.get_mutable_numeric_parameter(self._seed).SetFromVector(declare.seed_parameter(seed))
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        pose = declare.start_pose(self._pose_port, context)
+        pose = declare.start_pose(self._pose_port.Eval(context))
         discrete_state.set_value(self._count, [0.0])
         discrete_state.set_value(self._is_lost, [0.0])
         discrete_state.set_value(self._last_delivered, pose)

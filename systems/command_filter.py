@@ -60,7 +60,7 @@ class CommandFilter(LeafSystem):
     get_intervention_output_port = output_getter("intervention", "flag that the law intervened, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._last, self._law.start(declare.start_pose(self._pose_port, context)))
+        discrete_state.set_value(self._last, self._law.start(declare.start_pose(self._pose_port.Eval(context))))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last, self._command.Eval(context)[:-1])

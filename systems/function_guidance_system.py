@@ -75,7 +75,7 @@ class FunctionGuidanceSystem(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the function did not return O finite numbers, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        start = declare.start_pose(self._pose_port, context)
+        start = declare.start_pose(self._pose_port.Eval(context))
         returned = self._evaluate(context)
         if _numbers(returned, len(start)) is None:
             raise InputError(f"a guidance's function must return {len(start)} numbers, not {brief(returned)}")

@@ -104,7 +104,7 @@ class PoseMotionLimiter(LeafSystem):
         return np.concatenate([state[:3], angles[::-1]])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(_at_rest(declare.start_pose(self._pose_port, context)))
+        discrete_state.set_value(_at_rest(declare.start_pose(self._pose_port.Eval(context))))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._next_state.Eval(context))

@@ -76,7 +76,7 @@ class PoseRateLimiter(LeafSystem):
         return last + change
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(declare.start_pose(self._pose_port, context))
+        discrete_state.set_value(declare.start_pose(self._pose_port.Eval(context)))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._limited_pose(context))

@@ -177,16 +177,7 @@ def part_output(
     return output(system, name, size, value, [source])
 
 
-def start_pose(port: InputPort, context: Context) -> np.ndarray:
-    """Return the measured pose (O,) of a port, which is the first command of a motion.
-
-    Raises:
-        InputError: If the pose is not finite.
-    """
-    return check_start_pose(port.Eval(context))
-
-
-def check_start_pose(pose: np.ndarray) -> np.ndarray:
+def start_pose(pose: np.ndarray) -> np.ndarray:
     """Return the measured pose (O,), which is the first command of a motion.
 
     Raises:

@@ -117,7 +117,7 @@ class LastValidPose:
         return port is None or not port.HasValue(context) or port.Eval(context)[0] > 0.0
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        discrete_state.set_value(self._last_pose, declare.check_start_pose(self._measured_pose(context)))
+        discrete_state.set_value(self._last_pose, declare.start_pose(self._measured_pose(context)))
         discrete_state.set_value(self._check_time, [context.get_time()])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
