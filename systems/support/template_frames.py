@@ -29,6 +29,9 @@ class TemplateFrames:
         template: Template with the frames.
         frames: Default poses in the world, by name of the frame.
 
+    Attributes:
+        names: Names of the frames.
+
     Raises:
         InputError: If a frame of the template is missing or not finite.
     """
@@ -37,7 +40,7 @@ class TemplateFrames:
         missing = [name for name in template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")
-        self._names = template.frames
+        self.names = template.frames
         self._indices = [
             system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in template.frames
         ]
@@ -47,11 +50,6 @@ class TemplateFrames:
     def ticket(self) -> DependencyTicket:
         """Dependency ticket of values computed from the frames."""
         return self._cache.ticket()
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the frames."""
-        return self._names
 
     def eval(self, context: Context) -> dict[str, RigidTransform]:
         """Return the poses by name; `context` is the system's."""
@@ -64,17 +62,17 @@ class TemplateFrames:
             InputError: If the template has no such frame, or a pose is not finite.
         """
         for name in frames:
-            if name not in self._names:
-                raise InputError(f"the template has no frame {name}, only {', '.join(self._names)}")
+            if name not in self.names:
+                raise InputError(f"the template has no frame {name}, only {', '.join(self.names)}")
         poses = {name: _checked_pose(name, X_WF) for name, X_WF in frames.items()}
         for name, pose in poses.items():
-            index = self._indices[self._names.index(name)]
+            index = self._indices[self.names.index(name)]
             context.get_mutable_numeric_parameter(index).SetFromVector(pose)
 
     def _calc(self, context: Context) -> dict[str, RigidTransform]:
         return {
             name: pose_to_transform(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
-            for name, index in zip(self._names, self._indices, strict=True)
+            for name, index in zip(self.names, self._indices, strict=True)
         }
 
 
