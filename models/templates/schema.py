@@ -75,7 +75,7 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
     if str(source) not in files:
         raise InputError(f"There is no template {brief(str(source))}: {did_you_mean(str(source), files)}")
     path = files[str(source)]
-    return _read(_load_shipped(path), path.name, parameters)
+    return _read(_load_shipped(path, "template"), path.name, parameters)
 
 
 def parse_template(text: str, where: str = "template", **parameters: float) -> SharedControlTemplate:
@@ -102,10 +102,7 @@ def _shipped_files() -> dict[str, Path]:
     return {file.stem: file for file in Path(__file__).parents[1].joinpath("objects").glob("*/*.yaml")}
 
 
-@lru_cache
-def _load_shipped(path: Path) -> Any:
-    """Return the content of a shipped file, cached because a study makes many environments."""
-    return load_yaml(path, "template")
+_load_shipped = lru_cache(load_yaml)  # a study makes many environments
 
 
 def _calculate(node: ast.expr, parameters: Mapping[str, float] | None) -> float:
