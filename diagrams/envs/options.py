@@ -361,12 +361,9 @@ def _example(field: FieldInfo) -> str:
     annotations = repr(field.annotation)
     if "tuple" not in annotations or ("float" not in annotations and "int" not in annotations):
         return ""
-    lengths = {getattr(item, "min_length", None) for item in (*field.metadata, *_metadata_of(field.annotation))}
+    of_parts = (item for part in get_args(field.annotation) for item in getattr(part, "__metadata__", ()))
+    lengths = {getattr(item, "min_length", None) for item in (*field.metadata, *of_parts)}
     (number,) = (lengths - {None}) or {0}
     default = () if field.is_required() else field.default
     example = (field.examples or [default or tuple(0.001 * (index + 1) for index in range(number or 2))])[0]
     return f"{number or 'several'} numbers, such as {','.join(f'{entry:g}' for entry in example)}"
-
-
-def _metadata_of(annotation: Any) -> list[Any]:
-    return [item for part in get_args(annotation) for item in getattr(part, "__metadata__", ())]
