@@ -145,7 +145,4 @@ def _solve_relaxed(
     return solver(rows, lower - last, upper + last)
 
 
-@cache
-def _identity(size: int) -> np.ndarray:
-    """Return a shared identity matrix: building one for each QP costs as much as solving it."""
-    return np.eye(size)
+_identity = cache(np.eye)  # shared: building one for each QP costs as much as solving it
