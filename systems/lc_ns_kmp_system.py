@@ -63,6 +63,9 @@ class LcNsKmpSystem(LeafSystem):
         shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
             (O,).
 
+    Attributes:
+        primitive: Primitive with the longest history.
+
     Raises:
         InputError: If a gain has the wrong shape or is not finite, the period is not positive, or the primitives in
             `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`. At
@@ -88,7 +91,7 @@ class LcNsKmpSystem(LeafSystem):
             constraints, others = primitive.constraints, other.constraints
             if not (np.array_equal(constraints.G, others.G) and np.array_equal(constraints.c, others.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
-        self._primitive, self._period = primitive, period
+        self.primitive, self._period = primitive, period
         self._by_history_length = {
             one.history: (one, _checked_gain(one_gain, outputs)) for one, one_gain in [(primitive, gain), *shorter]
         }
@@ -120,14 +123,9 @@ class LcNsKmpSystem(LeafSystem):
         )
 
     @property
-    def primitive(self) -> LcNsKmp:
-        """Primitive with the longest history."""
-        return self._primitive
-
-    @property
     def gain(self) -> np.ndarray:
         """Raw null-space action per unit of the policy's action, (O,)."""
-        return self._by_history_length[self._primitive.history][1].copy()
+        return self._by_history_length[self.primitive.history][1].copy()
 
     get_null_space_action_input_port = input_getter("null_space_action", "policy's action in [−1, 1], (O,)")
 
@@ -181,7 +179,7 @@ class LcNsKmpSystem(LeafSystem):
             if not math.isfinite(time):
                 raise InputError(f"motion_time must be finite, not {time} s")
             step = round(time / self._period)
-        length = self._primitive.history
+        length = self.primitive.history
         if self._history_length_port is not None:
             length = self._history_length_port.Eval(context)[0]
             if length not in self._by_history_length:
@@ -206,11 +204,11 @@ class LcNsKmpSystem(LeafSystem):
         except UnsolvableError:
             # The constraints may differ from those of the previous step: the last command itself might violate them.
             last_command = context.get_discrete_state().value(self._last_command)
-            output, fallback = self._primitive.constraints.nearest(last_command, step), 1.0
+            output, fallback = self.primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)
 
     def _violation(self, prediction: _Prediction) -> float:
-        violation = self._primitive.constraints.violation(prediction.output, prediction.step)
+        violation = self.primitive.constraints.violation(prediction.output, prediction.step)
         return max(violation, ConstraintViolation.UNCONSTRAINED)
 
 
