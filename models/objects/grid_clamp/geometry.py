@@ -73,13 +73,9 @@ class GridClampDimensions:
         return np.concatenate([np.zeros((1, 2)), self.spacing * corners])
 
 
-def _around(radius: float) -> float:
-    """Return the radius of the corners of a polygon around a circle."""
-    return radius / np.cos(np.pi / NUM_SIDES)
-
-
 def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
-    return lathe([(_around(radius), height) for radius, height in profile], NUM_SIDES)
+    """Return the mesh of a profile of (radius, height) [m], with polygons around the circles."""
+    return lathe([(radius / np.cos(np.pi / NUM_SIDES), height) for radius, height in profile], NUM_SIDES)
 
 
 def hole_mesh(dimensions: GridClampDimensions) -> TriangleMesh:
