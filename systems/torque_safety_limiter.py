@@ -231,7 +231,9 @@ class TorqueSafetyLimiter(LeafSystem):
     def _find_fault(self, context: Context) -> Fault:
         """Return the first fault that is present now; checks have the form `not value <= limit`, so that NaN fails."""
         limits, n = self._limits, self._num_joints
-        status_fault = _fault_of(float(self._status_fault_port.Eval(context)[0]))
+        code = self._status_fault_port.Eval(context)[0]
+        # An unknown code, such as NaN, is a fault as well.
+        status_fault = next((fault for fault in Fault if fault == code), Fault.MALFORMED)
         if status_fault:
             return status_fault
         if np.isnan(self._status_age_port.Eval(context)[0]):
@@ -322,8 +324,3 @@ class TorqueSafetyLimiter(LeafSystem):
     def _not_following(self, context: Context) -> float:
         has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0
         return float(has_timed_out or self._state_of(context)[_ARM_STATE] != ArmState.RUNNING)
-
-
-def _fault_of(code: float) -> Fault:
-    """Return the fault of a code; an unknown code, such as NaN, is a fault as well."""
-    return next((fault for fault in Fault if fault == code), Fault.MALFORMED)
