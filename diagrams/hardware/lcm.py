@@ -41,12 +41,8 @@ def open_bus(url: str) -> DrakeLcm:
     Raises:
         InputError: If the URL is unusable.
     """
-    if url:
-        _check_url(url)
-    return DrakeLcm(url)
-
-
-def _check_url(url: str) -> None:
+    if not url:
+        return DrakeLcm()
     try:
         parts = urlsplit(url)
         host, port = parts.hostname, parts.port
@@ -61,6 +57,7 @@ def _check_url(url: str) -> None:
             is_group = False
         if not is_group or port == 0:
             raise InputError(f"{brief(url)}: LCM's messages go to a multicast address, 224.0.0.0 to 239.255.255.255")
+    return DrakeLcm(url)
 
 
 def handlers_are_safe() -> bool:
