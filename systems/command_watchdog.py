@@ -1,8 +1,9 @@
 """Watchdog that outputs the last valid command when commands stop."""
 
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import LeafSystem
 
 from guiderail.models.common.errors import InputError
+from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
@@ -48,7 +49,7 @@ class CommandWatchdog(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
-        self._followed_pose = LastValidPose(
+        followed_pose = LastValidPose(
             self,
             self._desired_pose_port,
             self._command_time_port,
@@ -57,10 +58,8 @@ class CommandWatchdog(LeafSystem):
             timeout=timeout,
             blend_factor=self._blend_factor_port,
         )
-        self._safe_pose_port = self.DeclareVectorOutputPort(
-            "safe_pose", pose_size, self._calc_safe_pose, prerequisites_of_calc=self._followed_pose.tickets
-        )
-        self._command_timed_out_port = self._followed_pose.declare_timed_out_output(self)
+        self._safe_pose_port = declare.output(self, "safe_pose", pose_size, followed_pose.eval, followed_pose.tickets)
+        self._command_timed_out_port = followed_pose.declare_timed_out_output(self)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
@@ -68,6 +67,3 @@ class CommandWatchdog(LeafSystem):
     get_blend_factor_input_port = input_getter("blend_factor", "blend factor, (1,); 0 while the arm is not controlled")
     get_safe_pose_output_port = output_getter("safe_pose", "last valid desired pose, (O,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
-
-    def _calc_safe_pose(self, context: Context, output: BasicVector) -> None:
-        output.SetFromVector(self._followed_pose.eval(context))
