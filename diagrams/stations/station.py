@@ -49,7 +49,7 @@ from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.wrench import WrenchBound
+from guiderail.models.control.wrench import POSE_ORDER, WrenchBound
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
@@ -317,7 +317,7 @@ def add_workcell_plant(
 
 def to_wrench_order(values: Sequence[float]) -> np.ndarray:
     """Reorder values from a pose's order, [x y z Rz Ry Rx], to a wrench's, [x y z Rx Ry Rz]."""
-    return np.array(values)[[0, 1, 2, 5, 4, 3]]
+    return np.array(values)[POSE_ORDER]
 
 
 def export_station_ports(
