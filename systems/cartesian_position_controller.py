@@ -16,7 +16,6 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import norm
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
-from guiderail.models.robots.inverse_kinematics import pose_error
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_pose
@@ -195,9 +194,11 @@ class CartesianPositionController(LeafSystem):
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
         """Return the tool velocity [rotational, translational] (6,) that reaches X_TPd in one period, within limits."""
-        V = pose_error(X_TPd, X_TP) / self._period
-        limits = self._speed_limits
-        return np.concatenate([_limited(V[:3], limits.rotational), _limited(V[3:], limits.translational)])
+        turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
+        V = np.empty(6)
+        V[:3] = _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational)
+        V[3:] = _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational)
+        return V
 
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
