@@ -184,8 +184,8 @@ def test_nothing_is_computed_between_control_steps(skill):
         guidance = build(kind, skill)
         calls = []
         system = guidance.GetSubsystemByName("kmp" if guidance.HasSubsystemNamed("kmp") else "lc_ns_kmp")
-        predict = system._primitive.predict
-        system._primitive.predict = lambda *a, calls=calls, predict=predict: calls.append(a) or predict(*a)
+        predict = system.primitive.predict
+        system.primitive.predict = lambda *a, calls=calls, predict=predict: calls.append(a) or predict(*a)
         simulator = Simulator(guidance)
         context = simulator.get_mutable_context()
         guidance.GetInputPort("action").FixValue(context, [0.5, 0.5])
