@@ -56,8 +56,8 @@ class ActiveConstraintProjector(LeafSystem):
             measured at that time [m], positive; infinite by default.
 
     Raises:
-        InputError: If an argument is out of range, or a frame is missing or not finite. At initialization, if the
-            measured pose or a frame is not finite.
+        InputError: If an argument is out of range, a frame is missing or not finite, or active constraints of a state
+            contradict each other. At initialization, if the measured pose or a frame is not finite.
 
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
@@ -75,6 +75,8 @@ class ActiveConstraintProjector(LeafSystem):
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
         self.frames = TemplateFrames(self, template, frames)
+        if template.contradiction is not None:
+            raise InputError(f"the template {template.name}, state {template.contradiction}")
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)

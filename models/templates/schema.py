@@ -55,8 +55,8 @@ _OPERATORS: dict[type, Callable[..., float]] = {
 def load_template(source: str | Path, **parameters: float) -> SharedControlTemplate:
     """Read a template.
 
-    The file is checked, but not whether the constraints and transitions can be satisfied: `guiderail template validate`
-    checks this at random poses.
+    The file is checked, but not whether the constraints and transitions can be satisfied: guidance refuses constraints
+    that are proven to contradict each other, and `guiderail template validate` checks transitions at random poses.
 
     Args:
         source: Path of a .yaml or .yml file, or the name of a shipped template: `pouring`, `pouring_aimed`,

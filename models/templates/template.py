@@ -10,6 +10,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
+from guiderail.models.templates.consistency import describe, find_contradiction
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
@@ -117,6 +118,15 @@ class SharedControlTemplate:
         if state not in names:
             raise InputError(f"{self.name} has no state {state!r}; {did_you_mean(state, names)}")
         return names.index(state)
+
+    @cached_property
+    def contradiction(self) -> str | None:
+        """Sentence about the first state whose active constraints contradict each other; None if none is proven to."""
+        for state in self.states:
+            found = find_contradiction(state.active_constraints)
+            if found:
+                return f"{state.name}: {describe(state.active_constraints, found)}"
+        return None
 
     def without_active_constraints(self) -> "SharedControlTemplate":
         """Return the template with the same states, input mappings and distances, but no active constraints."""

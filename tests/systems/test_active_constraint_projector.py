@@ -323,3 +323,20 @@ def test_projector_uses_a_frame_set_by_a_reset():
 def test_projector_refuses_invalid_arguments(period, max_tracking_error):
     with pytest.raises(InputError, match="positive"):
         ActiveConstraintProjector(TEMPLATE, FRAMES, period, max_tracking_error)
+
+
+def test_projector_refuses_constraints_that_contradict():
+    contradictory = parse_template(
+        "name: slab"
+        + ABOVE
+        + """    active_constraints:
+      - {kind: keep_above, frame: slab, height_m: 0.1}
+      - {kind: box, frame: slab, lower_m: [-1, -1, 0], upper_m: [1, 1, 0.05]}
+    transition_distance: {kind: height, frame: slab}
+    starts_at_m: 1.0
+    ends_at_m: 0.0
+"""
+    )
+    with pytest.raises(InputError, match=r"slab, state above: active constraint 1 \(KeepAbove\) contradicts 2 \(Box\)"):
+        ActiveConstraintProjector(contradictory, FRAMES, PERIOD)
+    ActiveConstraintProjector(contradictory.without_active_constraints(), FRAMES, PERIOD)
