@@ -57,7 +57,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     Raises:
         InputError: If an argument is out of range, a frame is missing or not finite, or active constraints of a state
-            contradict each other. At initialization, if the measured pose or a frame is not finite.
+            contradict each other. At initialization, if the measured pose or a frame is not finite, or the measured
+            pose is more than 0.2 m or 1 rad outside of the active constraints.
 
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
@@ -75,8 +76,7 @@ class ActiveConstraintProjector(LeafSystem):
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
         self.frames = TemplateFrames(self, template, frames)
-        if template.contradiction is not None:
-            raise InputError(f"the template {template.name}, state {template.contradiction}")
+        template.check_consistency()
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
@@ -165,6 +165,7 @@ class ActiveConstraintProjector(LeafSystem):
         command = transform_to_pose(self._template.command(state, X_WE, X_WE, frames, self._period).X_WE)
         if not np.isfinite(command).all():
             raise InputError(f"the frames of the template {self._template.name} must be finite at the start")
+        self._template.check_start(X_WE, frames)
         discrete_state.set_value(self._last, np.concatenate([command, measured]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

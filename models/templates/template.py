@@ -18,6 +18,8 @@ from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
+MAX_START_DISTANCE = 0.2  # largest distance of a start from the constraints [m]; a larger one is probably in mm
+MAX_START_ANGLE = 1.0  # largest angle between a start and the constraints [rad]; a larger one is probably in degrees
 BACKTRACKS = 8  # attempts to find an allowed displacement, each shorter than the one before
 
 
@@ -127,6 +129,27 @@ class SharedControlTemplate:
             if found:
                 return f"{state.name}: {describe(state.active_constraints, found)}"
         return None
+
+    def check_consistency(self) -> None:
+        """Raise an InputError if active constraints of a state are proven to contradict each other."""
+        if self.contradiction is not None:
+            raise InputError(f"the template {self.name}, state {self.contradiction}")
+
+    def check_start(self, X_WE: RigidTransform, frames: Frames) -> None:
+        """Raise an InputError if an episode begins too far outside of the active constraints to move inside.
+
+        The largest distance is `MAX_START_DISTANCE`, and the largest angle `MAX_START_ANGLE`.
+        """
+        state = self.state_at(X_WE, frames)
+        X_WP = self.project(state, X_WE, frames)
+        distance = math.dist(X_WE.translation(), X_WP.translation())
+        angle = angle_between(X_WE.rotation(), X_WP.rotation())
+        if distance > MAX_START_DISTANCE or angle > MAX_START_ANGLE:
+            raise InputError(
+                f"the start is {distance:.3g} m and {angle:.3g} rad outside of the active constraints of the template "
+                f"{self.name}, state {self.states[state].name}: start at most {MAX_START_DISTANCE} m and "
+                f"{MAX_START_ANGLE:g} rad outside, and give poses of objects in meters and radians"
+            )
 
     def without_active_constraints(self) -> "SharedControlTemplate":
         """Return the template with the same states, input mappings and distances, but no active constraints."""

@@ -340,3 +340,22 @@ def test_projector_refuses_constraints_that_contradict():
     with pytest.raises(InputError, match=r"slab, state above: active constraint 1 \(KeepAbove\) contradicts 2 \(Box\)"):
         ActiveConstraintProjector(contradictory, FRAMES, PERIOD)
     ActiveConstraintProjector(contradictory.without_active_constraints(), FRAMES, PERIOD)
+
+
+@pytest.mark.parametrize(
+    "start", [[0.0, 0.0, -0.15, 0.0, 0.0, 0.0], [0.0, 0.0, 0.3, 1.2, 0.0, 0.0], [0.0, 0.0, -300.0, 0.0, 0.0, 0.0]]
+)
+def test_projector_refuses_a_start_far_outside_its_constraints(start):
+    with pytest.raises(InputError, match=r"outside of the active constraints of the template slab, state above"):
+        Rig(np.array(start))
+
+
+def test_projector_returns_inside_after_a_start_slightly_outside():
+    rig = Rig(np.array([0.0, 0.0, 0.0, 0.9, 0.0, 0.0]))
+    violations = []
+    for _ in range(200):
+        rig.step(rig.desired())
+        violations.append(rig.value("commanded_violation"))
+    assert violations[0] > 0.5
+    assert (np.diff(violations) <= 1e-12).all()
+    assert violations[-1] <= 1e-9

@@ -387,7 +387,7 @@ class TemplateGuide(Guide):
         extra: Value for `to_action`, or (name of the state) → value.
 
     Raises:
-        InputError: If the period is missing or not positive.
+        InputError: If the period is missing or not positive, or active constraints of a state contradict each other.
     """
 
     num_outputs = POSE_SIZE
@@ -401,6 +401,7 @@ class TemplateGuide(Guide):
     ):
         if period is None or not 0.0 < period < np.inf:
             raise InputError("guidance by a template needs the period of the environment [s], positive")
+        template.check_consistency()
         self.template, self._frames_of, self._period, self._extra_of = template, frames, period, extra
         self.num_actions = template.inputs
 
@@ -408,7 +409,8 @@ class TemplateGuide(Guide):
         """Begin in the template's state at the measured pose.
 
         Raises:
-            InputError: If the pose of an object is missing or no transform, or a pose is not finite.
+            InputError: If the pose of an object is missing or no transform, a pose is not finite, or the measured pose
+                is more than 0.2 m or 1 rad outside of the active constraints.
         """
         frames = self._frames_of(env, observation)
         if not isinstance(frames, Mapping):
@@ -425,6 +427,7 @@ class TemplateGuide(Guide):
         self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE
         if not np.isfinite(transform_to_pose(self._X)).all():
             raise InputError(f"the pose and the frames of the template {self.template.name} must be finite at a reset")
+        self.template.check_start(X_WE, self._frames)
         self._has_begun = False
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:
