@@ -158,6 +158,13 @@ def _name(text: str) -> str:
     return text
 
 
+def _parameter_name(text: str) -> str:
+    """Return `text`; raise a ValueError if an expression could not refer to it."""
+    if not re.fullmatch("[A-Za-z_][A-Za-z0-9_]{0,99}", text):
+        raise ValueError(f"{brief(text)} can't name a parameter; use letters from a to z, digits and _, a letter first")
+    return text
+
+
 def _part(entry: Any, info: ValidationInfo, registry: dict[str, type]) -> Any:
     """Build a mapping, constraint or distance from an entry with its `kind` and the fields of that kind."""
     return _union(tuple(registry.items())).validate_python(entry, context=info.context)
@@ -166,7 +173,7 @@ def _part(entry: Any, info: ValidationInfo, registry: dict[str, type]) -> Any:
 Number = Annotated[float, BeforeValidator(_number)]
 Positive = Annotated[Number, Field(gt=0)]
 Name = Annotated[str, AfterValidator(_name)]
-ParameterName = Annotated[str, Field(pattern="^[A-Za-z_][A-Za-z0-9_]{0,99}$")]
+ParameterName = Annotated[str, AfterValidator(_parameter_name)]
 AnyMapping = Annotated[InputMapping, PlainValidator(partial(_part, registry=INPUT_MAPPINGS))]
 AnyConstraint = Annotated[ActiveConstraint, PlainValidator(partial(_part, registry=ACTIVE_CONSTRAINTS))]
 AnyDistance = Annotated[TransitionDistance, PlainValidator(partial(_part, registry=TRANSITION_DISTANCES))]
@@ -269,6 +276,9 @@ def _state(entry: Any, info: ValidationInfo) -> Any:
     state = _state_model(unit).model_validate(entry, context=info.context)
     if state.ends_at is None and not state.transitions:
         raise ValueError(f"ends_at_{unit} is missing; give it a value")
+    can_be_negative = state.transition_distance.can_be_negative
+    if any(transition.below <= 0.0 and not can_be_negative for transition in state.transitions):
+        raise ValueError(f"below_{unit} must be positive, because this transition distance is never negative")
     state.ends_at = state.transitions[0].below if state.ends_at is None else state.ends_at
     if not state.starts_at > state.ends_at:
         raise ValueError(f"starts_at_{unit} must exceed the distance at the phase's end, because distances decrease")
@@ -333,6 +343,10 @@ def _check_references(template: SharedControlTemplate, state: TemplateState) -> 
     for transition in state.transitions:
         names = [other.name for other in template.states]
         _check_known(f"states.{state.name}: there is no state", transition.to, names)
+        if transition.to == state.name:
+            raise InputError(
+                f"states.{state.name}: a transition must lead to another state, not to {state.name} itself"
+            )
     for frame in sorted(state.frame_names):
         _check_known(f"states.{state.name}: there is no frame", frame, [*template.frames, WORLD])
     for used in (used for mapping in state.input_mapping for used in mapping.used_inputs):
@@ -345,18 +359,19 @@ def _check_references(template: SharedControlTemplate, state: TemplateState) -> 
 def _sentence(error: ValidationError) -> str:
     """Return the first error and its place in the file as a sentence."""
     first: Any = error.errors()[0]
-    names = (key if isinstance(key, int) or key.isidentifier() else brief(key) for key in first["loc"])
+    location = first["loc"][:-2] if first["loc"][-1:] == ("[key]",) else first["loc"]  # the message has the key itself
+    names = (key if isinstance(key, int) or key.isidentifier() else brief(key) for key in location)
     place = "".join(f"[{name}]" if isinstance(name, int) else f".{name:.60}" for name in names)
     place = place.lstrip(".") or "the file"
     if first["type"] == "value_error":
         return f"{place}: {first['ctx']['error']}"
     if first["type"] == "missing":
         return f"{place} is missing; give it a value"
-    if first["type"] == "union_tag_not_found":
+    if first["type"] == "union_tag_not_found" or (tag := first.get("ctx", {}).get("tag")) == "None":
         return f"{place} has no kind; give it one"
     if first["type"] == "union_tag_invalid":
         known = [tag.strip(" '") for tag in first["ctx"]["expected_tags"].split(",")]
-        return f"{place}: unknown kind {brief(first['ctx']['tag'])}: {did_you_mean(first['ctx']['tag'], known)}"
+        return f"{place}: unknown kind {brief(tag)}: {did_you_mean(tag, known)}"
     message = re.sub(r"valid dictionary.*", "mapping", first["msg"]).replace("tuple", "list").replace("Tuple", "List")
     if message.startswith("Input "):
         return f"{place} {message.removeprefix('Input ')}, not {brief(first['input'])}"

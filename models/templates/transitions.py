@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -18,6 +19,7 @@ class TransitionDistance(StatePart, ABC):
     """Transition distance d_t, which decreases as the task progresses."""
 
     unit: str = "m"  # unit of thresholds in a file, "m" or "deg"; values are in meters or radians
+    can_be_negative: ClassVar[bool] = True  # False if the value is at least 0 everywhere
 
     @abstractmethod
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
@@ -31,6 +33,7 @@ class Distance(TransitionDistance):
 
     frame: str  # F: frame of an object, or `world`
     point_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # point in F
+    can_be_negative = False
 
     def __post_init__(self) -> None:
         require_three(self.point_m, "point_m")
@@ -59,6 +62,7 @@ class AxisDistance(TransitionDistance):
     """Distance of the end effector's origin from F's z axis."""
 
     frame: str  # F: frame of an object, or `world`
+    can_be_negative = False
 
     @override
     def value(self, X_WE: RigidTransform, frames: Frames) -> float:
@@ -100,6 +104,7 @@ class RotationToGo(TransitionDistance):
     rpy_deg: tuple[float, ...]  # given orientation R_FE
     frame: str = WORLD  # F: frame of an object, or `world`
     unit = "deg"
+    can_be_negative = False
 
     def __post_init__(self) -> None:
         require_three(self.rpy_deg, "rpy_deg")

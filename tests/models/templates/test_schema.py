@@ -188,8 +188,13 @@ TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
         (set_in(*FAR, "transitions", 0, "to", value=["near"]), "to should be a valid string"),
         (set_in(*FAR, "transitions", value=[]), "ends_at_m is missing"),
         (set_in(*FAR, "transitions", value=None), "transitions should be a valid list"),
-        (set_in("parameters", "rim m", value=1), "should match pattern"),
-        (set_in("parameters", "ﬁ", value=1), "should match pattern"),
+        (set_in("parameters", "rim m", value=1), "parameters: 'rim m' can't name a parameter; use letters"),
+        (set_in("parameters", "ﬁ", value=1), "parameters: 'ﬁ' can't name a parameter"),
+        (set_in("states", "", value={}), "states: '' can't name anything"),
+        (set_in(*FAR, "active_constraints", 0, "kind", value=None), "active_constraints[0] has no kind; give it one"),
+        (set_in(*FAR, "transitions", 0, "below_m", value=-0.012), "below_m must be positive"),
+        (set_in(*FAR, "transitions", 0, "below_m", value=0), "below_m must be positive"),
+        (set_in(*FAR, "transitions", 0, "to", value="far"), "must lead to another state, not to far itself"),
     ],
 )
 def test_parse_names_fault_and_place_in_one_sentence(change, message):
