@@ -2,7 +2,7 @@
 
 The checks place the template's objects and the end effector at random near each other, and evaluate the template's
 input mappings, active constraints and transitions there. A fault that occurs in less than one of a few hundred poses
-may not be found.
+may not be found. An error is proven, by a pose or by a contradiction; whatever a search did not find is a remark.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,8 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
+from guiderail.models.templates.consistency import describe, find_contradiction
+from guiderail.models.templates.constraints import ActiveConstraint, Cylinder, HalfSpace, TiltLimits
 from guiderail.models.templates.geometry import Frames, pose_distance
-from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.models.templates.shape_constraints import InsideSphere
+from guiderail.models.templates.template import SharedControlTemplate, TemplateState
+from guiderail.models.templates.transitions import AxisDistance, Distance, Height, TiltToGo
 
 SAMPLES = 200  # number of sampled poses of the end effector
 REACH = 0.6  # largest distance of a sampled pose from an object [m]
@@ -43,7 +47,6 @@ def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:
         *_find_unreachable(template),
         *_check_constraints(template, scenes),
         *_check_transitions(template, scenes),
-        *_check_arrivals(template, scenes),
     ]
     return sorted(findings, key=lambda finding: not finding.is_error)
 
@@ -88,6 +91,10 @@ def _find_unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
 def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
     """Check that each constraint and the whole sequence are idempotent, and that no constraint undoes another."""
     for number, state in enumerate(template.states):
+        contradiction = find_contradiction(state.active_constraints)
+        if contradiction:
+            yield Finding(True, f"{state.name}: {describe(state.active_constraints, contradiction)}")
+            continue
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
             worst = max(constraint.violation(constraint.project(X, frames), frames) for X, frames in scenes)
@@ -101,43 +108,119 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
             repeated = max(repeated, pose_distance(template.project(number, X_WP, frames), X_WP))
         for i in np.flatnonzero(outside).tolist():
             kind = type(state.active_constraints[i]).__name__
-            if outside[i] == len(scenes):
-                why = "contradicts the constraints after it; no pose satisfies them all"
-            else:
-                why = (
-                    f"is undone by a constraint after it in {outside[i] / len(scenes):.0%} of the poses; "
-                    "put it last, or make room for both"
-                )
-            yield Finding(True, f"{state.name}: active constraint {i + 1} ({kind}) {why}")
+            is_always = outside[i] == len(scenes)  # few poses, or none, satisfy all constraints
+            share = "all" if is_always else f"{outside[i] / len(scenes):.0%} of the"
+            yield Finding(
+                not is_always,
+                f"{state.name}: active constraint {i + 1} ({kind}) is undone by a constraint after it in {share} "
+                "sampled poses; put it last, or make room for both",
+            )
         if repeated > TOLERANCE and not outside.any():
             yield Finding(True, f"{state.name}: the constraints in their order are not idempotent ({repeated:.2g})")
 
 
 def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
-    """Check that inputs can lead from a pose inside a state's constraints to each of its transitions."""
-    for number, state in enumerate(template.states):
+    """Check that inputs lead to each transition and to the end, and that one control step leads into the next state.
+
+    A search begins in a sampled pose inside the constraints or, except in the initial state, in a pose in which the
+    state before hands over. The search ends at the threshold.
+    """
+    handovers: dict[int, list[tuple[RigidTransform, Frames]]] = {}
+    for number in _in_order(template):
+        state = template.states[number]
+        if find_contradiction(state.active_constraints):
+            continue
+        inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
         goals = goals or [("the end", state.ends_at + TOLERANCE)]
-        lowest = min(threshold for _, threshold in goals)
-        starts = sorted(
-            ((template.project(number, X, frames), frames) for X, frames in scenes),
-            key=lambda start: template.distance(number, *start),
-        )
-        # Search from the nearest pose and from several others: one success proves that the threshold can be reached.
-        best = np.inf
-        for X, frames in [starts[0], *starts[len(starts) // 2 :: len(starts) // 8]]:
-            best = min(best, _greedy(template, number, X, frames, lowest)[0])
-            if best < lowest:
-                break
-        for goal, threshold in goals:
-            if best > threshold:
+        for i, (goal, threshold) in enumerate(goals):
+            if _is_excluded(state, threshold):
                 yield Finding(
                     True,
-                    f"{state.name}: {goal} never fires: no sampled pose within the active constraints is there, and no "
-                    f"input leads there (nearest {best:.3g}, threshold {threshold:.3g})",
+                    f"{state.name}: {goal} never fires: no pose within the active constraints is below the threshold "
+                    f"{threshold:.3g}; change the threshold or the constraints",
                 )
-        if all(template.distance(number, X, frames) < lowest for X, frames in starts):
+                continue
+            starts = _choose_starts(template, number, threshold, handovers.get(number, []), inside)
+            arrivals, nearest = _search(template, number, threshold, starts)
+            # Sampled poses show nothing about a state to which no search has led.
+            if starts and not arrivals and (number == template.initial_state or number in handovers):
+                yield Finding(
+                    False,
+                    f"{state.name}: {goal} was not reached from any of {len(starts)} poses by one input at a time "
+                    f"(nearest {nearest:.3g}, threshold {threshold:.3g}); check that the inputs lead there",
+                )
+            if state.transitions:
+                target = template.index(state.transitions[i].to)
+                if arrivals:
+                    handovers.setdefault(target, []).extend(arrivals)
+                yield from _check_arrivals(template, number, target, arrivals)
+        lowest = min(threshold for _, threshold in goals)
+        if all(template.distance(number, X, frames) < lowest for X, frames in inside):
             yield Finding(False, f"{state.name}: every sampled pose is below the threshold; the state is left at once")
+
+
+def _in_order(template: SharedControlTemplate) -> list[int]:
+    """Return the numbers of all states, those that transitions lead to from the initial state first and in order."""
+    order = [template.initial_state]
+    for number in order:
+        targets = (template.index(transition.to) for transition in template.states[number].transitions)
+        order += [target for target in dict.fromkeys(targets) if target not in order]
+    return order + [number for number in range(len(template.states)) if number not in order]
+
+
+def _is_excluded(state: TemplateState, threshold: float) -> bool:
+    """Return True if the active constraints are proven to keep the distance of a state above a threshold."""
+    goal: ActiveConstraint
+    if threshold <= 0.0 and not state.transition_distance.can_be_negative:
+        return True
+    match state.transition_distance:
+        case Distance(frame, point):
+            goal = InsideSphere(threshold, point, frame)
+        case AxisDistance(frame):
+            goal = Cylinder(frame, 0.0, threshold)
+        case Height(frame):
+            goal = HalfSpace((0.0, 0.0, -1.0), -threshold, frame)
+        case TiltToGo(frame, until_deg, rpy_deg, turns_along) if until_deg - np.rad2deg(threshold) <= 180.0:
+            least = max(-180.0, until_deg - float(np.rad2deg(threshold)))
+            goal = TiltLimits(frame, least, 180.0, rpy_deg, turns_along)
+        case _:
+            return False
+    return len(state.active_constraints) in find_contradiction((*state.active_constraints, goal))
+
+
+def _choose_starts(
+    template: SharedControlTemplate,
+    number: int,
+    threshold: float,
+    handovers: list[tuple[RigidTransform, Frames]],
+    inside: list[tuple[RigidTransform, Frames]],
+) -> list[tuple[RigidTransform, Frames]]:
+    """Return poses above a threshold: those of a handover, or else sampled ones, the nearest among them."""
+    given, sampled = (
+        [start for start in starts if template.distance(number, *start) >= threshold] for starts in (handovers, inside)
+    )
+    if given:
+        return given[:ARRIVALS]
+    sampled.sort(key=lambda start: template.distance(number, *start))
+    step = max(1, len(sampled) // (2 * ARRIVALS))
+    return [*sampled[len(sampled) // 2 :: step][:ARRIVALS], *sampled[:1]]
+
+
+def _search(
+    template: SharedControlTemplate, number: int, threshold: float, starts: list[tuple[RigidTransform, Frames]]
+) -> tuple[list[tuple[RigidTransform, Frames]], float]:
+    """Return the poses below a threshold that searches from `starts` arrive at, and the least distance."""
+    reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
+    arrivals, nearest = [], np.inf
+    for X, frames in starts:
+        # The last part uses the control period, because a longer step would overshoot the threshold.
+        _, X_WE = _greedy(template, number, X, frames, threshold + reach)
+        distance, X_WE = _greedy(template, number, X_WE, frames, threshold, CONTROL_PERIOD)
+        nearest = min(nearest, distance)
+        if distance < threshold:
+            arrivals.append((X_WE, frames))
+    return arrivals, nearest
 
 
 def _greedy(
@@ -166,26 +249,16 @@ def _greedy(
     return best, X_WE
 
 
-def _check_arrivals(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+def _check_arrivals(
+    template: SharedControlTemplate, number: int, target: int, arrivals: list[tuple[RigidTransform, Frames]]
+) -> Iterator[Finding]:
     """Check that a transition fires at its threshold: one control step must lead into the next state's constraints."""
-    reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
-    for number, state in enumerate(template.states):
-        inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
-        for transition in state.transitions:
-            target, arrived, waiting, worst = template.index(transition.to), 0, 0, 0.0
-            before = [start for start in inside if template.distance(number, *start) >= transition.below]
-            for X, frames in before[:ARRIVALS]:
-                # The last part uses the control period, because a longer step would overshoot the threshold.
-                _, X_WE = _greedy(template, number, X, frames, transition.below + reach)
-                distance, X_WE = _greedy(template, number, X_WE, frames, transition.below, CONTROL_PERIOD)
-                if distance < transition.below:
-                    arrived += 1
-                    waiting += not template.can_enter(target, X_WE, frames, CONTROL_PERIOD)
-                    worst = max(worst, template.violation(target, X_WE, frames))
-            if waiting:
-                yield Finding(
-                    False,
-                    f"{state.name}: the transition to {transition.to} waits in {waiting} of {arrived} arrivals, as the "
-                    f"command is up to {worst:.2g} m or rad outside of the next state's constraints; change the "
-                    "constraints of either state so that they agree at the threshold",
-                )
+    waiting = sum(not template.can_enter(target, X, frames, CONTROL_PERIOD) for X, frames in arrivals)
+    if waiting:
+        worst = max(template.violation(target, X, frames) for X, frames in arrivals)
+        yield Finding(
+            False,
+            f"{template.states[number].name}: the transition to {template.states[target].name} waits in {waiting} of "
+            f"{len(arrivals)} arrivals, as the command is up to {worst:.2g} m or rad outside of the next state's "
+            "constraints; change the constraints of either state so that they agree at the threshold",
+        )

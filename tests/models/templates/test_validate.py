@@ -139,3 +139,77 @@ def test_validate_warns_of_a_transition_that_waits():
         )
 
     assert any("waits in" in finding.message and not finding.is_error for finding in findings(change))
+
+
+SLIDE_AND_LIFT = """
+name: slide_lift
+inputs: 3
+frames: [edge]
+max_speed_m_per_s: 0.2
+max_speed_rad_per_s: 1.0
+states:
+  slide:
+    input_mapping:
+      - {kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.08, frame: edge}
+    active_constraints:
+      - {kind: box, frame: edge, lower_m: [-0.11, -0.004, 0], upper_m: [0.02, 0.004, 0.01]}
+      - {kind: fixed_orientation, frame: edge}
+    transition_distance: {kind: distance, frame: edge}
+    starts_at_m: 0.1
+    transitions:
+      - {to: lift, below_m: 0.012}
+  lift:
+    input_mapping:
+      - {kind: translation, inputs: [2], axes: [[0, 0, 1]], speed_m_per_s: 0.05, frame: edge}
+    active_constraints:
+      - {kind: cylinder, frame: edge, max_radius_m: 0.025}
+      - {kind: half_space, frame: edge, normal: [0, 0, -1], offset_m: -0.09}
+      - {kind: keep_above, frame: edge, height_m: 0}
+      - {kind: fixed_orientation, frame: edge}
+    transition_distance: {kind: distance, frame: edge, point_m: [0, 0, 0.08]}
+    starts_at_m: 0.08
+    ends_at_m: 0.014
+"""
+
+
+def slide_and_lift(change=None):
+    data = yaml.safe_load(SLIDE_AND_LIFT)
+    if change:
+        change(data["states"]["slide"])
+    return validate(parse_template(yaml.safe_dump(data, sort_keys=False)))
+
+
+def test_validate_searches_from_the_poses_of_a_handover():
+    # From poses farther from the axis than those in which slide ends, no input leads to the end of lift.
+    assert slide_and_lift() == []
+
+
+@pytest.mark.parametrize("factor", [[0.0, 1.0], [0.0, 0.0]])
+def test_validate_warns_of_inputs_that_lead_nowhere(factor):
+    def change(slide):
+        (mapping,) = slide["input_mapping"]
+        slide["input_mapping"] = [
+            {"kind": "scaled", "frame": "edge", "distance_m": [0.02, 0.03], "factor": factor, "of": mapping}
+        ]
+
+    (finding,) = slide_and_lift(change)
+    assert "slide: the transition to lift was not reached" in finding.message
+    assert not finding.is_error
+
+
+def test_validate_warns_of_a_state_without_a_mapping():
+    findings = slide_and_lift(lambda slide: slide.update(input_mapping=[]))
+    assert any("slide: the transition to lift was not reached" in finding.message for finding in findings)
+    assert not any(finding.is_error for finding in findings)
+
+
+def test_validate_warns_of_constraints_with_a_single_pose():
+    def change(slide):
+        slide["active_constraints"] = [
+            {"kind": "box", "frame": "edge", "lower_m": [0.005, -0.05, 0], "upper_m": [0.02, 0.05, 0.01]},
+            {"kind": "cylinder", "frame": "edge", "max_radius_m": 0.005},
+        ]
+
+    findings = slide_and_lift(change)
+    assert any("Box" in finding.message and "in all sampled poses" in finding.message for finding in findings)
+    assert not any(finding.is_error for finding in findings)
