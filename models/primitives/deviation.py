@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.kernels import Kernel
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
@@ -12,6 +13,10 @@ MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
 """RMS distance, relative to an output's range, up to which any deviation is accepted: spreads may be tiny."""
+MAX_OUTSIDE = 1.0
+"""Distance of a reference outside of a constraint up to which any deviation is accepted [unit of the output]."""
+MAX_RANGES = 30.0
+"""As `MAX_OUTSIDE`, relative to the largest range of an output: a wrong unit changes it by factors of 1000."""
 _EVALUATED = 16  # number of steps at which the deviation is measured
 
 
@@ -93,3 +98,31 @@ def check_deviation(
             raise InputError(advice)
         warnings.warn(advice, UserWarning, stacklevel=3)
     return deviation
+
+
+def check_constraints(
+    reference: ReferenceTrajectory, constraints: LinearConstraints, max_deviation: float = MAX_DEVIATION
+) -> None:
+    """Check that constraints are not far from a reference, as they are if one of the two has a wrong unit.
+
+    A reference at rest has no scale to compare with and is accepted.
+
+    Raises:
+        InputError: If the mean of the reference is outside of a constraint by more than `MAX_OUTSIDE`, by more than
+            `max_deviation` (at least `MAX_DEVIATION`) standard deviations, and by more than `MAX_RANGES` times the
+            largest range of an output.
+    """
+    G, c = constraints.window(np.arange(reference.num_steps))
+    outside = c - np.einsum("nfo,no->nf", G, reference.means)
+    largest_range = float(np.ptp(reference.means, axis=0).max())
+    if outside.max(initial=0.0) <= MAX_OUTSIDE or largest_range == 0.0:
+        return
+    deviations = np.sqrt(np.einsum("nfo,nop,nfp->nf", G, reference.covariances, G))
+    least = max(MAX_OUTSIDE, MAX_RANGES * largest_range)
+    is_far = outside > np.maximum(least, max(MAX_DEVIATION, max_deviation) * deviations)
+    if is_far.any():
+        step, row = np.unravel_index(int(np.argmax(np.where(is_far, outside, -np.inf))), outside.shape)
+        raise InputError(
+            f"the reference is {outside[step, row]:.3g} outside of constraint {row} at step {step}, and its means "
+            f"extend over only {largest_range:.3g}: give both in one unit (defaults are for meters)"
+        )

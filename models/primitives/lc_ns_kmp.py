@@ -21,7 +21,7 @@ from guiderail.models.common.arrays import as_doubles, as_number, as_numbers, as
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
-from guiderail.models.primitives.deviation import MAX_DEVIATION, check_deviation
+from guiderail.models.primitives.deviation import MAX_DEVIATION, check_constraints, check_deviation
 from guiderail.models.primitives.features import WindowFeatures, window_features, window_interpolation
 from guiderail.models.primitives.kernels import Kernel, SquaredExponential
 from guiderail.models.primitives.qp import UnsolvableError, find_solver
@@ -54,7 +54,8 @@ class LcNsKmp:
 
     Raises:
         InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
-            length, or the motion misses the demonstrations (`check_deviation`).
+            length, the motion misses the demonstrations (`check_deviation`), or the constraints are far from them
+            (`check_constraints`).
 
     Warns:
         UserWarning: If `deviation` exceeds one.
@@ -98,6 +99,7 @@ class LcNsKmp:
         if not isinstance(constraints, LinearConstraints):
             raise InputError(f"constraints of a primitive are LinearConstraints, not {brief(constraints)}")
         constraints.check_sizes(reference.num_outputs, reference.num_steps)
+        check_constraints(reference, constraints, max_deviation)
         self.reference = reference
         self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
         self.lambda_, self.beta = float(lambda_), float(beta)
