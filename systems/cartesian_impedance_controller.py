@@ -7,12 +7,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import (
+    check_plant,
     effort_limits,
     orientation_error,
     pose_to_transform,
@@ -30,7 +32,8 @@ class ImpedanceGains:
 
     Args:
         stiffness: Stiffness matrix (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
-        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive.
+        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive and
+            finite.
         damping_ratio: Damping ratio of every mode, positive and finite.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
@@ -51,14 +54,15 @@ class ImpedanceGains:
     bound: WrenchBound | None = None
 
     def __post_init__(self) -> None:
-        K = np.asarray(self.stiffness, dtype=float)
+        K = as_numbers(self.stiffness, "a Cartesian stiffness")
         is_symmetric = K.shape == (6, 6) and np.allclose(K, K.T)
         if not is_symmetric or not (np.abs(K) <= MAX_STIFFNESS).all() or not (np.linalg.eigvalsh(K) > 0.0).all():
             raise InputError(
                 f"a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix, at most {MAX_STIFFNESS:g}"
             )
-        if np.shape(self.wrench_limits) != (6,) or not (np.asarray(self.wrench_limits) > 0.0).all():
-            raise InputError(f"an impedance needs six positive wrench limits, not {self.wrench_limits}")
+        limits = as_numbers(self.wrench_limits, "the wrench limits of an impedance")
+        if limits.shape != (6,) or not ((limits > 0.0) & (limits < np.inf)).all():
+            raise InputError(f"an impedance needs six positive, finite wrench limits, not {self.wrench_limits}")
         posture_gains = (self.posture_stiffness, self.posture_damping)
         if not 0.0 < self.damping_ratio < np.inf or not all(0.0 <= gain < np.inf for gain in posture_gains):
             raise InputError(
@@ -120,8 +124,9 @@ class CartesianImpedanceController(LeafSystem):
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range, the posture does not have n joints, or a joint has no actuator or
-            several. At an evaluation, if the estimated state is not finite.
+        InputError: If an argument is out of range, the plant is not finalized, a frame is not of the plant, T is not
+            fixed in the world, the posture does not have n joints, or a joint has no actuator or several. At an
+            evaluation, if the estimated state is not finite.
     """
 
     def __init__(
@@ -137,6 +142,9 @@ class CartesianImpedanceController(LeafSystem):
         timeout: float = 0.1,
     ):
         super().__init__()
+        check_plant(plant, target, target=target, tool_center=tool_center, stiffness_frame=stiffness_frame or target)
+        if not isinstance(gains, ImpedanceGains):
+            raise InputError(f"the gains of an impedance are ImpedanceGains, not {brief(gains)}")
         num_joints = plant.num_positions()
         if np.shape(gains.posture) != (num_joints,):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")

@@ -18,7 +18,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
-from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_pose
+from guiderail.systems.support.drake_multibody import check_plant, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import CommandValidity
 
 
@@ -105,6 +105,7 @@ class CartesianPositionController(LeafSystem):
     ):
         super().__init__()
         check_period(period)
+        check_plant(plant, target, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         if num_joints < 6:
             raise InputError(f"a position controller needs an arm of at least six joints, not {num_joints}")

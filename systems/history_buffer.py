@@ -8,6 +8,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
+MAX_NUMBERS = 1_000_000  # largest number of stored numbers (8 MB)
+
 
 class HistoryBuffer(LeafSystem):
     """Buffer of the last P outputs, the via-points of sKGRL's movement primitive.
@@ -33,7 +35,7 @@ class HistoryBuffer(LeafSystem):
 
     Args:
         num_outputs: Number O of outputs, at least 1.
-        length: Number P of stored outputs, at least 1.
+        length: Number P of stored outputs, at least 1; P·O is at most a million.
         period: Control period [s], positive.
 
     Raises:
@@ -46,6 +48,8 @@ class HistoryBuffer(LeafSystem):
         num_outputs, length = as_whole(num_outputs, "num_outputs of a history"), as_whole(length, "length of a history")
         if num_outputs < 1 or length < 1:
             raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
+        if length * num_outputs > MAX_NUMBERS:
+            raise InputError(f"a history has at most {MAX_NUMBERS} numbers, not {length} times {num_outputs}")
         self._shape = (length, num_outputs)
 
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)

@@ -9,6 +9,7 @@ from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_multibody import check_plant
 
 MAX_TORQUE = 1e4  # torque to which samples are clipped [Nm]; no arm of this size has such a torque
 
@@ -64,6 +65,7 @@ class JointTorqueWrench(LeafSystem):
         super().__init__()
         if not 0.0 <= time_constant < np.inf or not 0.0 <= damping < np.inf:
             raise InputError("a wrench estimate's time constant and damping must be finite and not negative")
+        check_plant(plant, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center = plant, target, tool_center
         self._damping = damping * np.eye(6)

@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,11 +68,11 @@ class LcNsKmpSystem(LeafSystem):
         primitive: Primitive with the longest history.
 
     Raises:
-        InputError: If a gain has the wrong shape or is not finite, the period is not positive, or the primitives in
-            `shorter` do not have different histories of 1 to P − 1 outputs and the constraints of `primitive`. At
-            initialization, if ``reference_window`` is connected and the primitives have different horizons. At an
-            evaluation, if the action, the history or the time is not finite, or no primitive has the selected history
-            length.
+        InputError: If an argument has the wrong type, a gain has the wrong shape or is not finite, the period is not
+            positive or differs from that of the reference by more than 1 %, or the primitives in `shorter` do not have
+            different histories of 1 to P − 1 outputs and the constraints of `primitive`. At initialization, if
+            ``reference_window`` is connected and the primitives have different horizons. At an evaluation, if the
+            action, the history or the time is not finite, or no primitive has the selected history length.
     """
 
     def __init__(
@@ -82,6 +83,12 @@ class LcNsKmpSystem(LeafSystem):
         shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
     ):
         super().__init__()
+        check_period(period)
+        shorter = _checked_pairs(shorter)
+        for one in (primitive, *(other for other, _ in shorter)):
+            if not isinstance(one, LcNsKmp):
+                raise InputError(f"a primitive of this system is an LcNsKmp, not {brief(one)}")
+            _check_reference_period(one, period)
         outputs = primitive.num_outputs
         if any(other.history not in range(1, primitive.history) for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
@@ -212,8 +219,25 @@ class LcNsKmpSystem(LeafSystem):
         return max(violation, ConstraintViolation.UNCONSTRAINED)
 
 
+def _checked_pairs(shorter: object) -> tuple[tuple[LcNsKmp, np.ndarray], ...]:
+    if isinstance(shorter, Sequence) and all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in shorter):
+        return tuple((primitive, gain) for primitive, gain in shorter)
+    raise InputError(f"shorter is a list of primitives with their gains, not {brief(shorter)}")
+
+
+def _check_reference_period(primitive: LcNsKmp, period: float) -> None:
+    """Raise an InputError unless the period is that of the reference trajectory, up to a percent."""
+    times = primitive.reference.times
+    step = float(times[-1] - times[0]) / (len(times) - 1)
+    if not abs(period - step) <= 0.01 * step:
+        raise InputError(
+            f"the reference has a step every {step:.6g} s, and the system's period is {period:g} s: resample the "
+            "reference (ReferenceTrajectory.resampled), or choose its period"
+        )
+
+
 def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:
-    checked = np.ones(outputs) if gain is None else np.array(gain, dtype=float)
+    checked = np.ones(outputs) if gain is None else as_numbers(gain, "the gain")
     if checked.shape != (outputs,) or not np.isfinite(checked).all():
         raise InputError(f"the gain must be {outputs} finite numbers, not {gain}")
     return checked

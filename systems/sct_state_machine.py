@@ -45,7 +45,8 @@ class SctStateMachine(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If the period is not positive, or a frame is missing or not finite.
+        InputError: If the period is not positive, or a frame is missing or not finite. At initialization, if
+            ``initial_pose`` is not finite.
 
     Attributes:
         frames: Parameters with the poses of the template's object frames, which a reset can set.
@@ -79,7 +80,7 @@ class SctStateMachine(LeafSystem):
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        X_WE = pose_to_transform(self._initial_pose_port.Eval(context))
+        X_WE = pose_to_transform(declare.start_pose(self._initial_pose_port, context))
         discrete_state.set_value(self._state, [float(self._template.state_at(X_WE, self.frames.eval(context)))])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

@@ -7,7 +7,7 @@ from functools import cached_property, reduce
 
 import numpy as np
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.consistency import describe, find_contradiction
@@ -161,8 +161,15 @@ class SharedControlTemplate:
         """Return the displacement ΔH of one period [s] for inputs (n,): map_q (equation 2.19).
 
         Inputs are clipped to [−1, 1].
+
+        Raises:
+            InputError: If there are not n inputs, `state` is not the number of a state, a frame is missing, or the
+                period is not positive.
         """
+        self._check_arguments(state, frames, period_s)
         inputs = np.clip(inputs, -1.0, 1.0)
+        if inputs.shape != (self.inputs,):
+            raise InputError(f"the template {self.name} has {self.inputs} inputs, not an array of shape {inputs.shape}")
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
         return reduce(self.displace, parts, RigidTransform())
 
@@ -199,7 +206,11 @@ class SharedControlTemplate:
         outside too. If the last command is inside the constraints, so is the new one. If the last command is outside
         (at the start of an episode, or after an object moved), the commands move inside at the largest speed. The pose
         is not finite if that of an object is not; callers check it.
+
+        Raises:
+            InputError: If `state` is not the number of a state, a frame is missing, or the period is not positive.
         """
+        self._check_arguments(state, frames, period_s)
         # Scaled before the first projection: the projection of a distant request does not preserve its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
         constraints = self._constraints_at(state, X_WLast, frames)
@@ -218,6 +229,17 @@ class SharedControlTemplate:
             X_WE = constraint.project(X_WE, frames)
         ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
         return Command(X_WE if ratio <= 1.0 else between(X_WLast, X_WE, 1.0 / ratio), 0.0)
+
+    def _check_arguments(self, state: int, frames: Frames, period_s: float) -> None:
+        """Raise an InputError for an unknown state, a missing frame, or a period that is not positive."""
+        if not (isinstance(state, int | np.integer) and 0 <= state < len(self.states)):
+            last = len(self.states) - 1
+            raise InputError(f"a state of the template {self.name} is a number from 0 to {last}, not {brief(state)}")
+        for name in self.frames:
+            if name not in frames:
+                raise InputError(f"the template {self.name} needs the frame {name}: give its pose")
+        if not period_s > 0.0:
+            raise InputError(f"a period must be positive, not {period_s} s")
 
     def _constraints_at(
         self, state: int, X_WLast: RigidTransform, frames: Frames

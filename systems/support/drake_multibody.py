@@ -3,9 +3,10 @@
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import Frame
 from pydrake.systems.framework import Context
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 
 
 class JointDynamics:
@@ -25,6 +26,31 @@ class JointDynamics:
         """Return the mass matrix (n, n) and the torques of Coriolis forces and damping (n,) [Nm]."""
         drag = self._plant.CalcBiasTerm(plant_context) + self._damping * self._plant.GetVelocities(plant_context)
         return self._plant.CalcMassMatrix(plant_context), drag
+
+
+def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Frame) -> None:
+    """Check a plant and its frames, the arguments of a system.
+
+    Args:
+        plant: Plant, which must be finalized.
+        fixed: Frame that must be fixed in the world, if any.
+        **frames: Frames by the names of their arguments.
+
+    Raises:
+        InputError: If the plant or a frame has another type, the plant is not finalized, a frame belongs to another
+            plant, or `fixed` can move.
+    """
+    if not isinstance(plant, MultibodyPlant):
+        raise InputError(f"a plant is a MultibodyPlant, not {brief(plant)}")
+    if not plant.is_finalized():
+        raise InputError("a plant must be finalized before it is given to a system: call Finalize()")
+    for name, frame in frames.items():
+        if not isinstance(frame, Frame):
+            raise InputError(f"{name} is a frame of the plant, such as body.body_frame(), not {brief(frame)}")
+        if frame.GetParentPlant() is not plant:
+            raise InputError(f"{name} is the frame {frame.name()} of another plant: give a frame of this one")
+    if fixed is not None and fixed.body() not in plant.GetBodiesWeldedTo(plant.world_body()):
+        raise InputError(f"the target frame {fixed.name()} can move: give a frame that is fixed in the world")
 
 
 def effort_limits(plant: MultibodyPlant) -> np.ndarray:

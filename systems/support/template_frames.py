@@ -6,8 +6,9 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, InputPort, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
+from guiderail.models.templates.geometry import WORLD
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 
@@ -33,10 +34,17 @@ class TemplateFrames:
         names: Names of the frames.
 
     Raises:
-        InputError: If a frame of the template is missing or not finite.
+        InputError: If the template is not a `SharedControlTemplate`, or the frames are not transforms by name. A
+            missing frame, a pose that is not finite and a pose of the world are refused.
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
+        if not isinstance(template, SharedControlTemplate):
+            raise InputError(f"a template is a SharedControlTemplate, as load_template returns, not {brief(template)}")
+        if not isinstance(frames, Mapping):
+            raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
+        if WORLD in frames:
+            raise InputError(f"the frame {WORLD} of a template can't be moved: leave its pose out, or add a frame")
         missing = [name for name in template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")
@@ -77,6 +85,8 @@ class TemplateFrames:
 
 
 def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:
+    if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
+        raise InputError(f"the frame {name} is a RigidTransform, not {brief(X_WF)}")
     pose = transform_to_pose(X_WF)
     if not np.isfinite(pose).all():
         raise InputError(f"the frame {name} must be at a finite pose, not at {X_WF.translation()}")

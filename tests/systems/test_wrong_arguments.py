@@ -1,0 +1,133 @@
+"""Arguments of the wrong type, size or plant are refused with one sentence when a system is made."""
+
+import numpy as np
+import pytest
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
+
+from guiderail import systems
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
+from guiderail.models.templates import load_template
+
+PERIOD = 0.02
+HOLE = {"hole": RigidTransform()}
+STIFFNESS = np.diag([600.0] * 3 + [25.0] * 3)
+LIMITS = np.array([20.0] * 3 + [2.0] * 3)
+GAINS = systems.ImpedanceGains(STIFFNESS, LIMITS, posture=np.zeros(6))
+
+
+def gantry(*, finalize=True):
+    plant = MultibodyPlant(0.0)
+    parent = plant.world_body()
+    for i, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
+        child = plant.AddRigidBody(f"body{i}", SpatialInertia.SolidSphereWithMass(0.5, 0.04))
+        kind = PrismaticJoint if i < 3 else RevoluteJoint
+        joint = plant.AddJoint(kind(f"joint{i}", parent.body_frame(), child.body_frame(), axis))
+        plant.AddJointActuator(f"motor{i}", joint, 100.0)
+        parent = child
+    if finalize:
+        plant.Finalize()
+    return plant, parent
+
+
+def primitive(history=0):
+    times = PERIOD * np.arange(50)
+    means = np.column_stack([0.1 * np.sin(times), 0.1 * times])
+    reference = ReferenceTrajectory(times, means, np.tile(1e-3 * np.eye(2), (50, 1, 1)))
+    return LcNsKmp(reference, horizon=8, history=history)
+
+
+PLANT, TOOL = gantry()
+_, OTHER_TOOL = gantry()
+UNFINISHED, UNFINISHED_TOOL = gantry(finalize=False)
+WORLD, FRAME = PLANT.world_frame(), TOOL.body_frame()
+
+
+@pytest.mark.parametrize(
+    ("plant", "target", "tool", "gains", "message"),
+    [
+        (PLANT, FRAME, FRAME, GAINS, "can move: give a frame that is fixed in the world"),
+        (PLANT, WORLD, OTHER_TOOL.body_frame(), GAINS, "tool_center is the frame body5 of another plant"),
+        (PLANT, WORLD, TOOL, GAINS, "tool_center is a frame of the plant, such as body.body_frame"),
+        (UNFINISHED, UNFINISHED.world_frame(), UNFINISHED_TOOL.body_frame(), GAINS, "must be finalized"),
+        (None, WORLD, FRAME, GAINS, "a plant is a MultibodyPlant, not None"),
+        (PLANT, WORLD, FRAME, STIFFNESS, "the gains of an impedance are ImpedanceGains"),
+    ],
+)
+def test_impedance_refuses_wrong_arguments(plant, target, tool, gains, message):
+    with pytest.raises(InputError, match=message):
+        systems.CartesianImpedanceController(plant, target, tool, gains, period=PERIOD)
+
+
+def test_impedance_refuses_a_stiffness_frame_of_another_plant():
+    with pytest.raises(InputError, match="stiffness_frame is the frame body5 of another plant"):
+        systems.CartesianImpedanceController(
+            PLANT, WORLD, FRAME, GAINS, period=PERIOD, stiffness_frame=OTHER_TOOL.body_frame()
+        )
+
+
+def test_other_systems_check_plant_and_frames_too():
+    with pytest.raises(InputError, match="of another plant"):
+        systems.CartesianPositionController(PLANT, WORLD, OTHER_TOOL.body_frame(), posture=np.zeros(6))
+    with pytest.raises(InputError, match="of another plant"):
+        systems.JointTorqueWrench(PLANT, WORLD, OTHER_TOOL.body_frame(), period=PERIOD, time_constant=0.0)
+
+
+@pytest.mark.parametrize("limits", [np.inf * LIMITS, "a", None])
+def test_gains_refuse_wrong_limits(limits):
+    with pytest.raises(InputError, match="wrench limits"):
+        systems.ImpedanceGains(STIFFNESS, limits, posture=np.zeros(6))
+
+
+def test_gains_refuse_a_stiffness_of_text():
+    with pytest.raises(InputError, match="a Cartesian stiffness is not an array of numbers"):
+        systems.ImpedanceGains("a", LIMITS, posture=np.zeros(6))
+
+
+@pytest.mark.parametrize("kind", [systems.SctInputMapping, systems.ActiveConstraintProjector, systems.SctStateMachine])
+@pytest.mark.parametrize(
+    ("template", "frames", "message"),
+    [
+        ("grid_clamp.yaml", HOLE, "a template is a SharedControlTemplate"),
+        (None, None, "poses by name, not None"),
+        (None, ["hole"], "poses by name"),
+        (None, {"hole": np.zeros(6)}, "the frame hole is a RigidTransform"),
+        (None, {"hole": np.eye(4)}, "the frame hole is a RigidTransform"),
+        (None, {**HOLE, "world": RigidTransform([1.0, 0.0, 0.0])}, "world of a template can't be moved"),
+    ],
+)
+def test_template_systems_refuse_wrong_arguments(kind, template, frames, message):
+    with pytest.raises(InputError, match=message):
+        kind(template or load_template("grid_clamp"), frames, PERIOD)
+
+
+def test_state_machine_refuses_a_start_that_is_not_finite():
+    machine = systems.SctStateMachine(load_template("grid_clamp"), HOLE, PERIOD)
+    context = machine.CreateDefaultContext()
+    machine.get_initial_pose_input_port().FixValue(context, np.full(6, np.nan))
+    with pytest.raises(InputError, match="must be finite"):
+        machine.ExecuteInitializationEvents(context)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((None, None, PERIOD), "is an LcNsKmp, not None"),
+        ((primitive(), "a", PERIOD), "the gain is not an array of numbers"),
+        ((primitive(), None, 0.05), "a step every 0.02 s, and the system's period is 0.05 s"),
+        ((primitive(), None, 20.0), "the system's period is 20 s"),
+        ((primitive(3), None, PERIOD, [primitive(1)]), "shorter is a list of primitives with their gains"),
+        ((primitive(3), None, PERIOD, [(None, np.ones(2))]), "is an LcNsKmp, not None"),
+    ],
+)
+def test_primitive_system_refuses_wrong_arguments(arguments, message):
+    with pytest.raises(InputError, match=message):
+        systems.LcNsKmpSystem(*arguments)
+
+
+@pytest.mark.parametrize(("outputs", "length"), [(1001, 1000), (1000, 1001)])
+def test_history_refuses_sizes_beyond_its_limit(outputs, length):
+    with pytest.raises(InputError, match="at most 1000000 numbers"):
+        systems.HistoryBuffer(outputs, length, PERIOD)
