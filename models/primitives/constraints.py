@@ -68,8 +68,13 @@ class LinearConstraints:
             lower, upper = np.broadcast_arrays(lower, upper)
         except ValueError as error:
             raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
-        if lower.ndim not in (1, 2) or np.isnan(lower).any() or np.isnan(upper).any():
+        if lower.ndim not in (1, 2):
             raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
+        for name, bounds in (("lower", lower), ("upper", upper)):
+            if np.isnan(bounds).any():
+                at = tuple(np.argwhere(np.isnan(bounds))[0].tolist())
+                where = f"of output {at[0]}" if len(at) == 1 else f"of output {at[1]} at step {at[0]}"
+                raise InputError(f"the {name} bound {where} is NaN: give a number, or an infinite one for no bound")
         if lower.size == 0:
             raise InputError(f"box bounds need at least one output and one step, not the shape {lower.shape}")
         if (lower > upper).any():

@@ -55,6 +55,18 @@ def test_contradiction_at_one_step_names_the_step():
         LinearConstraints.box(lower, upper)
 
 
+@pytest.mark.parametrize(
+    ("lower", "upper", "message"),
+    [
+        ([np.nan, 0.0], [1.0, 1.0], "the lower bound of output 0 is NaN"),
+        ([[0.0, 0.0]] * 2, [[1.0, 1.0], [1.0, np.nan]], "the upper bound of output 1 at step 1 is NaN"),
+    ],
+)
+def test_box_names_the_bound_that_is_nan(lower, upper, message):
+    with pytest.raises(InputError, match=message):
+        LinearConstraints.box(lower, upper)
+
+
 def test_box_accepts_equal_bounds():
     assert LinearConstraints.box([1.0], [1.0]).violation(np.array([1.0])) == 0
 
