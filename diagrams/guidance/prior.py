@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
+from guiderail.models.templates.template import check_template
 
 if TYPE_CHECKING:
     from guiderail.models.control.keep_out import KeepOut
@@ -188,12 +189,18 @@ class PlacedTemplate:
         active_constraints: True if the active constraints are enforced; None: the guidance's default.
         max_tracking_error: Distance between robot and command [m] beyond which the last command is repeated, unless the
             new one is closer to the robot.
+
+    Raises:
+        InputError: If the template is not a `SharedControlTemplate`, or the frames are not poses by name.
     """
 
     template: SharedControlTemplate
     frames: Mapping[str, RigidTransform]
     active_constraints: bool | None = None
     max_tracking_error: float = np.inf
+
+    def __post_init__(self) -> None:
+        check_template(self.template, self.frames)
 
     def constrained(self, by_default: bool) -> bool:
         """Return `active_constraints`; if that is None, the guidance's default, `by_default`."""
@@ -227,6 +234,9 @@ class PriorKnowledge:
         options: Options of the guidance by name; empty if it declares none.
         pose_size: Size O of the station's pose.
         wrench_size: Size W of the station's wrench.
+
+    Raises:
+        InputError: If the template is not a `PlacedTemplate`.
     """
 
     period: float
@@ -236,6 +246,10 @@ class PriorKnowledge:
     options: Mapping[str, Any] = field(default_factory=dict)
     pose_size: int = POSE_SIZE
     wrench_size: int = WRENCH_SIZE
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.template, PlacedTemplate | None):
+            raise InputError(f"a task's template is a PlacedTemplate with its frames, not {brief(self.template)}")
 
     @property
     def constraints(self) -> LinearConstraints:

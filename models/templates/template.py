@@ -12,7 +12,7 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates.consistency import describe, find_contradiction
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
-from guiderail.models.templates.geometry import Frames, StatePart, angle_between, between, largest
+from guiderail.models.templates.geometry import WORLD, Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
 from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
@@ -346,3 +346,16 @@ class SharedControlTemplate:
         """
         phase = self.states[state]
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))
+
+
+def check_template(template: object, frames: object) -> None:
+    """Raise an InputError unless an argument is a template, and a second one holds poses of its objects by name.
+
+    Poses of other objects are accepted, but not one of the world, which would have no effect.
+    """
+    if not isinstance(template, SharedControlTemplate):
+        raise InputError(f"a template is a SharedControlTemplate, as load_template returns, not {brief(template)}")
+    if not isinstance(frames, Mapping):
+        raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
+    if WORLD in frames:
+        raise InputError(f"the frame {WORLD} of a template can't be moved: leave its pose out, or add a frame")

@@ -8,8 +8,7 @@ from pydrake.systems.framework import BasicVector, Context, DependencyTicket, In
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
-from guiderail.models.templates.geometry import WORLD
-from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 
 
@@ -39,12 +38,7 @@ class TemplateFrames:
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
-        if not isinstance(template, SharedControlTemplate):
-            raise InputError(f"a template is a SharedControlTemplate, as load_template returns, not {brief(template)}")
-        if not isinstance(frames, Mapping):
-            raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
-        if WORLD in frames:
-            raise InputError(f"the frame {WORLD} of a template can't be moved: leave its pose out, or add a frame")
+        check_template(template, frames)
         missing = [name for name in template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")

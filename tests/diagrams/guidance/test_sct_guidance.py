@@ -8,8 +8,10 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
+from guiderail.diagrams.guidance.prior import PlacedTemplate, PriorKnowledge
 from guiderail.diagrams.guidance.sct import ActiveConstraintFilter, SctGuidance
 from guiderail.models.common.arrays import round_period
+from guiderail.models.common.errors import InputError
 from guiderail.models.templates import load_template
 
 PERIOD = round_period(0.01)
@@ -167,3 +169,12 @@ def test_a_persons_device_and_a_policy_differ_in_one_connection(template):
         builder.ExportInput(guidance.GetInputPort("pose"), "pose")
         diagrams.append(builder.Build())
     assert all(diagram.HasInputPort("pose") for diagram in diagrams)
+
+
+def test_prior_knowledge_refuses_what_is_not_a_placed_template():
+    with pytest.raises(InputError, match="a template is a SharedControlTemplate"):
+        PlacedTemplate("grid_clamp.yaml", {"hole": RigidTransform()})
+    with pytest.raises(InputError, match="poses by name"):
+        PlacedTemplate(load_template("grid_clamp"), None)
+    with pytest.raises(InputError, match="a task's template is a PlacedTemplate"):
+        PriorKnowledge(0.02, template=load_template("grid_clamp"))
