@@ -154,20 +154,20 @@ LOCKED_STEPS = 3  # consecutive steps with a locked plug that count as success, 
 
 
 def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
-    """Return the reference trajectory of demonstrations, fitted once per process.
+    """Return the reference trajectory of demonstrations, fitted once per process and content of the file.
 
     Args:
         demonstrations: Name in `DEMONSTRATIONS`, or path of a file .npz or .csv.
         count: Number of demonstrations that are used, from the first on; None: all.
         fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
     """
-    return _fit_reference(demonstrations, count, tuple(sorted(fit.items())))
+    if demonstrations not in DEMONSTRATIONS:
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **fit)
+    return _fit_shipped(demonstrations, count, tuple(sorted(fit.items())))
 
 
 @cache  # called with all arguments by position: an omitted `count` and None have the same key
-def _fit_reference(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
-    if demonstrations not in DEMONSTRATIONS:
-        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **dict(fit))
+def _fit_shipped(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
     loaded = Demonstrations.load(DEMONSTRATIONS[demonstrations]).first(count)
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, **dict(fit))
 

@@ -2,14 +2,26 @@
 
 import gc
 import pickle
+from dataclasses import replace
+from pathlib import Path
 
+import gymnasium
 import numpy as np
 import psutil
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.guidance.guidance import FunctionGuidance
+from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
+from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
+from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
 from guiderail.models.common.errors import InputError
+from guiderail.models.objects import grid_clamp
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.kernels import KERNELS, SquaredExponential, register_kernel
+from guiderail.models.templates import load_template
 
+GRID_CLAMP = Path(grid_clamp.__file__).parent / "grid_clamp.yaml"
 CASES = [
     ("NarrowPassage", {"guidance": "safe_residual"}),
     ("BncConnector", {"guidance": "kgrl", "adaptive_history": False}),
@@ -46,6 +58,80 @@ def test_episode_is_equal_in_a_reused_diagram(task, options):
     assert episode(third, 3) == expected
     second.close()
     third.close()
+
+
+@pytest.fixture
+def registries():
+    """Remove the registrations of each test."""
+    before = [(registry, set(registry.names())) for registry in (TASKS, GUIDANCE, KERNELS)]
+    yield
+    for registry, names in before:
+        for name in set(registry.names()) - names:
+            del registry._entries[name]
+            gymnasium.registry.pop(environment_id(name), None)
+
+
+def last_command(task, action=1.0, steps=3, **options):
+    """Return the last command of a few steps in a new environment, which is closed afterwards."""
+    env = make_env(task, **options)
+    env.reset(seed=0)
+    for _ in range(steps):
+        env.step(np.full(env.action_space.shape, action))
+    env.close()
+    return env.trace.commanded[-1]
+
+
+def test_own_template_is_new_when_the_file_changed(tmp_path, registries):
+    file = tmp_path / "clamp.yaml"
+
+    @register_task("lab/Edited")
+    class Edited(GridClamp):
+        def template(self):
+            return replace(super().template(), template=load_template(file))
+
+    sideways, shipped = [], GRID_CLAMP.read_text()
+    for width in ("0.008", "0.002"):
+        file.write_text(shipped.replace("width_m: 0.008", f"width_m: {width}"))
+        sideways.append(last_command("lab/Edited", action_repeat=20)[0])
+    assert sideways == pytest.approx([0.004, 0.001], abs=1e-6)
+
+
+def test_own_guidance_is_new_when_its_file_changed(tmp_path, registries):
+    file = tmp_path / "target.txt"
+
+    @register_guidance("from_file")
+    def build(prior):
+        target = np.full(prior.pose_size, float(file.read_text()))
+        return FunctionGuidance(prior, lambda action, pose, wrench: target, action_size=1)
+
+    for target in (0.1, 0.2):
+        file.write_text(str(target))
+        assert last_command("NarrowPassage", guidance="from_file").tolist() == [target, target]
+
+
+def test_own_kernel_is_new_when_it_is_registered_again(registries):
+    commands = []
+    for number in (1.0, 3.0):
+
+        @register_kernel("changed")
+        class Changed(SquaredExponential):
+            factor = number
+
+            def __call__(self, a, b):
+                return super().__call__(self.factor * a, self.factor * b)
+
+        commands.append(last_command("NarrowPassage", kernel="changed"))
+    assert not np.array_equal(*commands)
+
+
+def test_demonstrations_are_new_when_the_file_changed(tmp_path):
+    file, commands = tmp_path / "mine.npz", []
+    times, height = 0.02 * np.arange(100), np.linspace(0.02, 0.0, 100)
+    for x in (0.0, 1e-3):
+        outputs = [np.outer(np.ones(100), [x + d, d, 0.0, d, d, d]) for d in (-1e-4, 0.0, 1e-4)]
+        Demonstrations(times, [one + np.outer(height, [0, 0, 1, 0, 0, 0]) for one in outputs]).save(file)
+        commands.append(last_command("BncConnector", 0.0, 1, guidance="kgrl", demonstrations=str(file))[0])
+    assert commands == pytest.approx([0.0, 1e-3], abs=2e-4)
 
 
 def test_two_environments_never_share_a_diagram():

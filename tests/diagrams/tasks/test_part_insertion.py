@@ -168,6 +168,20 @@ def test_folder_is_the_same_task_until_a_file_changes(tmp_path):
     assert len(set(tasks)) == 5
 
 
+def test_folder_demonstrations_are_new_when_the_file_changed(tmp_path):
+    folder, heights = write(tmp_path / "replaced"), []
+    name = register_task_folder(folder)
+    for scale in (1.0, 0.5):
+        loaded = Demonstrations.load(folder / "demonstrations.npz")
+        Demonstrations(loaded.times, [scale * one for one in loaded.outputs]).save(folder / "demonstrations.npz")
+        env = make_env(name, guidance="kmp", action_repeat=25)
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape))
+        heights.append(env.trace.commanded[-1, 2])
+        env.close()
+    assert heights == pytest.approx([0.0104, 0.0052], abs=2e-4)
+
+
 def test_two_folders_with_one_name_must_have_the_same_content(tmp_path):
     one, copy, other = (write(tmp_path / name, name="parts/peg") for name in ("one", "copy", "other"))
     assert [register_task_folder(folder) for folder in (one, copy, one)] == 3 * ["parts/peg"]

@@ -39,7 +39,6 @@ def make_clamp(template, **options):
     def place(task):
         return replace(GridClamp.template(task), template=template)
 
-    # A name of its own, because diagrams of closed environments are reused by name.
     name = f"lab/Phases{next(NUMBERS)}"
     register_task(name)(type("Phases", (GridClamp,), {"template": place}))
     try:
