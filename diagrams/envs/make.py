@@ -55,7 +55,8 @@ def make_station(task: Task) -> Station:
             f"workcell() of {task.name} returns nothing: let it return what station={kind.name!r} works on"
         )
     arguments = config.part("station")
-    if config.control_period is not None and "control_period" in inspect.signature(kind.build).parameters:
+    takes_period = "control_period" in inspect.signature(kind.build).parameters
+    if config.control_period is not None and takes_period:
         arguments["control_period"] = task.control_period
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
@@ -64,6 +65,12 @@ def make_station(task: Task) -> Station:
     else:
         station = build()
     if config.control_period is not None and station.nominal_period != task.control_period:
+        if takes_period:
+            raise InputError(
+                f"time_unit of {task.name} is {task.time_unit!r} s, and the period {station.nominal_period!r} s of "
+                f"station={kind.name!r} is no multiple of it: leave time_unit out, which has the station's time step "
+                "by default"
+            )
         raise InputError(
             f"station={kind.name!r} has a control period of {station.nominal_period:g} s: leave control_period out, or "
             "give the station's builder that parameter"

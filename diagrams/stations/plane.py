@@ -72,7 +72,12 @@ class PlaneConfig:
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2
 
 
-@register_station("plane", workcell_kind="plane")
+@register_station(
+    "plane",
+    workcell_kind="plane",
+    time_unit=PlaneConfig.plant_period,
+    control_period=PlaneConfig().control_period,
+)
 class PlaneStation(Station):
     """Point robot under position control in a plane with walls.
 

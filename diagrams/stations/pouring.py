@@ -102,7 +102,12 @@ class PouringConfig:
         return turned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
 
 
-@register_station("pouring", workcell_kind="pouring")
+@register_station(
+    "pouring",
+    workcell_kind="pouring",
+    time_unit=PouringConfig.plant_period,
+    control_period=PouringConfig().control_period,
+)
 class PouringStation(Station):
     """Arm under Cartesian position control that holds a thermos with balls, and a mug on a table.
 

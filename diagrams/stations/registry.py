@@ -23,6 +23,8 @@ class StationKind:
     options: type[Options] | None  # class of the station's environment options; None if it has none
     description: str  # summary in one line
     is_simulated: bool = True  # True for a simulation: a reset can set its state
+    time_unit: float | None = None  # default of `Task.time_unit` [s]; None: `station.TIME_UNIT`
+    control_period: float | None = None  # default of `Task.default_control_period` [s]; None: `station.CONTROL_PERIOD`
 
 
 STATIONS: Registry[StationKind] = Registry(
@@ -34,7 +36,13 @@ STATIONS: Registry[StationKind] = Registry(
 
 
 def register_station(
-    name: str, *, workcell_kind: str, options: type[Options] | None = None, is_simulated: bool = True
+    name: str,
+    *,
+    workcell_kind: str,
+    options: type[Options] | None = None,
+    is_simulated: bool = True,
+    time_unit: float | None = None,
+    control_period: float | None = None,
 ) -> Callable[[Callable[..., Station]], Callable[..., Station]]:
     """Return a decorator that registers a class or function that builds a station from a workcell and options.
 
@@ -43,6 +51,8 @@ def register_station(
         workcell_kind: Kind of workcell that the station needs.
         options: Class of the station's environment options; None if it has none.
         is_simulated: True for a simulation: a reset can set its state.
+        time_unit: Time step of the plant, of which control periods are whole multiples [s]; default: 5 ms.
+        control_period: Control period without the option `control_period` [s]; default: 20 ms.
 
     Raises:
         InputError: When the decorator is applied, if another station has that name.
@@ -50,9 +60,9 @@ def register_station(
 
     def add(build: Any) -> Any:
         lines = str(build.__doc__ or "").strip().splitlines()
-        STATIONS.register(
-            name, StationKind(name, build, workcell_kind, options, lines[0] if lines else "", is_simulated)
-        )
+        description = lines[0] if lines else ""
+        periods = time_unit, control_period
+        STATIONS.register(name, StationKind(name, build, workcell_kind, options, description, is_simulated, *periods))
         return build
 
     return add

@@ -109,8 +109,8 @@ class Task(ABC):
         isotropic_groups: Groups of outputs with the same unit, as indices; in residual learning, an action of 1
             displaces each output of a group by the same amount. None: one group of all outputs.
         pushable: True if `DiagramEnv.push` may displace the robot.
-        time_unit: Time of which every control period is a whole multiple [s].
-        default_control_period: Control period without the option `control_period` [s].
+        time_unit: Time of which every control period is a whole multiple [s]; default: that of the station.
+        default_control_period: Control period without the option `control_period` [s]; default: that of the station.
         config: Configuration of the environment.
         options: The task's own options, an instance of `Options`.
         control_period: Control period [s].
@@ -137,8 +137,8 @@ class Task(ABC):
     has_held_out_distribution: ClassVar[bool] = False
     isotropic_groups: ClassVar[tuple[tuple[int, ...], ...] | None] = None
     pushable: ClassVar[bool] = True
-    time_unit: ClassVar[float] = TIME_UNIT
-    default_control_period: ClassVar[float] = CONTROL_PERIOD
+    time_unit: float
+    default_control_period: float
 
     def __init__(self, config: EnvConfig):
         """Construct the task; a subclass may refuse incompatible options.
@@ -151,7 +151,10 @@ class Task(ABC):
         """
         self.config = config
         self.options = config.parts["task"]
-        given = config.control_period
+        given, kind, declared = config.control_period, config.station_kind, type(self)
+        self.time_unit = getattr(declared, "time_unit", kind.time_unit or TIME_UNIT)
+        period = kind.control_period or CONTROL_PERIOD
+        self.default_control_period = getattr(declared, "default_control_period", period)
         self.control_period = self.default_control_period if given is None else whole_multiple(given, self.time_unit)
         self.episode_constants: dict[str, EpisodeConstant] = {}
 

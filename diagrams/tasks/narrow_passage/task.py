@@ -16,7 +16,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD, Pair, ResetOptions
 from guiderail.diagrams.envs.scene import Camera, Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
-from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
+from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
 from guiderail.diagrams.tasks.offsets import episode_stream
@@ -108,7 +108,6 @@ class NarrowPassage(Task):
     observations = ("state", "image")
     defaults = {"guidance": "skgrl", "action_repeat": 5}
     difficulties = {STANDARD: {}, "hard": HARD}
-    time_unit, default_control_period = PlaneConfig.plant_period, PlaneConfig().control_period
     clip = 1.0
     statistics = (
         Metric(

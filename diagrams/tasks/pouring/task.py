@@ -177,7 +177,6 @@ class Pouring(Task):
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
     collision = Threshold("touched")
-    time_unit, default_control_period = PouringConfig.plant_period, PouringConfig().control_period
     pushable = False  # the balls in the thermos would not move along
 
     def __init__(self, config: EnvConfig):

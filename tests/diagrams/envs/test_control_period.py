@@ -1,11 +1,13 @@
 """The option `control_period`: clock of guidance, station and task, and the refusals of other periods."""
 
+import gymnasium
 import numpy as np
 import pytest
 
 from guiderail import make_env
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge, make_skill
+from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
@@ -14,8 +16,13 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
+from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
+from guiderail.systems.episode_monitor import TerminationTerm
+from guiderail.systems.reward_system import RewardTerm
 
 
 def task_of(name, **options):
@@ -86,6 +93,60 @@ def test_period_or_unit_that_is_nonsense_is_refused(nonsense):
     for period, unit in ((nonsense, 0.01), (0.02, nonsense)):
         with pytest.raises(InputError, match="whole multiple"):
             whole_multiple(period, unit)
+
+
+class Lane(Task):
+    """Straight motion in a plane, resampled to the control period."""
+
+    workcell_kind, num_steps = "plane", 20
+
+    def workcell(self):
+        return PassageGeometry()
+
+    def reference(self):
+        means = np.column_stack([np.full(41, 0.35), np.linspace(0.1, 0.5, 41)])
+        return self.on_clock(ReferenceTrajectory(0.02 * np.arange(41), means, np.tile(1e-3 * np.eye(2), (41, 1, 1))))
+
+    def observation_terms(self):
+        return (ObservationTerm("pose"),)
+
+    def reward_terms(self, num_actions):
+        return [RewardTerm("none", {}, lambda: 0.0)]
+
+    def termination_terms(self):
+        return [TerminationTerm("success", {"pose": 2}, lambda pose: False)]
+
+    def reset(self, station, guidance, context, rng, options):
+        station.set_pose(context, np.array([0.35, 0.1]))
+        return {}
+
+
+@pytest.fixture
+def own_tasks():
+    """Register an own task, and one with a time unit of its own; remove both after the test."""
+    names = "lab/Lane", "lab/Units"
+    register_task(names[0])(Lane)
+    register_task(names[1])(type("Units", (Lane,), {"time_unit": 0.01}))
+    yield
+    for name in names:
+        TASKS._entries.pop(name)
+        gymnasium.registry.pop(environment_id(name))
+
+
+@pytest.mark.parametrize("period", [None, 0.012, 0.04, 0.05])
+def test_own_task_has_the_periods_of_its_station(own_tasks, period):
+    env = make_env("lab/Lane", guidance="kmp", action_repeat=1, control_period=period)
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(np.zeros(2))
+    assert env.task.declaration.control_period == env.task.control_period == pytest.approx(period or 0.02, rel=1e-9)
+    # The demonstrated speed is 0.5 m/s, whatever the period.
+    assert env.trace.commanded[4, 1] - env.trace.commanded[3, 1] == pytest.approx(0.5 * (period or 0.02), rel=0.1)
+
+
+def test_message_names_the_time_unit_when_it_is_not_the_stations(own_tasks):
+    with pytest.raises(InputError, match=r"^time_unit of lab/Units is 0\.01 s, .* leave time_unit out"):
+        make_env("lab/Units", guidance="kmp", control_period=0.05)
 
 
 def test_reference_of_another_clock_is_refused():
