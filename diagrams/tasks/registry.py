@@ -89,6 +89,11 @@ def _check(name: str, task: type[Task]) -> None:
         check_num_steps(name, num_steps)
     if not isinstance(task.clip, int | float) or not task.clip > 0:
         raise InputError(f"clip of {name} must be a positive number, not {brief(task.clip)}")
+    if not isinstance(inspect.getattr_static(task, "scripted_policies"), classmethod | staticmethod):
+        raise InputError(
+            f"scripted_policies of {name} is called without an instance: make it a @classmethod with the arguments "
+            "(cls, difficulty)"
+        )
 
 
 def check_num_steps(name: str, num_steps: Any) -> None:

@@ -286,7 +286,15 @@ class Task(ABC):
 
     @classmethod
     def scripted_policies(cls, difficulty: str = option_models.STANDARD) -> Mapping[str, ScriptedPolicy]:
-        """Return scripted policies by name; the first one is the default for `difficulty`."""
+        """Return scripted policies by name; the first one is the default for `difficulty`.
+
+        A scripted policy takes the observation, (n,), centered, scaled and clipped as `observation_terms` declares it,
+        and returns an action, (A,), in [−1, 1]. `guiderail evaluate` runs the default one as a baseline, unless the
+        observation is an image. This is a class method or a static method.
+
+        Args:
+            difficulty: Value of the option `difficulty`.
+        """
         return {}
 
     # Drawing.

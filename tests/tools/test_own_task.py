@@ -21,6 +21,7 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.datasets.validate import validate_template
+from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.train import train
@@ -91,6 +92,11 @@ def declare(of=Own, **attributes):
         ({"num_steps": True}, "num_steps of lab/Own must be a whole number of at least 1, not True"),
         ({"num_steps": "80"}, "num_steps of lab/Own must be a whole number of at least 1, not '80'"),
         ({"rewards": ()}, "rewards of lab/Own must be a tuple of names"),
+        (
+            {"scripted_policies": lambda self, difficulty: {}},
+            r"^scripted_policies of lab/Own is called without an instance: make it a @classmethod with the arguments "
+            r"\(cls, difficulty\)$",
+        ),
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
 )
@@ -128,6 +134,22 @@ def test_default_guidance_has_an_effect():
     declare()
     assert possible_guidance(TASKS.get("lab/Own").provides())[0] == "base_policy"
     assert EnvConfig.resolve("lab/Own", {}).guidance == "kgrl"
+
+
+@pytest.mark.parametrize("kind", [classmethod, staticmethod])
+def test_scripted_policies_without_an_instance_are_accepted(kind):
+    def hold(observation):
+        return np.zeros(2)
+
+    declare(scripted_policies=kind(lambda *given: {"hold": hold}))
+    assert find_scripted_policy("lab/Own", "scripted") is hold
+
+
+@pytest.mark.parametrize("returned", [None, [np.zeros], {"hold": 3}])
+def test_scripted_policies_that_are_no_functions_are_refused(returned):
+    declare(scripted_policies=staticmethod(lambda difficulty: returned))
+    with pytest.raises(InputError, match="scripted_policies of lab/Own must return functions of an observation by"):
+        find_scripted_policy("lab/Own", "scripted")
 
 
 def test_settings_of_another_guidance_are_accepted():

@@ -13,7 +13,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.policies import ENDINGS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
@@ -126,8 +126,18 @@ def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
 
 
 def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
-    """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task."""
-    return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
+    """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task.
+
+    Raises:
+        InputError: If the task returns anything but functions by name.
+    """
+    policies = TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
+    if not isinstance(policies, Mapping) or not all(map(callable, policies.values())):
+        raise InputError(
+            f"scripted_policies of {task} must return functions of an observation by name, {{}} if none, not "
+            f"{brief(policies)}"
+        )
+    return policies
 
 
 def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> PolicyFn:
