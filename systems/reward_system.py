@@ -52,14 +52,15 @@ class RewardSystem(LeafSystem):
     Raises:
         InputError: If there is no term, a name is not allowed, a signal's size is below 1 or differs between terms, or
             the parameters of a function are not named like its signals. At evaluation, if a term is not one finite
-            number.
+            number, or the sum of the terms is not finite.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
         super().__init__()
         names = [term.name for term in terms]
         self._terms, self._of_task = tuple(terms), f" of {task_name}" if task_name else ""
-        if not names or len(set(names)) < len(names) or "reward" in names or "" in names:
+        are_words = all(isinstance(name, str) and name not in ("", "reward") for name in names)
+        if not names or not are_words or len(set(names)) < len(names):
             raise InputError(
                 f"a reward{self._of_task} needs terms of different names, neither empty nor 'reward', "
                 f"not {brief(names)}"
@@ -69,7 +70,7 @@ class RewardSystem(LeafSystem):
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         sources = self._signals.tickets or {self.nothing_ticket()}
         self._values = declare.cache(self, "terms", self._calc_terms, sources)
-        self._reward_port = declare.part_output(self, "reward", self._values, np.add.reduce)
+        self._reward_port = declare.part_output(self, "reward", self._values, self._sum)
         self._term_ports = {
             term.name: declare.part_output(self, term.name, self._values, itemgetter(i)) for i, term in enumerate(terms)
         }
@@ -95,6 +96,13 @@ class RewardSystem(LeafSystem):
     def _calc_terms(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)
         return np.array([self._value(term, signals) for term in self._terms])
+
+    def _sum(self, values: np.ndarray) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            total = np.add.reduce(values)
+        if not math.isfinite(total):
+            raise InputError(f"the sum of the reward terms{self._of_task} is not finite, but {total}: scale them down")
+        return total
 
     def _value(self, term: RewardTerm, signals: Mapping[str, np.ndarray]) -> float:
         value = term.value(**{name: signals[name] for name in term.inputs})

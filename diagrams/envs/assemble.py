@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, cast
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,6 +12,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
+from guiderail.diagrams.envs.answers import ask, check_takes_arguments, refuse_half_turns, threshold_of
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import (
     CLOCKS,
@@ -42,8 +43,6 @@ from guiderail.systems.episode_monitor import EpisodeMonitor
 from guiderail.systems.image_observation import ImageObservation
 from guiderail.systems.reward_system import RewardSystem
 
-HALF_TURN_MARGIN = 0.1  # margin of demonstrated angles to ±180° [rad]: actions and contact turn the tool further
-
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """Return the prior knowledge that a task provides to guidance on a station.
@@ -54,15 +53,15 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """
     provides = task.provides()
     primitive = None
-    constraints = task.constraints() or LinearConstraints.none(station.pose_size)
+    constraints = ask(task, "constraints") or LinearConstraints.none(station.pose_size)
     if "demonstrations" in provides:
         options = task.config.part("primitive")
         kernel = kernel_from_options(options)
-        reference = pass_through(task.reference(), options.get("via_points", ()), kernel)
+        reference = pass_through(ask(task, "reference"), options.get("via_points", ()), kernel)
         options = {name: value for name, value in options.items() if name not in _NOT_PRIMITIVE}
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
-            _refuse_half_turns(reference.means)
+            refuse_half_turns(reference.means)
         primitive = PrimitiveConfig(
             reference=reference,
             kernel=kernel,
@@ -71,15 +70,15 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
             progress=_state_progress(task, station.control_period),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
-            keep_out=task.keep_out() if "keep_out" in provides else None,
+            keep_out=ask(task, "keep_out") if "keep_out" in provides else None,
             wrench_size=station.wrench_size,
             **options,
         )
     return PriorKnowledge(
         period=station.control_period,
         demonstrations=primitive,
-        template=task.template() if "template" in provides else None,
-        approach=task.approach() if "approach" in provides else None,
+        template=ask(task, "template") if "template" in provides else None,
+        approach=ask(task, "approach") if "approach" in provides else None,
         options=task.config.part("guidance"),
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
@@ -113,7 +112,7 @@ def _motion_constraints(task: Task, constraints: LinearConstraints, station: Sta
         InputError: If the station has no joints for `joint_margin`, `min_singular_value` is given without
             `joint_margin`, or the number of limits does not fit the outputs.
     """
-    motion, options = task.motion_constraints(), task.config.part("primitive")
+    motion, options = ask(task, "motion_constraints"), task.config.part("primitive")
     limits: dict[str, Any] = {}
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
@@ -136,16 +135,6 @@ def _check_clock(times: np.ndarray, period: float) -> None:
         )
 
 
-def _refuse_half_turns(means: np.ndarray) -> None:
-    """Raise an `InputError` if angles of a motion (N, 6) come near ±180°, where the station's pose jumps."""
-    furthest = np.abs(means[:, 3:]).max(initial=0.0)
-    if furthest > np.pi - HALF_TURN_MARGIN:
-        raise InputError(
-            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and this station's angles jump by a full turn at "
-            f"180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
-        )
-
-
 class Signals:
     """Collection of ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
 
@@ -157,11 +146,11 @@ class Signals:
         """Add signals; a later one replaces an earlier one of the same name."""
         self._ports |= ports
 
-    def get(self, name: str, user: str) -> OutputPort:
+    def get(self, name: str, user: str, size: int | None = None) -> OutputPort:
         """Return the port of a signal. The error message names the `user`, the part of the task that needs it.
 
         Raises:
-            InputError: If there is no signal of this name.
+            InputError: If there is no signal of this name, or it has another `size`.
         """
         held = name.removeprefix("last_")
         if name not in self._ports and held != name and held in self._ports:
@@ -172,7 +161,11 @@ class Signals:
             raise InputError(
                 f"{user} needs the signal {name!r}, which does not exist here: {did_you_mean(name, self._ports)}"
             )
-        return self._ports[name]
+        port = self._ports[name]
+        if size not in (None, port.size()):
+            numbers = "one number" if size == 1 else f"{size} numbers"
+            raise InputError(f"{user} takes {numbers} as the signal {name!r}, which has {port.size()}")
+        return port
 
     def connect(self, system: Any, names: Mapping[str, int], user: str) -> None:
         """Connect the signal of each name to the system's input `get_signal_input_port(name)` of the given size.
@@ -181,10 +174,7 @@ class Signals:
             InputError: If a signal is missing or has another size.
         """
         for name, size in names.items():
-            port = self.get(name, user)
-            if port.size() != size:
-                raise InputError(f"{user} takes {size} numbers as the signal {name!r}, which has {port.size()}")
-            self._builder.Connect(port, system.get_signal_input_port(name))
+            self._builder.Connect(self.get(name, user, size), system.get_signal_input_port(name))
 
 
 class Loop:
@@ -219,7 +209,7 @@ class Loop:
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
         if not station.HasOutputPort("exact_wrench"):
             self.signals.add({"exact_wrench": station.get_wrench_output_port()})
-        signals = task.signals(builder, station)
+        signals = ask(task, "signals", builder, station)
         self.signals.add(signals)
         self._connect_max_wrench(task, signals.get("max_wrench"))
         self.space, self.observation = self._add_observation(task)
@@ -230,8 +220,8 @@ class Loop:
         """Connect the station's `max_wrench` to the task's `bound`, lowered to the limits of the template's state."""
         limit = None
         if self.guidance.HasOutputPort("state") and "template" in task.provides():
-            impedance = task.impedance() if self.station.HasInputPort("max_wrench") else None
-            limit = make_phase_wrench_limit(task.template().template, impedance, self.station.control_period)
+            impedance = ask(task, "impedance") if self.station.HasInputPort("max_wrench") else None
+            limit = make_phase_wrench_limit(ask(task, "template").template, impedance, self.station.control_period)
         if limit is not None:
             add_system(self.builder, "phase_wrench_limit", limit, state=self.guidance.GetOutputPort("state"))
             if bound is not None:
@@ -260,10 +250,10 @@ class Loop:
         self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        observed = task.observation_terms()
+        observed = ask(task, "observation_terms")
         camera = observed if isinstance(observed, Camera) else task.observation_camera()
         if camera is None:
-            return self.add_terms(task, cast("Sequence[ObservationTerm]", observed), "observation")
+            return self.add_terms(task, observed, "observation")
         image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
         if isinstance(observed, Camera):
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
@@ -312,19 +302,20 @@ def build_task_diagram(
     builder.ExportInput(guidance.GetInputPort("action"), "action")
 
     violations = _add_violations(builder, task, station, guidance)
-    conditions = task.termination_terms()
+    conditions = ask(task, "termination_terms")
     monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
     watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
     signals.connect(monitor, watched, f"the termination of {task.name}")
     signals.add({"termination": monitor.get_termination_output_port()})
 
-    terms = task.reward_terms(guidance.GetInputPort("action").size())
+    terms = ask(task, "reward_terms", guidance.GetInputPort("action").size())
     reward = builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
     rewarded = {name: size for term in terms for name, size in term.inputs.items()}
     signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
 
-    watched_force = signals.get(task.collision.signal, f"the collision threshold of {task.name}")
-    collision = add_system(builder, "collision", affine(np.eye(1), [-task.collision.above]), watched_force)
+    threshold = threshold_of(task)
+    watched_force = signals.get(threshold.signal, f"the collision threshold of {task.name}", 1)
+    collision = add_system(builder, "collision", affine(np.eye(1), [-threshold.above]), watched_force)
     force = station.get_contact_force_output_port()
     exported = {
         **violations,
@@ -347,8 +338,9 @@ def build_task_diagram(
                 f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
-    if task.privileged_terms() and station.HasOutputPort("body_poses"):
-        exported["privileged"] = loop.add_terms(task, task.privileged_terms(), "privileged")[1]
+    privileged = ask(task, "privileged_terms")
+    if privileged and station.HasOutputPort("body_poses"):
+        exported["privileged"] = loop.add_terms(task, privileged, "privileged")[1]
     # Outputs that only this guidance has, such as the state of a template, are exported too.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
@@ -446,7 +438,7 @@ def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
 
 def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
     """Return the ports of the constraint violations by name; without task constraints, guidance's ports are used."""
-    constraints = task.constraints()
+    constraints = ask(task, "constraints")
     poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
     poses["measured_violation"] = station.get_pose_output_port()
     violations = {}
@@ -457,7 +449,7 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
             violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
     for name, port in poses.items():
         if name not in violations:
-            checked = task.motion_constraints() or constraints
+            checked = ask(task, "motion_constraints") or constraints
             violation = add_system(builder, name, ConstraintViolation(checked, station.control_period), pose=port)
             violations[name] = violation.get_violation_output_port()
     return violations
@@ -467,8 +459,9 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
     """Return the function `TaskDiagram.randomize`.
 
     The function raises an InputError if a reset option is invalid, or if the task's `reset` does not return values by
-    name or returns a value with a reserved name.
+    name or returns a value with a reserved name. This function raises one if `reset` has other parameters.
     """
+    check_takes_arguments(task, "reset")
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         sampled = task.reset(

@@ -1,5 +1,6 @@
 """The Gymnasium environment of every task."""
 
+import math
 import re
 import weakref
 from collections.abc import Callable, Iterator, Mapping
@@ -193,8 +194,9 @@ class DiagramEnv(DrakeGymEnv):
             options: Options of the task's `Reset` by name.
 
         Raises:
-            InputError: If an option is unknown, a value is out of range, the environment is closed, or the observation
-                is not finite although the simulation did not fail.
+            InputError: If an option is unknown, a value is out of range, the environment is closed, the first reset
+                puts the robot more than `MAX_POSITION` away, or the observation is not finite although the simulation
+                did not fail.
         """
         if self._closed:
             raise InputError("the environment is closed: make another one")
@@ -223,7 +225,10 @@ class DiagramEnv(DrakeGymEnv):
         self._violations = -np.inf, -np.inf
         if self._failure is None:
             with self._record_failure():
-                self._check_plausible(context, self._pose_port.Eval(context))
+                pose = self._pose_port.Eval(context)
+                if self._observation is None:
+                    self._check_start(pose)
+                self._check_plausible(context, pose)
                 observation = self._observe(context)
                 now = {name: port.Eval(context) for name, port in self._recorded}
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
@@ -244,6 +249,15 @@ class DiagramEnv(DrakeGymEnv):
             if self._observation is None or not _SIMULATION_FAILURE.search(str(error)):
                 raise
             self._failure = str(error)
+
+    def _check_start(self, pose: np.ndarray) -> None:
+        """Raise an `InputError` if the first reset puts the robot further away than a simulation may."""
+        if np.abs(pose[:3]).max() > MAX_POSITION:
+            of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
+            raise InputError(
+                f"reset{of} puts the robot at {pose[:3]} m, and at most {MAX_POSITION:g} m are allowed: give poses in "
+                "meters"
+            )
 
     def _check_plausible(self, context: Context, pose: np.ndarray) -> None:
         """Raise a `RuntimeError` if the measured pose (O,) or a joint speed is not finite or exceeds its limit."""
@@ -302,6 +316,8 @@ class DiagramEnv(DrakeGymEnv):
             self.trace.append(desired_pose, pose, force, reward, now)
             termination = reason
 
+        if not math.isfinite(total):
+            raise InputError(f"the reward of {self._control_steps - first_step} control steps overflows: scale it down")
         terminated = termination != 0
         truncated = not terminated and (self._failure is not None or self._control_steps >= self.task.num_steps)
         if truncated and self._failure is None:

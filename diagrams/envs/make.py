@@ -16,6 +16,7 @@ import numpy as np
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
+from guiderail.diagrams.envs.answers import ask, workcell_of
 from guiderail.diagrams.envs.assemble import (
     SkillDiagram,
     build_prior_knowledge,
@@ -44,16 +45,12 @@ def make_station(task: Task) -> Station:
     """Build the station that a task is configured with, including its workcell.
 
     Raises:
-        InputError: If the task has no workcell, its `num_steps` is not a positive whole number, or the station has a
-            fixed control period other than the option `control_period`.
+        InputError: If the task has no workcell, or one of another kind, its `num_steps` is not a positive whole number,
+            or the station has a fixed control period other than the option `control_period`.
     """
     config, kind = task.config, task.config.station_kind
     check_num_steps(task.name, getattr(task, "num_steps", None))
-    workcell = task.workcell()
-    if workcell is None:
-        raise InputError(
-            f"workcell() of {task.name} returns nothing: let it return what station={kind.name!r} works on"
-        )
+    workcell = workcell_of(task)
     arguments = config.part("station")
     takes_period = "control_period" in inspect.signature(kind.build).parameters
     if config.control_period is not None and takes_period:
@@ -61,7 +58,7 @@ def make_station(task: Task) -> Station:
     build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
         assert isinstance(disturbances, Disturbances)
-        station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
+        station = disturbed(build, disturbances, kind.is_simulated, kind.name, ask(task, "impedance"))
     else:
         station = build()
     if config.control_period is not None and station.nominal_period != task.control_period:

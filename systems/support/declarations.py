@@ -79,13 +79,19 @@ def get_signal_input_port(self: Any, name: str) -> InputPort:
     return self._signals.port(name)
 
 
-def check_takes(function: Callable[..., Any], names: Iterable[str], what: str) -> None:
-    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` names the function."""
+def check_takes(function: Callable[..., Any], names: Mapping[str, int], what: str) -> None:
+    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` names the function.
+
+    It also raises one if `function` is no function, or `names` are not the keys of a mapping from signal to size.
+    """
+    if not callable(function):
+        raise InputError(f"{what} needs a function of its signals, not {brief(function)}")
+    if not isinstance(names, Mapping):
+        raise InputError(f"{what} needs the sizes of its signals by name, such as {{'pose': 6}}, not {brief(names)}")
     try:
         takes = signature(function)
     except (ValueError, TypeError):
         return  # functions written in C may have no signature
-    names = list(names)
     try:
         takes.bind(**dict.fromkeys(names))
     except TypeError:

@@ -1,6 +1,7 @@
 """Messages about mistakes in the declaration of a task."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -71,8 +72,8 @@ def no_other_test_has_it():
     gymnasium.registry.pop("lab/Own-v0", None)
 
 
-def first_step():
-    env = make_env("lab/Own", guidance="kmp")
+def first_step(**options):
+    env = make_env("lab/Own", guidance="kmp", **options)
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape))
 
@@ -181,6 +182,96 @@ def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
     declare(**attributes)
     with pytest.raises(InputError, match=says):
         first_step()
+
+
+HUGE = [RewardTerm(name, {"pose": 2}, lambda pose: 1e308) for name in "ab"]
+TERM = RewardTerm("a", {"pose": 2}, lambda pose: 0.0)
+
+
+@pytest.mark.parametrize(
+    ("method", "returned", "says"),
+    [
+        ("reference", None, r"reference\(\) of lab/Own must return ReferenceTrajectory, not None"),
+        ("reference", np.zeros((10, 2)), r"reference\(\) of lab/Own must return ReferenceTrajectory, not array"),
+        ("reference", "demos.npz", r"reference\(\) of lab/Own must return ReferenceTrajectory, not 'demos.npz'"),
+        (
+            "constraints",
+            [[1, 0]],
+            r"constraints\(\) of lab/Own must return LinearConstraints or None, not \[\[1, 0\]\]",
+        ),
+        ("motion_constraints", 1, r"motion_constraints\(\) of lab/Own must return MotionConstraints or None, not 1"),
+        ("signals", None, r"signals\(\) of lab/Own must return Mapping, not None"),
+        ("observation_terms", ObservationTerm("pose"), "must return Camera or a list of ObservationTerm, not Obs"),
+        ("observation_terms", ("pose",), r"must return Camera or a list of ObservationTerm, not \('pose',\)"),
+        ("privileged_terms", "pose", r"privileged_terms\(\) of lab/Own must return a list of ObservationTerm, not 'p"),
+        ("reward_terms", [np.zeros], r"reward_terms\(\) of lab/Own must return a list of RewardTerm, not \[<"),
+        ("reward_terms", TERM, r"reward_terms\(\) of lab/Own must return a list of RewardTerm, not RewardTerm\("),
+        (
+            "reward_terms",
+            [replace(TERM, inputs=["pose"])],
+            "reward term 'a' of lab/Own needs the sizes .*, not .'pose'",
+        ),
+        ("reward_terms", [replace(TERM, value=3.0)], "reward term 'a' of lab/Own needs a function .*, not 3.0"),
+        ("reward_terms", [replace(TERM, name=3)], r"a reward of lab/Own needs terms of different names, .*, not \[3\]"),
+        ("reward_terms", HUGE, "the sum of the reward terms of lab/Own is not finite, but inf"),
+        (
+            "termination_terms",
+            None,
+            r"termination_terms\(\) of lab/Own must return a list of TerminationTerm, not None",
+        ),
+        ("workcell", 5, r"workcell\(\) of lab/Own returns 5, which has no robot_radius: .* what station='plane' works"),
+    ],
+)
+def test_method_that_returns_another_type_is_refused(method, returned, says):
+    declare(**{method: lambda self, *arguments: returned})
+    with pytest.raises(InputError, match=says) as error:
+        first_step()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"collision": 3.0}, "collision of lab/Own must be a Threshold, not 3.0"),
+        (
+            {"collision": Threshold("contact_force", np.nan)},
+            "the limit of the collision threshold of lab/Own must be a",
+        ),
+        ({"collision": Threshold("contact_force", "a")}, "the limit of the collision threshold of lab/Own must be a"),
+        (
+            {"collision": Threshold("wrench")},
+            "threshold of lab/Own takes one number as the signal 'wrench', which has 2",
+        ),
+        ({"workcell_kind": "insertion"}, r"workcell\(\) of lab/Own returns PassageGeometry\(.*, which has no X_WT"),
+        (
+            {"reset": lambda self, station: {}},
+            r"^reset\(\) of lab/Own is called with the arguments \(station, guidance, context, rng, options\), but has "
+            r"the parameters \(station\): give it those of Task.reset$",
+        ),
+        (
+            {"reward_terms": lambda self: []},
+            r"reward_terms\(\) of lab/Own is called with the arguments \(num_actions\)",
+        ),
+        (
+            {
+                "reset": lambda self, station, guidance, context, *rest: (
+                    station.set_pose(context, np.full(2, 100.0)) or {}
+                )
+            },
+            r"reset of lab/Own puts the robot at \[100\. 100\.\] m, and at most 10 m are allowed: give poses in meters",
+        ),
+    ],
+)
+def test_wrong_attribute_or_parameters_are_refused(attributes, says):
+    declare(**attributes)
+    with pytest.raises(InputError, match=says):
+        first_step()
+
+
+def test_reward_that_overflows_in_a_step_is_refused():
+    declare(reward_terms=lambda self, num_actions: HUGE[:1])
+    with pytest.raises(InputError, match="the reward of 5 control steps overflows: scale it down"):
+        first_step(action_repeat=5)
 
 
 @pytest.mark.parametrize(
