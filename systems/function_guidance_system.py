@@ -1,11 +1,13 @@
 """Guidance by a function of action, measured pose and measured wrench."""
 
 from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -45,16 +47,19 @@ class FunctionGuidanceSystem(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a size or the period is out of range, or `function` is none; at initialization, if the measured
-            pose is not finite, or the function does not return O numbers.
+        InputError: If a size or the period is out of range, or `function` is no function of three arguments; at
+            initialization, if the measured pose is not finite, or the function does not return O numbers.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
         super().__init__()
-        if min(action_size, pose_size, wrench_size) < 1:
-            raise InputError(f"guidance needs sizes of at least 1, not {action_size}, {pose_size} and {wrench_size}")
-        if not callable(function):
-            raise InputError(f"guidance needs a function of action, pose and wrench, not {brief(function)}")
+        if not all(is_whole(size, 1) for size in (action_size, pose_size, wrench_size)):
+            raise InputError(
+                f"guidance needs whole sizes of at least 1, not {brief(action_size)}, "
+                f"{brief(pose_size)} and {brief(wrench_size)}"
+            )
+        _check_function(function)
+        action_size, pose_size, wrench_size = int(action_size), int(pose_size), int(wrench_size)
         self._function = function
         self._action_port = self.DeclareVectorInputPort("action", action_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
@@ -96,6 +101,23 @@ class FunctionGuidanceSystem(LeafSystem):
             discrete_state.set_value(self._desired_pose, desired)
         discrete_state.set_value(self._held_action, self._action_port.Eval(context))
         discrete_state.set_value(self._fallback, [float(not is_usable)])
+
+
+def _check_function(function: Any) -> None:
+    """Raise an `InputError` if `function` is no function, or does not take three arguments by position."""
+    if not callable(function):
+        raise InputError(f"guidance needs a function of action, pose and wrench, not {brief(function)}")
+    try:
+        takes = signature(function)
+    except (ValueError, TypeError):
+        return  # functions written in C may have no signature
+    try:
+        takes.bind("action", "pose", "wrench")
+    except TypeError:
+        raise InputError(
+            "guidance needs a function of action, pose and wrench, and this one has the parameters "
+            f"({', '.join(takes.parameters)})"
+        ) from None
 
 
 def _numbers(returned: Any, size: int) -> np.ndarray | None:

@@ -93,7 +93,7 @@ class FunctionGuidance(Guidance):
             action_size: A, at least 1.
 
         Raises:
-            InputError: If a size or the period is out of range.
+            InputError: If a size or the period is out of range, or `law` is no function of three arguments.
         """
         super().__init__()
         builder = DiagramBuilder()

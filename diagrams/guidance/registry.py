@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry
 
 if TYPE_CHECKING:
@@ -97,7 +97,17 @@ def register_guidance(
         displaces: See `GuidanceKind`.
         options: Model of further options of the environment.
         ignores_actions: See `GuidanceKind`.
+
+    Raises:
+        InputError: If the name is no word, or `needs` are not tuples of names in `REQUIREMENTS`.
     """
+    GUIDANCE.check_name(name)
+    are_tuples = isinstance(needs, list | tuple) and all(isinstance(each, list | tuple) for each in needs)
+    if not are_tuples or not all(one in REQUIREMENTS for each in needs for one in each):
+        raise InputError(
+            f"needs of guidance {name!r} must be tuples of the names {', '.join(REQUIREMENTS)}, such as "
+            f"(('template',),), not {brief(needs)}"
+        )
 
     def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
         kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options, ignores_actions)
@@ -147,13 +157,19 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
         task: Name of the task, for the message.
 
     Raises:
-        InputError: If there is no such kind, or a requirement is missing.
+        InputError: If there is no such kind, a requirement is missing, or its builder returns no diagram.
     """
+    from pydrake.systems.framework import System
+
     kind = check_guidance(name, [one for one in REQUIREMENTS if prior.has(one)], task)
     if kind.options is not None:
         declared = kind.options.model_fields.items()
         defaults = {name: field.get_default() for name, field in declared if not field.is_required()}
         prior = replace(prior, options=defaults | dict(prior.options))
     guidance = kind.build(prior)
+    if not isinstance(guidance, System):
+        raise InputError(
+            f"the builder of guidance '{name}' must return a diagram, such as FunctionGuidance, not {brief(guidance)}"
+        )
     guidance.set_name("guidance")
     return guidance

@@ -77,8 +77,8 @@ class Registry(Generic[Entry]):
         return value
 
     def check_name(self, name: object) -> None:
-        """Raise an InputError unless `name` is a text that is not empty."""
-        if not (isinstance(name, str) and name):
+        """Raise an InputError unless `name` is a text that is not blank."""
+        if not (isinstance(name, str) and name.strip()):
             raise InputError(f'a {self.noun} is registered by a name, as in @register_...("name"), not {brief(name)}')
 
     def get(self, name: str) -> Entry:

@@ -55,3 +55,38 @@ def test_guidance_that_lacks_a_port_is_named_by_its_kind(monkeypatch):
 
     with pytest.raises(InputError, match=r"guidance 'deaf_of_mine' lacks the port pose, wrench, .*from a PassThrough"):
         make_env("NarrowPassage", guidance="deaf_of_mine")
+
+
+@pytest.mark.parametrize("needs", [("template",), "template", (("demos",),), None, (3,)])
+def test_needs_that_are_no_tuples_of_names_are_refused(needs):
+    with pytest.raises(
+        InputError, match=r"^needs of guidance 'wrong' must be tuples of .*, such as \(\('template',\),\)"
+    ):
+        register_guidance("wrong", needs=needs)
+
+
+def test_blank_name_is_refused():
+    with pytest.raises(InputError, match=r"a guidance is registered by a name, .*, not ' '"):
+        register_guidance(" ")
+
+
+@pytest.mark.parametrize(
+    ("build", "says"),
+    [
+        (lambda known: None, "the builder of guidance 'wrong' must return a diagram, .*, not None"),
+        (lambda known: np.zeros, "the builder of guidance 'wrong' must return a diagram, .*, not <"),
+        (
+            lambda known: FunctionGuidance(known, lambda action, pose: pose, action_size=2),
+            r"a function of action, pose and wrench, and this one has the parameters \(action, pose\)$",
+        ),
+        (
+            lambda known: FunctionGuidance(known, lambda action, pose, wrench: pose, action_size=1.5),
+            "guidance needs whole sizes of at least 1, not 1.5, 2 and 2$",
+        ),
+    ],
+)
+def test_builder_that_returns_no_guidance_is_refused(build, says, monkeypatch):
+    monkeypatch.setitem(GUIDANCE._entries, "wrong", None)
+    register_guidance("wrong")(build)
+    with pytest.raises(InputError, match=says):
+        make_env("NarrowPassage", guidance="wrong")
