@@ -205,5 +205,7 @@ def refuse_existing_run(path: Path) -> None:
         is_taken = path.exists() and (not path.is_dir() or any(not one.name.startswith(".") for one in path.iterdir()))
     except OSError as error:
         raise InputError(f"{brief(path)} is no folder for a run: {error.strerror}") from error
+    if is_taken and path == Path():  # also the empty path
+        raise InputError("a run needs a folder of its own, and the current folder is not empty: name one, such as RUN")
     if is_taken:
         raise InputError(f"{path} already exists: name another folder, or resume that run with --resume")

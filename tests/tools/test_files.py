@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,15 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.files import LOCK, atomic_folder, check_page, check_picture, check_writable, remove_partial_files
+from guiderail.tools.files import (
+    LOCK,
+    atomic_folder,
+    check_page,
+    check_picture,
+    check_writable,
+    refuse_existing_run,
+    remove_partial_files,
+)
 from guiderail.tools.learning.run_folder import RunFolder
 
 
@@ -22,6 +31,17 @@ def test_check_refuses_a_path_below_a_file(tmp_path):
             check_picture(tmp_path / name)
     check_writable(tmp_path / "new" / "folder" / "x.png")
     assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("path", ["", "."])
+def test_current_folder_with_files_is_no_folder_for_a_run(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    refuse_existing_run(Path(path))
+    (tmp_path / "file").touch()
+    with pytest.raises(
+        InputError, match=r"^a run needs a folder of its own, and the current folder is not empty: name"
+    ):
+        refuse_existing_run(Path(path))
 
 
 def test_check_refuses_a_name_that_is_too_long(tmp_path):

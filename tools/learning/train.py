@@ -25,7 +25,14 @@ from guiderail.tools.evaluation.policies import is_policy_file
 from guiderail.tools.evaluation.rollout import EpisodeProgress, check_seed
 from guiderail.tools.evaluation.subject import counts_collisions
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
+from guiderail.tools.learning.config import (
+    OffPolicyConfig,
+    check_episodes,
+    config_values,
+    default_preset,
+    make_config,
+    resolve_preset,
+)
 from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
@@ -219,6 +226,14 @@ def start_or_resume(
         folder.refuse_existing()
         given["settings"] = settings
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
+    shown = config.learner.demonstration_episodes
+    if isinstance(config.learner, OffPolicyConfig) and shown >= config.episodes:
+        _LOGGER.warning(
+            "the scripted policy acts in every episode and the learned one in none, because demonstration_episodes is "
+            "%d: give more than %d episodes",
+            shown,
+            shown,
+        )
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
     demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None

@@ -3,6 +3,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.train import train
 
 
 @pytest.mark.parametrize(
@@ -36,3 +37,12 @@ def test_config_accepts_large_networks():
 
 def test_learners_are_listed_without_importing_their_modules():
     assert {*LEARNERS._declarations} == {"bc", "chunk", "crossq", "distillation", "ppo", "sac", "td3", "tqc", "trpo"}
+
+
+@pytest.mark.parametrize(("demonstrated", "warns"), [(0, False), (1, True), (99, True)])
+def test_warning_appears_when_only_the_scripted_policy_acts(demonstrated, warns, tmp_path, caplog):
+    settings = {"demonstration_episodes": demonstrated, "net_arch": (8,), "gradient_steps": 1}
+    options = {"settings": settings, "pictures": False, "difficulty": "hard"}
+    train("NarrowPassage", out=tmp_path / "run", episodes=1, **options)
+    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert any("in none, because demonstration_episodes is" in one for one in warnings) is warns
