@@ -80,7 +80,7 @@ class SctStateMachine(LeafSystem):
         return state, pose_to_transform(self._pose_port.Eval(context)), self.frames.eval(context)
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
-        X_WE = pose_to_transform(declare.start_pose(self._initial_pose_port, context))
+        X_WE = pose_to_transform(declare.start_pose(self._initial_pose_port.Eval(context)))
         discrete_state.set_value(self._state, [float(self._template.state_at(X_WE, self.frames.eval(context)))])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
