@@ -7,18 +7,15 @@ as the configuration of a run; a module or file that this process has not import
 
 import hashlib
 import sys
-import traceback
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import partial
 from importlib import import_module
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
-from typing import Any
 
 from guiderail.diagrams.tasks.registry import is_task_folder, register_task_folder
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, naming_failures
 
 _IMPORTED_FILES: dict[Path, bytes] = {}  # content of each file when it was imported
 _TRUSTED = ContextVar("trusted", default=False)  # True if imports that a file names may be executed
@@ -68,7 +65,8 @@ def import_modules(
         elif path.suffix == ".py" and path.is_file():
             names.append(_import_file(path))
         elif _is_module(module):
-            names.append(_import_or_refuse(module, partial(import_module, module)).__name__)
+            with naming_failures(f"importing {module}"):
+                names.append(import_module(module).__name__)
         else:
             kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
             shown = module if module.isprintable() else brief(module)
@@ -157,21 +155,9 @@ def _import_file(path: Path) -> str:
     folder = str(path.parent)
     sys.path.insert(0, folder)
     try:
-        _import_or_refuse(path.name, partial(spec.loader.exec_module, module))
+        with naming_failures(f"importing {path.name}"):
+            spec.loader.exec_module(module)
     finally:
         sys.path.remove(folder)
     _IMPORTED_FILES[path] = content
     return str(path)
-
-
-def _import_or_refuse(name: str, load: Callable[[], Any]) -> Any:
-    """Return the imported module; raise an InputError with the line if the module raises an error."""
-    try:
-        return load()
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
-        words = " ".join(str(error).split())
-        raise InputError(f"importing {name} failed: {where}{type(error).__name__}: {words}") from error

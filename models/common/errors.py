@@ -1,8 +1,12 @@
 """Exceptions with messages for users, and errors of missing dependencies that name the extra to install."""
 
 import reprlib
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 
@@ -35,6 +39,23 @@ _SHORT.maxlevel = 3
 def brief(value: Any) -> str:
     """Return the repr of a value on one line, shortened for a message."""
     return " ".join(_SHORT.repr(value).split())
+
+
+@contextmanager
+def naming_failures(action: str) -> Iterator[None]:
+    """Turn any error of a user's code into an `InputError`: the action that failed, the file, the line and the error.
+
+    An `InputError` is raised unchanged.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
+        words = " ".join(str(error).split())
+        raise InputError(f"{action} failed: {where}{type(error).__name__}: {words}") from error
 
 
 _SOFTWARE: dict[str, dict[str, str]] = {

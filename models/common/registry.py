@@ -10,9 +10,10 @@ from functools import cached_property, partial
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, naming_failures
 
 Entry = TypeVar("Entry")
 
@@ -47,6 +48,7 @@ class Registry(Generic[Entry]):
         self._decorator, self._group, self._check = decorator, entry_points, check
         self._entries: dict[str, Entry] = {}
         self._origins: dict[str, tuple[str, str]] = {}
+        self._loaded: set[str] = set()  # names whose entry points were loaded
 
     @overload
     def register(self, name: str, value: None = None) -> Callable[[Entry], Entry]: ...
@@ -85,23 +87,62 @@ class Registry(Generic[Entry]):
         """Return the entry of a name.
 
         Raises:
-            InputError: If there is no such entry, or the name is not a string.
+            InputError: If there is no such entry, the name is not a string, or an entry point of that name cannot be
+                loaded or is not the only entry of that name.
         """
         if not isinstance(name, str):
             raise InputError(f"a {self.noun} is named by a word, not {brief(name)}: {did_you_mean('', self.names())}")
         if name not in self._entries and name in self._declarations:
             import_module(self._declarations[name].module)
-        if name not in self._entries and name in self._points:
-            value = self._points[name].load()
-            if name not in self._entries:  # importing the module may have registered it
-                self.register(name, value)
+        if name in self._points and name not in self._loaded:
+            for point in self._points[name]:
+                self._load(point)
+            self._loaded.add(name)
         if name not in self._entries:
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
+    def _load(self, point: metadata.EntryPoint) -> None:
+        """Load an entry point; raise an InputError if that fails, or if another object is registered by its name."""
+        name = point.name
+        package = f"the installed package {point.dist.name if point.dist else '?'}"
+        try:
+            with naming_failures(f"importing {point.value}"):
+                value = point.load()
+            if name not in self._entries:  # importing the module may have registered it
+                self.register(name, value)
+            entry, place = self._entries[name], self._origins[name][0]
+            is_same = value is entry or value is getattr(entry, "build", None) or isinstance(value, ModuleType)
+            if not is_same and _origin(value) != self._origins[name]:
+                raise InputError(f"there is another {self.noun} {name!r}, from {place}: rename one, or uninstall it")
+        except InputError as error:
+            raise InputError(f"the {self.noun} {name!r} of {package} cannot be used: {error}") from error
+
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""
         return sorted({*self._declarations, *self._points, *self._entries})
+
+    @cached_property
+    def broken(self) -> dict[str, str]:
+        """Message of `get` by name, for each entry point that cannot be used; all entry points are loaded."""
+        messages = {}
+        for name in self._points:
+            try:
+                self.get(name)
+            except InputError as error:
+                messages[name] = str(error)
+        return messages
+
+    def usable(self) -> list[str]:
+        """Return the names of all entries but the `broken` ones, sorted."""
+        return [name for name in self.names() if name not in self.broken]
+
+    def name_of(self, value: object) -> str | None:
+        """Return the name of an object that is registered, or that an entry point declares; None if there is none."""
+        declared = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
+        points = (point for points in self._points.values() for point in points)
+        names = (name for name, entry in self._entries.items() if entry is value)
+        return next(names, next((point.name for point in points if point.value == declared), None))
 
     def is_packaged(self, name: str) -> bool:
         """Return True if a module of the package registers the name."""
@@ -144,8 +185,12 @@ class Registry(Generic[Entry]):
         }
 
     @cached_property
-    def _points(self) -> dict[str, metadata.EntryPoint]:
-        return {point.name: point for point in metadata.entry_points(group=self._group)} if self._group else {}
+    def _points(self) -> dict[str, list[metadata.EntryPoint]]:
+        """Entry points by name; those of one name and value are one."""
+        points: dict[str, dict[str, metadata.EntryPoint]] = {}
+        for point in metadata.entry_points(group=self._group) if self._group else ():
+            points.setdefault(point.name, {}).setdefault(point.value, point)
+        return {name: list(by_value.values()) for name, by_value in points.items()}
 
 
 class _Declaration(NamedTuple):
@@ -160,6 +205,21 @@ class _ImportedName(NamedTuple):
 
     module: str
     name: str
+
+
+def check_callable(name: str, value: object) -> None:
+    """Raise an InputError unless a value is a function or a class; for the `check` of a registry."""
+    if not callable(value):
+        raise InputError(f"{brief(name)} is registered with a function or a class, not with {brief(value)}")
+
+
+def check_class(name: str, value: object, kind: type) -> None:
+    """Raise an InputError unless a value is a subclass of `kind` without abstract methods; as `check_callable`."""
+    if not (isinstance(value, type) and issubclass(value, kind)):
+        raise InputError(f"{brief(name)} is registered with a class made of {kind.__name__}, not with {brief(value)}")
+    missing = sorted(getattr(value, "__abstractmethods__", ()))
+    if missing:
+        raise InputError(f"the class {value.__name__} lacks {', '.join(missing)}: see `{kind.__name__}`")
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:

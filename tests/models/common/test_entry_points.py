@@ -1,0 +1,98 @@
+"""Entry points of installed packages: a broken one is refused where it is used, and left out elsewhere."""
+
+import sys
+
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.registry import Registry, check_callable
+
+
+@pytest.fixture
+def install(tmp_path, monkeypatch):
+    """Return a function that installs a package of one module with entry points of the group "shapes"."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+    def install(package, source, **points):
+        if source is not None:
+            (tmp_path / f"{package}.py").write_text(source)
+        information = tmp_path / f"{package}-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+        lines = [f"{name} = {package}:{value}" for name, value in points.items()]
+        (information / "entry_points.txt").write_text("\n".join(["[shapes]", *lines, ""]))
+
+    before = set(sys.modules)
+    yield install
+    for module in set(sys.modules) - before:
+        del sys.modules[module]
+
+
+def shapes(**arguments):
+    return Registry("shape", entry_points="shapes", check=check_callable, **arguments)
+
+
+@pytest.mark.parametrize(
+    ("source", "sentence"),
+    [
+        ("def broken(:\n", "importing lab_broken:Cone failed: SyntaxError"),
+        ("raise RuntimeError('no licence')\n", r"failed: lab_broken\.py, line 1: RuntimeError: no licence"),
+        ("raise SystemExit(3)\n", "SystemExit: 3"),
+        ("import nowhere\n", "ModuleNotFoundError: No module named 'nowhere'"),
+        ("\n", "has no attribute 'Cone'"),
+        ("Cone = 3\n", "'cone' is registered with a function or a class, not with 3"),
+        (None, "No module named 'lab_broken'"),
+    ],
+)
+def test_broken_entry_point_is_refused_only_where_it_is_used(install, source, sentence):
+    install("lab_broken", source, cone="Cone")
+    install("lab_sound", "def Cube():\n    pass\n", cube="Cube")
+    registry = shapes()
+    registry.register("sphere", install)
+    assert registry.get("sphere") is install
+    assert registry.get("cube").__module__ == "lab_sound"
+    for _ in range(2):
+        with pytest.raises(InputError, match=f"the shape 'cone' of the installed package lab_broken .*{sentence}"):
+            registry.get("cone")
+    assert registry.names() == ["cone", "cube", "sphere"]
+    assert registry.usable() == ["cube", "sphere"]
+    assert list(registry.broken) == ["cone"]
+
+
+def test_two_packages_with_one_name_are_refused(install):
+    install("lab_one", "def Cone():\n    pass\n", cone="Cone")
+    install("lab_two", "def Cone():\n    pass\n", cone="Cone")
+    registry = shapes()
+    with pytest.raises(InputError, match=r"the shape 'cone' of the installed package .* there is another shape 'cone'"):
+        registry.get("cone")
+    assert registry.usable() == []
+
+
+def test_entry_point_with_the_name_of_another_entry_is_refused(install):
+    install("lab_one", "def Cone():\n    pass\n", cone="Cone")
+    registry = shapes()
+    registry.register("cone", test_two_packages_with_one_name_are_refused)
+    with pytest.raises(InputError, match=r"lab_one cannot be used: there is another shape 'cone', from \S+\.py"):
+        registry.get("cone")
+
+
+def test_module_of_an_entry_point_may_register_its_object_itself(install):
+    source = "import lab_shapes\n\n\n@lab_shapes.REGISTRY.register('cone')\ndef Cone():\n    pass\n"
+    install("lab_one", source, cone="Cone")
+    registry = shapes()
+    sys.modules["lab_shapes"] = type(sys)("lab_shapes")
+    sys.modules["lab_shapes"].REGISTRY = registry
+    cone = registry.get("cone")
+    assert registry.get("cone") is cone
+    assert registry.broken == {}
+
+
+def test_name_of_an_object_is_found_without_loading_it(install):
+    install("lab_one", "class Cone:\n    pass\n", cone="Cone")
+    registry = shapes()
+    assert registry.name_of(Registry) is None
+    import lab_one
+
+    assert registry.name_of(lab_one.Cone) == "cone"
+    registry.register("registry", Registry)
+    assert registry.name_of(Registry) == "registry"
