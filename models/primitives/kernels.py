@@ -9,8 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from guiderail.models.common.arrays import as_number
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry, did_you_mean
+from guiderail.models.common.errors import InputError, brief, naming_failures
+from guiderail.models.common.registry import Registry, check_callable, did_you_mean
 
 
 class Kernel(Protocol):
@@ -24,7 +24,7 @@ class Kernel(Protocol):
         ...
 
 
-KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", entry_points="guiderail.kernels")
+KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", entry_points="guiderail.kernels", check=check_callable)
 """Registry of kernels; their names are the values of an environment's option `kernel`.
 
 An entry is called with `length_scale=` and its own further parameters, all of them numbers, and returns a kernel.
@@ -33,6 +33,9 @@ register_kernel = KERNELS.register
 DEFAULT_KERNEL = "squared_exponential"
 DEFAULT_LENGTH_SCALE = 0.5
 _SMALLEST, _LARGEST = 1e-100, 1e100  # bounds of a length scale: far beyond them, kernels overflow or are NaN
+_CHECKED = 48  # number of inputs at which `check_kernel` evaluates a kernel
+_SHIFTS = (0.37, -0.83, 2.9)  # shifts of the inputs of a stationary kernel in `check_kernel`, in their range
+_ROUNDING = 1e-9  # largest rounding error of a kernel in double precision, relative to its largest value
 
 
 def make_kernel(
@@ -72,12 +75,73 @@ def make_kernel(
 
 @lru_cache(maxsize=100)
 def _build(factory: Callable[..., Kernel], length_scale: float, parameters: tuple[tuple[str, Any], ...]) -> Kernel:
-    return factory(length_scale=length_scale, **dict(parameters))
+    with naming_failures(f"constructing the kernel {getattr(factory, '__name__', brief(factory))}"):
+        return factory(length_scale=length_scale, **dict(parameters))
 
 
 def kernel_name(kernel: Kernel) -> str | None:
     """Return the name that the class of `kernel` is registered by, or None."""
-    return next((name for name in KERNELS.names() if KERNELS.get(name) is type(kernel)), None)
+    return KERNELS.name_of(type(kernel))
+
+
+def check_kernel(kernel: Any, inputs: np.ndarray) -> None:
+    """Check that a kernel is positive definite on a subset of `inputs` (n,) or (n, I), and stationary as declared.
+
+    The subset is at most 48 inputs: the first ones, and others at equal distances.
+
+    Raises:
+        InputError: If `kernel` is no kernel; if a matrix that it returns has the wrong shape or type, is not finite,
+            not symmetric or not positive definite; or if it is declared stationary and is not.
+    """
+    if isinstance(kernel, type) or not callable(kernel):
+        raise InputError(f"a kernel is an object such as SquaredExponential(0.5), not {brief(kernel)}")
+    name = f"the kernel {kernel_name(kernel) or type(kernel).__name__}"
+    if not isinstance(getattr(kernel, "stationary", None), bool | np.bool_):
+        raise InputError(f"{name} has no attribute stationary, True or False: add it to the class")
+    n = len(inputs)
+    first = np.arange(min(n, _CHECKED // 3))
+    steps = np.unique(np.r_[first, np.linspace(0, n - 1, min(n, _CHECKED - len(first))).astype(int)])
+    x = inputs[steps].astype(np.longdouble)
+    K = _checked_matrix(kernel, name, x, x)
+    rounding = max(_ROUNDING, 10 * len(x) * np.finfo(K.dtype).eps)
+    K = K.astype(float)
+    largest = np.abs(K).max()
+    if not np.allclose(K, K.T, rtol=0.0, atol=rounding * largest):
+        raise InputError(f"{name} is not symmetric: k(a, b) must be k(b, a) at all inputs")
+    if not (K.diagonal() > 0.0).all():
+        at, value = x[np.argmin(K.diagonal())], K.diagonal().min()
+        raise InputError(f"{name} is not positive definite: k(a, a) must be positive, and is {value:g} at a = {at}")
+    eigenvalues = np.linalg.eigvalsh(K)
+    if not eigenvalues[0] >= -rounding * eigenvalues[-1]:
+        raise InputError(
+            f"{name} is not positive definite: the smallest eigenvalue of its matrix at {len(x)} inputs is "
+            f"{eigenvalues[0]:.3g}, and the largest one {eigenvalues[-1]:.3g}"
+        )
+    part = _checked_matrix(kernel, name, x[:2], x).astype(float)
+    if not np.allclose(part, K[:2], rtol=0.0, atol=rounding * largest):
+        raise InputError(f"{name} has other values for a part of the inputs: k(a, b) must depend on a and b only")
+    if kernel.stationary:
+        extent = np.where(np.ptp(x, axis=0) > 0.0, np.ptp(x, axis=0), 1.0)
+        for shift in _SHIFTS:
+            moved = x + shift * extent
+            if not np.allclose(_checked_matrix(kernel, name, moved, moved), K, rtol=0.0, atol=rounding * largest):
+                raise InputError(
+                    f"{name} declares stationary = True, but its values change when all inputs are shifted: declare "
+                    "stationary = False"
+                )
+
+
+def _checked_matrix(kernel: Kernel, name: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the kernel between inputs; raise an InputError unless it is a matrix of finite real numbers."""
+    with naming_failures(f"evaluating {name}"):
+        K: Any = kernel(a, b)
+    shape = (len(a), len(b))
+    if not (isinstance(K, np.ndarray) and K.shape == shape and K.dtype.kind == "f"):
+        got = f"an array of {K.dtype} of shape {K.shape}" if isinstance(K, np.ndarray) else type(K).__name__
+        raise InputError(f"{name} must return an array of real numbers of shape {shape}, not {got}")
+    if not np.isfinite(K).all():
+        raise InputError(f"{name} returns values that are not finite")
+    return K
 
 
 @dataclass(frozen=True)

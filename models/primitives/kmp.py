@@ -8,7 +8,7 @@ from scipy.linalg import solve_triangular
 from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.features import KernelBasis
-from guiderail.models.primitives.kernels import Kernel, SquaredExponential
+from guiderail.models.primitives.kernels import Kernel, SquaredExponential, check_kernel
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class Kmp:
         covariance_lambda: λ_c, positive; λ by default.
 
     Raises:
-        InputError: If λ or λ_c is out of range, shapes do not match, a number is not finite, or a covariance is not
-            symmetric or not positive definite.
+        InputError: If λ or λ_c is out of range, shapes do not match, a number is not finite, a covariance is not
+            symmetric or not positive definite, or `check_kernel` refuses the kernel.
     """
 
     def __init__(
@@ -72,7 +72,9 @@ class Kmp:
         self._via: dict[int, _Point] = {}
         self._next_identifier = 0
         self._lambda, self._covariance_lambda = lambda_, covariance_lambda if covariance_lambda is not None else lambda_
-        self._basis = KernelBasis(kernel if kernel is not None else SquaredExponential(), inputs)
+        kernel = kernel if kernel is not None else SquaredExponential()
+        check_kernel(kernel, inputs)
+        self._basis = KernelBasis(kernel, inputs)
         self._factor_reference()
 
     def mean(self, inputs: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from guiderail.models.common.arrays import as_number, as_numbers, as_whole, find_asymmetric
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
-from guiderail.models.primitives.kernels import Kernel
+from guiderail.models.primitives.kernels import Kernel, check_kernel
 from guiderail.models.primitives.promp import ProMp
 
 # Importing scikit-learn takes over a second, and reading a file does not need it.
@@ -340,7 +340,8 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
         kernel: Covariance of the process.
 
     Raises:
-        InputError: If `points` are not rows of a step and O finite numbers, or there is no such step.
+        InputError: If `points` are not rows of a step and O finite numbers, there is no such step, or `check_kernel`
+            refuses the kernel.
     """
     size = 1 + reference.num_outputs
     if len(points) % size or not np.isfinite(points).all():
@@ -353,6 +354,7 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
         raise InputError(f"a via-point's step is a whole number from 0 to {reference.num_steps - 1}")
     at = steps.astype(int)
     times = reference.times
+    check_kernel(kernel, times)
     K = kernel(times[at], times[at]) + VIA_POINT_VARIANCE * np.eye(len(at))
     displacement = kernel(times, times[at]) @ np.linalg.solve(K, rows[:, 1:] - reference.means[at])
     return ReferenceTrajectory(times, reference.means + displacement, reference.covariances)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Matern52, SquaredExponential
-from guiderail.models.primitives.kernels import make_kernel
+from guiderail.models.primitives import Kmp, LcNsKmp, Matern52, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives.kernels import check_kernel, make_kernel
 
 A, B = np.array([[0.0, 0.0], [0.3, -0.4]]), np.array([[0.0, 0.5], [1.0, 2.0], [0.3, -0.4]])
 DISTANCE = np.array([[np.linalg.norm(a - b) for b in B] for a in A])
@@ -32,3 +32,71 @@ def test_length_scale_is_one_number(scale):
     for make in (Matern52, lambda scale: make_kernel(length_scale=scale)):
         with pytest.raises(InputError, match="the kernel's length_scale must be a number, not"):
             make(scale)
+
+
+def function_kernel(law, stationary=True):
+    """Return a kernel of one input from a function of two arrays that broadcast."""
+
+    class Mine:
+        def __call__(self, a, b):
+            return law(*np.broadcast_arrays(np.reshape(a, (-1, 1)), np.reshape(b, (1, -1))))
+
+    Mine.stationary = stationary
+    return Mine()
+
+
+def decay(a, b):
+    return np.exp(-((a - b) ** 2))
+
+
+NO_KERNELS = [
+    (lambda a, b: np.cos(5 * (a - b)) - 0.5, "is not positive definite: the smallest eigenvalue of its matrix"),
+    (lambda a, b: abs(a - b), r"is not positive definite: k\(a, a\) must be positive, and is 0"),
+    (lambda a, b: -decay(a, b), r"is not positive definite: k\(a, a\) must be positive, and is -1"),
+    (lambda a, b: 0 * a, r"is not positive definite: k\(a, a\) must be positive, and is 0"),
+    (lambda a, b: decay(a, b) * (1 + a - b), "is not symmetric"),
+    (lambda a, b: decay(a, b) * (1 + a) * (1 + b), "declares stationary = True, but its values change"),
+    (lambda a, b: decay(a, b) * np.nan, "returns values that are not finite"),
+    (lambda a, b: decay(a, b) * (1 + 0j), "array of real numbers .* not an array of complex"),
+    (lambda a, b: (a == b).astype(int), "array of real numbers .* not an array of int"),
+    (lambda a, b: np.zeros(3), r"must return an array of real numbers of shape .* not an array of .* \(3,\)"),
+    (lambda a, b: decay(a, b).tolist(), "must return an array of real numbers .* not list"),
+    (lambda a, b: None, "must return an array of real numbers .* not NoneType"),
+    (lambda a, b: {}["scale"], r"failed: test_kernels\.py, line \d+: KeyError: 'scale'"),
+    (lambda a, b: decay(a, b) / len(a), "has other values for a part of the inputs"),
+]
+
+
+@pytest.mark.parametrize(("law", "sentence"), NO_KERNELS)
+@pytest.mark.parametrize("history", [0, 3])
+def test_primitive_refuses_a_function_that_is_no_kernel(law, sentence, history):
+    means, covariances = np.zeros((60, 1)), 0.1 * np.ones((60, 1, 1))
+    reference = ReferenceTrajectory(np.linspace(0.0, 2.0, 60), means, covariances)
+    with pytest.raises(InputError, match=f"the kernel Mine .*{sentence}"):
+        LcNsKmp(reference, function_kernel(law), history=history)
+    with pytest.raises(InputError, match=f"the kernel Mine .*{sentence}"):
+        Kmp(reference.times, means, covariances, function_kernel(law))
+
+
+def test_kernel_names_its_stationarity_when_it_is_a_kernel():
+    check_kernel(function_kernel(lambda a, b: decay(a, b) * (1 + a) * (1 + b), stationary=False), np.linspace(0, 2, 60))
+    for kernel in (function_kernel(decay, stationary=None), decay):
+        with pytest.raises(InputError, match="has no attribute stationary, True or False"):
+            check_kernel(kernel, np.linspace(0, 2, 60))
+    for kernel in (SquaredExponential, 3):
+        with pytest.raises(InputError, match="a kernel is an object such as"):
+            check_kernel(kernel, np.linspace(0, 2, 60))
+
+
+@pytest.mark.parametrize("kernel", [SquaredExponential, Matern52])
+@pytest.mark.parametrize("scale", [1e-100, 1e-6, 0.01, 1.0, 1e3, 1e8, 1e100])
+def test_check_accepts_the_kernels_of_the_package(kernel, scale):
+    states = np.random.default_rng(0).normal(size=(50, 3))
+    for inputs in (
+        np.linspace(0, 2, 200),
+        1e6 + np.linspace(0, 2, 200),
+        np.linspace(0, 1e4, 2000),
+        np.zeros(1),
+        states,
+    ):
+        check_kernel(kernel(scale), inputs)
