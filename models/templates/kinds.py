@@ -10,6 +10,7 @@ unit contains the unit. A kind is registered under the name that the file uses:
 
 import math
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from numbers import Real
 from typing import Any, TypeVar
 
@@ -26,12 +27,19 @@ def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
     """Return a decorator that makes a dataclass available to template files as a `kind` of a registry.
 
     Raises:
-        ValueError: If the name is taken.
+        InputError: When the decorator is applied, if another kind has that name, the name is no word, or the decorated
+            object is not a dataclass or lacks a method.
     """
 
     def add(kind: Kind) -> Kind:
-        if name in registry:
-            raise ValueError(f"{name} is already registered, by {registry[name].__name__}")
+        require(isinstance(name, str) and name, f"a kind is registered by a name, not {brief(name)}")
+        is_class = isinstance(kind, type) and is_dataclass(kind)
+        require(is_class, f"the kind {name!r} must be a dataclass, not {brief(kind)}: add @dataclass(frozen=True)")
+        missing = ", ".join(sorted(getattr(kind, "__abstractmethods__", ())))
+        require(not missing, f"the kind {name!r} lacks {missing}: implement what its base class declares")
+        other = registry.get(name, kind)
+        is_same = (other.__module__, other.__qualname__) == (kind.__module__, kind.__qualname__)
+        require(is_same, f"there is a kind {name!r} already, {other.__name__}: choose another name")
         registry[name] = kind
         return kind
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
+from numbers import Real
 
 import numpy as np
 
@@ -299,7 +300,7 @@ class SharedControlTemplate:
         from X_WE into its constraints.
         """
         for source, sign, target, threshold in self._exits[state]:
-            distance = self.states[source].transition_distance.value(X_WE, frames)
+            distance = self.distance(source, X_WE, frames)
             if sign * distance < sign * threshold:
                 is_waiting = period_s is not None and not self.can_enter(target, X_WE, frames, period_s)
                 return state if is_waiting else target
@@ -316,8 +317,16 @@ class SharedControlTemplate:
         return state
 
     def distance(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the transition distance d_t of a state, [m] or [rad]."""
-        return self.states[state].transition_distance.value(X_WE, frames)
+        """Return the transition distance d_t of a state, [m] or [rad].
+
+        Raises:
+            InputError: If it is not a number.
+        """
+        distance = self.states[state].transition_distance
+        value = distance.value(X_WE, frames)
+        if not isinstance(value, Real):
+            raise InputError(f"the transition distance {type(distance).__name__} must be a number, not {brief(value)}")
+        return float(value)
 
     @cached_property
     def _initial_progress(self) -> tuple[float, ...]:

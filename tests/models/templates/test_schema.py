@@ -1,6 +1,6 @@
 """Template files: what is read, and the sentence in which a faulty file is refused."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,8 @@ from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.drawing import state_lines
-from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register
+from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, TRANSITION_DISTANCES, register
+from guiderail.models.templates.transitions import TransitionDistance
 
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
 
@@ -73,10 +74,46 @@ def test_register_adds_a_kind_with_one_decorator():
         template = parse_template(edit_template(use))
         X_WP = template.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
         np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
-        with pytest.raises(ValueError, match="already registered"):
-            register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)
+        register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)  # the same class, as when its file is imported again
+        with pytest.raises(InputError, match="there is a kind 'at_origin' already, AtOrigin: choose another name"):
+            register(ACTIVE_CONSTRAINTS, "at_origin")(next(iter(TRANSITION_DISTANCES.values())))
     finally:
         del ACTIVE_CONSTRAINTS["at_origin"]
+
+
+@dataclass(frozen=True)
+class Abstract(TransitionDistance):
+    frame: str
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "sentence"),
+    [
+        ("mine", type("NoDataclass", (), {}), "the kind 'mine' must be a dataclass"),
+        ("mine", 3, "the kind 'mine' must be a dataclass, not 3"),
+        ("mine", Abstract, "the kind 'mine' lacks value"),
+        (3, Abstract, "a kind is registered by a name, not 3"),
+    ],
+)
+def test_register_refuses_what_is_no_kind(name, kind, sentence):
+    with pytest.raises(InputError, match=sentence):
+        register(TRANSITION_DISTANCES, name)(kind)
+    assert name not in TRANSITION_DISTANCES
+
+
+def test_template_refuses_a_distance_that_is_no_number():
+    @dataclass(frozen=True)
+    class Text(TransitionDistance):
+        frame: str
+
+        def value(self, X_WE, frames):
+            return "near"
+
+    template = parse_template(edit_template(lambda data: None))
+    states = tuple(replace(state, transition_distance=Text("cup")) for state in template.states)
+    template = replace(template, states=states)
+    with pytest.raises(InputError, match="the transition distance Text must be a number, not 'near'"):
+        template.next_state(0, RigidTransform(), {"cup": RigidTransform()})
 
 
 def set_in(*path, value):
