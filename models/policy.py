@@ -22,7 +22,7 @@ from safetensors.numpy import load, save
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import digest, read_bytes
-from guiderail.models.common.registry import Registry, did_you_mean
+from guiderail.models.common.registry import Registry, check_callable, did_you_mean
 
 FORMAT = "guiderail policy 2"
 MAX_WEIGHTS_SIZE = 200_000_000  # [bytes]; a policy of 256 × 256 units has 0.3 million
@@ -213,7 +213,9 @@ def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) ->
 
 BasePolicy = Callable[[np.ndarray], Any]
 
-BASE_POLICIES: Registry[BasePolicy] = Registry("base policy", entry_points="guiderail.base_policies")
+BASE_POLICIES: Registry[BasePolicy] = Registry(
+    "base policy", entry_points="guiderail.base_policies", check=check_callable
+)
 register_base_policy = BASE_POLICIES.register
 
 

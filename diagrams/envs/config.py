@@ -156,7 +156,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     name = task.name
     stations = task.stations()
     if not stations:
-        kinds = {STATIONS.get(station).workcell_kind for station in STATIONS.names()}
+        kinds = {STATIONS.get(station).workcell_kind for station in STATIONS.usable()}
         raise InputError(
             f"no station works on a workcell of the kind {brief(task.workcell_kind)}, which {name} has: "
             f"{did_you_mean(task.workcell_kind, kinds)}"
@@ -175,6 +175,8 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     }
     if "guidance" not in merged:
         merged["guidance"] = default_guidance(guidance)
+    if merged["station"] in [*STATIONS.broken]:
+        STATIONS.get(merged["station"])  # raises an InputError
     check_choice("station", merged["station"], stations, name)
     check_choice("reward", merged["reward"], list(task.rewards), name)
     check_choice("observation", merged["observation"], list(task.observations), name)

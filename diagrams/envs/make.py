@@ -6,9 +6,9 @@ import hashlib
 import inspect
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, update_wrapper
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +31,11 @@ from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.diagrams.stations.disturbances import disturbed
 from guiderail.diagrams.stations.options import Disturbances
+from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives.kernels import KERNELS
 
@@ -55,7 +56,7 @@ def make_station(task: Task) -> Station:
     takes_period = "control_period" in inspect.signature(kind.build).parameters
     if config.control_period is not None and takes_period:
         arguments["control_period"] = task.control_period
-    build, disturbances = partial(kind.build, workcell, **arguments), config.parts["disturbances"]
+    build, disturbances = _checked_builder(kind, workcell, arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
         assert isinstance(disturbances, Disturbances)
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, ask(task, "impedance"))
@@ -73,6 +74,19 @@ def make_station(task: Task) -> Station:
             "give the station's builder that parameter"
         )
     return station
+
+
+def _checked_builder(kind: StationKind, workcell: Any, arguments: Mapping[str, Any]) -> Callable[..., Station]:
+    """Return a builder with its arguments bound, which raises an InputError unless it builds a `Station`."""
+    build = partial(kind.build, workcell, **arguments)
+
+    def checked(**more: Any) -> Station:
+        station = build(**more)
+        if not isinstance(station, Station):
+            raise InputError(f"station={kind.name!r} must build a Station, not {brief(station)}")
+        return station
+
+    return update_wrapper(checked, build)
 
 
 def make_guidance(task: Task, station: Station) -> Diagram:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.registry import Registry, check_callable
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import Diagram
@@ -65,11 +65,23 @@ def _missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collecti
     return min(missing, key=len, default=())
 
 
+def _check(name: str, kind: object) -> None:
+    """Raise an InputError unless an entry is a `GuidanceKind` with a builder and an options class."""
+    if not isinstance(kind, GuidanceKind):
+        raise InputError(f"the guidance {name!r} is registered by @register_guidance, not as {brief(kind)}")
+    check_callable(name, kind.build)
+    if kind.options is not None:
+        from guiderail.diagrams.envs.options import Options, check_options_class
+
+        check_options_class(name, "options", kind.options, Options)
+
+
 GUIDANCE: Registry[GuidanceKind] = Registry(
     "guidance",
     package="guiderail.diagrams.guidance",
     decorator="register_guidance",
     entry_points="guiderail.guidance",
+    check=_check,
 )
 
 
@@ -86,7 +98,8 @@ def register_guidance(
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
     """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
 
-    The decorator raises an `InputError` if another kind of guidance has this name.
+    The decorator raises an `InputError` if another kind of guidance has this name, or an argument or the decorated
+    object has the wrong type.
 
     Args:
         name: Value of the option `guidance`.
@@ -124,7 +137,7 @@ def is_demonstrated(guidance: str | None) -> bool:
 
 def possible_guidance(provided: Collection[str]) -> list[str]:
     """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
-    return [name for name in GUIDANCE.names() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
+    return [name for name in GUIDANCE.usable() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
 
 
 def default_guidance(possible: Collection[str]) -> str:

@@ -14,7 +14,7 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.registry import Registry, check_class
 from guiderail.models.control.joint_status import Fault, Heartbeat, JointStatus, StatusLimits
 from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.models.robots.mounting import add_robot
@@ -194,6 +194,7 @@ DRIVERS: Registry[type[Driver]] = Registry(
     package="guiderail.diagrams.hardware",
     decorator="register_driver",
     entry_points="guiderail.drivers",
+    check=lambda name, driver: check_class(name, driver, Driver),
 )
 """Driver classes by name: that of a robot for its default driver, otherwise that of an interface, such as "fci"."""
 

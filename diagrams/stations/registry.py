@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import Registry, check_callable
 
 if TYPE_CHECKING:
     from guiderail.diagrams.envs.options import Options
@@ -27,11 +28,25 @@ class StationKind:
     control_period: float | None = None  # default of `Task.default_control_period` [s]; None: `station.CONTROL_PERIOD`
 
 
+def _check(name: str, kind: object) -> None:
+    """Raise an InputError unless an entry is a `StationKind` with a builder, a workcell and an options class."""
+    if not isinstance(kind, StationKind):
+        raise InputError(f"the station {name!r} is registered by @register_station, not as {brief(kind)}")
+    check_callable(name, kind.build)
+    if not (isinstance(kind.workcell_kind, str) and kind.workcell_kind):
+        raise InputError(f"workcell_kind of {name} must be a word, such as 'plane', not {brief(kind.workcell_kind)}")
+    if kind.options is not None:
+        from guiderail.diagrams.envs.options import Options, check_options_class
+
+        check_options_class(name, "options", kind.options, Options)
+
+
 STATIONS: Registry[StationKind] = Registry(
     "station",
     package=("guiderail.diagrams.stations", "guiderail.diagrams.hardware"),
     decorator="register_station",
     entry_points="guiderail.stations",
+    check=_check,
 )
 
 
@@ -55,7 +70,8 @@ def register_station(
         control_period: Control period without the option `control_period` [s]; default: 20 ms.
 
     Raises:
-        InputError: When the decorator is applied, if another station has that name.
+        InputError: When the decorator is applied, if another station has that name, or an argument or the decorated
+            object has the wrong type.
     """
 
     def add(build: Any) -> Any:
@@ -70,4 +86,4 @@ def register_station(
 
 def stations_for(workcell_kind: str) -> list[str]:
     """Return the names of the stations for a kind of workcell."""
-    return [name for name in STATIONS.names() if STATIONS.declared(name, "workcell_kind") == workcell_kind]
+    return [name for name in STATIONS.usable() if STATIONS.declared(name, "workcell_kind") == workcell_kind]

@@ -23,7 +23,11 @@ if TYPE_CHECKING:
 
 IMPORT_HINT = ", or --import the file that registers it"
 TASKS: Registry[type[Task]] = Registry(
-    "task", package="guiderail.diagrams.tasks", decorator="register_task", entry_points="guiderail.tasks"
+    "task",
+    package="guiderail.diagrams.tasks",
+    decorator="register_task",
+    entry_points="guiderail.tasks",
+    check=lambda name, task: _check(name, task),
 )
 
 
@@ -40,7 +44,6 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
     TASKS.check_name(name)
 
     def add(task: TaskClass) -> TaskClass:
-        _check(name, task)
         TASKS.register(name, task)
         task.name = name
         _register_env(name)
@@ -69,15 +72,16 @@ def check_task_name(name: object) -> None:
 
 def _check(name: str, task: type[Task]) -> None:
     """Raise an InputError if a task class lacks a method or declares something of the wrong type."""
-    from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions
+    from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions, check_options_class
+    from guiderail.diagrams.tasks.task import Task
 
+    if not (isinstance(task, type) and issubclass(task, Task)):
+        raise InputError(f"the task {name!r} is registered with a class derived from Task, not with {brief(task)}")
     if inspect.isabstract(task):
         missing = ", ".join(f"{method}()" for method in sorted(task.__abstractmethods__))
         raise InputError(f"{name} lacks {missing}: every task must define these methods")
     for attribute, kind in (("Options", Options), ("Reset", ResetOptions)):
-        given = getattr(task, attribute)
-        if not (isinstance(given, type) and issubclass(given, kind)):
-            raise InputError(f"{attribute} of {name} must be a class made of {kind.__name__}, not {brief(given)}")
+        check_options_class(name, attribute, getattr(task, attribute), kind)
     for attribute in ("rewards", "observations"):
         given = getattr(task, attribute)
         if isinstance(given, str) or not given:

@@ -144,11 +144,26 @@ class EndEffector:
         return bool(self.joints)
 
 
-_ROBOTS: Registry[Robot] = Registry("robot", package="guiderail.models.robots", entry_points="guiderail.robots")
-_END_EFFECTORS: Registry[EndEffector] = Registry(
-    "end effector", package="guiderail.models.robots", entry_points="guiderail.end_effectors"
+def _check_robot(name: str, robot: object) -> None:
+    if not isinstance(robot, Robot):
+        raise InputError(f"a robot is registered as a Robot object, not {brief(robot)}")
+
+
+def _check_end_effector(name: str, end_effector: object) -> None:
+    if not isinstance(end_effector, EndEffector):
+        raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")
+
+
+ROBOTS: Registry[Robot] = Registry(
+    "robot", package="guiderail.models.robots", entry_points="guiderail.robots", check=_check_robot
 )
-robot_names, end_effector_names = _ROBOTS.names, _END_EFFECTORS.names
+END_EFFECTORS: Registry[EndEffector] = Registry(
+    "end effector",
+    package="guiderail.models.robots",
+    entry_points="guiderail.end_effectors",
+    check=_check_end_effector,
+)
+robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
@@ -160,9 +175,7 @@ def register_robot(robot: Robot) -> Robot:
     Raises:
         InputError: If `robot` is not a `Robot`, or its name is taken.
     """
-    if not isinstance(robot, Robot):
-        raise InputError(f"a robot is registered as a Robot object, not {brief(robot)}")
-    return _ROBOTS.register(robot.name, robot)
+    return ROBOTS.register(getattr(robot, "name", "?"), robot)
 
 
 def find_robot(name: str | Robot) -> Robot:
@@ -171,7 +184,7 @@ def find_robot(name: str | Robot) -> Robot:
     Raises:
         InputError: If no entry has this name; the message suggests a similar name or lists all.
     """
-    return name if isinstance(name, Robot) else _ROBOTS.get(name)
+    return name if isinstance(name, Robot) else ROBOTS.get(name)
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
@@ -180,9 +193,7 @@ def register_end_effector(end_effector: EndEffector) -> EndEffector:
     Raises:
         InputError: If `end_effector` is not an `EndEffector`, or its name is taken.
     """
-    if not isinstance(end_effector, EndEffector):
-        raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")
-    return _END_EFFECTORS.register(end_effector.name, end_effector)
+    return END_EFFECTORS.register(getattr(end_effector, "name", "?"), end_effector)
 
 
 def find_end_effector(name: str | EndEffector) -> EndEffector:
@@ -191,7 +202,7 @@ def find_end_effector(name: str | EndEffector) -> EndEffector:
     Raises:
         InputError: If no entry has this name; the message suggests a similar name or lists all.
     """
-    return name if isinstance(name, EndEffector) else _END_EFFECTORS.get(name)
+    return name if isinstance(name, EndEffector) else END_EFFECTORS.get(name)
 
 
 def _are_numbers(values: Sequence[float], count: int) -> bool:

@@ -368,7 +368,7 @@ SYMBOLS = ("N", "N²", "s", VIOLATION, *JERKS.values())
 
 def statistics_of(task: str | None = None) -> dict[str, Metric]:
     """Return the statistics of a task's episodes by name: the common ones and its own; with None, those of all."""
-    tasks = TASKS.names() if task is None else [task] if task in TASKS.names() else []
+    tasks = TASKS.usable() if task is None else [task] if task in TASKS.names() else []
     return STATISTICS | {metric.name: metric for name in tasks for metric in TASKS.get(name).statistics}
 
 

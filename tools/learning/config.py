@@ -363,7 +363,7 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    known = {field.name for learner in LEARNERS.names() for field in fields(LEARNERS.declared(learner, "Config"))}
+    known = {field.name for learner in LEARNERS.usable() for field in fields(LEARNERS.declared(learner, "Config"))}
     known.remove("algorithm")
     for name in settings:
         if name not in known:

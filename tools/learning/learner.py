@@ -18,10 +18,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import gymnasium
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field
-from pydantic.dataclasses import dataclass
+from pydantic.dataclasses import dataclass, is_pydantic_dataclass
 
 from guiderail.models.common.errors import InputError, brief, require_extra
-from guiderail.models.common.registry import Registry, did_you_mean
+from guiderail.models.common.registry import Registry, check_callable, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Callback, has_image
 
@@ -157,7 +157,15 @@ def _check_learner(name: str, learner: Any) -> None:
     """Raise an InputError if a name cannot be that of a learner, or a class lacks what a learner needs."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise InputError(f"the name of a learner has letters, digits, '_', '-' and '.', unlike {brief(name)}")
+    check_callable(name, learner)
+    config = getattr(learner, "Config", None)
+    if hasattr(learner, "Config") and not (
+        isinstance(config, type) and issubclass(config, LearnerConfig) and is_pydantic_dataclass(config)
+    ):
+        raise InputError(f"Config of {name} must be a pydantic dataclass made of LearnerConfig, not {brief(config)}")
     if not inspect.isclass(learner):
+        if config is None:
+            raise InputError(f"the learner {name} has no Config: see `Learner`")
         return
     missing = sorted(getattr(learner, "__abstractmethods__", ()))
     missing += [] if hasattr(learner, "Config") else ["Config"]

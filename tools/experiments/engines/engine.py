@@ -8,8 +8,8 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
-from guiderail.models.common.errors import InputError
-from guiderail.models.common.registry import Registry
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.registry import Registry, check_callable
 
 MAX_ATTEMPTS = 3  # number of lost workers after which a job is given up: the job itself may kill its worker
 GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
@@ -57,6 +57,7 @@ ENGINES: Registry[Callable[..., Engine]] = Registry(
     package="guiderail.tools.experiments.engines",
     decorator="register_engine",
     entry_points="guiderail.engines",
+    check=check_callable,
 )
 register_engine = ENGINES.register
 
@@ -65,8 +66,12 @@ def make_engine(name: str = "process", processes: int | None = None, address: st
     """Return the engine registered as `name`, for `processes` jobs at once or for the cluster at `address`.
 
     Raises:
-        InputError: If the name is unknown, or an argument is out of range or not supported by the engine.
+        InputError: If the name is unknown, an argument is out of range or not supported by the engine, or the entry of
+            the name returns no `Engine`.
     """
     if processes is not None and processes < 1:
         raise InputError(f"a study needs at least one process, not {processes}")
-    return ENGINES.get(name)(processes=processes, address=address)
+    engine = ENGINES.get(name)(processes=processes, address=address)
+    if not isinstance(engine, Engine):
+        raise InputError(f"the engine {name!r} must be an Engine, not {brief(engine)}: derive its class from Engine")
+    return engine

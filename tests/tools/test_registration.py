@@ -1,0 +1,94 @@
+"""Every registry checks what is registered, with one sentence."""
+
+import pytest
+from pydantic.dataclasses import dataclass
+
+import guiderail
+from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
+from guiderail.diagrams.hardware.driver import DRIVERS, Driver, register_driver
+from guiderail.diagrams.stations.registry import STATIONS, register_station
+from guiderail.diagrams.tasks.registry import TASKS, register_task
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import BASE_POLICIES, register_base_policy
+from guiderail.models.primitives.kernels import KERNELS, register_kernel
+from guiderail.models.robots.robot import register_end_effector, register_robot
+from guiderail.tools.experiments.engines.engine import ENGINES, make_engine, register_engine
+from guiderail.tools.learning.learner import LEARNERS, register_learner
+
+
+class HalfDriver(Driver):
+    def read(self):
+        return None
+
+
+def build(*arguments, **options):
+    """Build nothing."""
+
+
+def learner(config):
+    return type("Mine", (), {"Config": config, "__init__": build})
+
+
+def add_station(kind="plane", options=None, builder=build):
+    register_station("mine", workcell_kind=kind, options=options)(builder)
+
+
+@dataclass
+class Loose:
+    algorithm: str = "mine"
+
+
+@pytest.mark.parametrize(
+    ("register", "sentence"),
+    [
+        (lambda: register_kernel("mine", 3), "'mine' is registered with a function or a class, not with 3"),
+        (lambda: register_base_policy("mine", 3), "registered with a function or a class, not with 3"),
+        (lambda: register_engine("mine")(3), "registered with a function or a class, not with 3"),
+        (lambda: register_driver("mine", 3), "registered with a class made of Driver, not with 3"),
+        (lambda: register_driver("mine", HalfDriver), "the class HalfDriver lacks write"),
+        (lambda: register_guidance("mine")(3), "registered with a function or a class, not with 3"),
+        (lambda: register_guidance("mine", options=dict)(build), "options of mine must be a class made of Options"),
+        (lambda: GUIDANCE.register("mine", build), "the guidance 'mine' is registered by @register_guidance"),
+        (lambda: add_station(builder=3), "registered with a function or a class, not with 3"),
+        (lambda: add_station(options=3), "options of mine must be a class made of Options, not 3"),
+        (lambda: add_station(kind=3), "workcell_kind of mine must be a word, such as 'plane', not 3"),
+        (lambda: STATIONS.register("mine", build), "the station 'mine' is registered by @register_station"),
+        (lambda: register_task("mine")(3), "the task 'mine' is registered with a class derived from Task, not with 3"),
+        (lambda: register_robot(3), "a robot is registered as a Robot object, not 3"),
+        (lambda: register_end_effector(3), "an end effector is registered as an EndEffector object, not 3"),
+        (lambda: register_learner("mine", 3), "registered with a function or a class, not with 3"),
+        (lambda: register_learner("mine", build), "the learner mine has no Config"),
+        (lambda: register_learner("mine", learner(dict)), "Config of mine must be a pydantic dataclass made of Learn"),
+        (lambda: register_learner("mine", learner(None)), "Config of mine must be a pydantic dataclass .*, not None"),
+        (lambda: register_learner("mine", learner(Loose)), "Config of mine must be a pydantic dataclass"),
+    ],
+)
+def test_registration_refuses_what_cannot_be_used(register, sentence):
+    with pytest.raises(InputError, match=sentence):
+        register()
+    for registry in (KERNELS, BASE_POLICIES, ENGINES, DRIVERS, GUIDANCE, STATIONS, TASKS, LEARNERS):
+        assert "mine" not in registry.names()
+
+
+@pytest.fixture
+def restored():
+    """Remove the entries that a test registers."""
+    before = [(registry, set(registry._entries)) for registry in (STATIONS, ENGINES)]
+    yield
+    for registry, names in before:
+        for name in set(registry._entries) - names:
+            del registry._entries[name], registry._origins[name]
+
+
+@pytest.mark.usefixtures("restored")
+def test_environment_refuses_a_station_that_is_none():
+    add_station()
+    with pytest.raises(InputError, match="station='mine' must build a Station, not None"):
+        guiderail.make_env("NarrowPassage", guidance="kgrl", station="mine")
+
+
+@pytest.mark.usefixtures("restored")
+def test_study_refuses_an_engine_that_is_none():
+    register_engine("mine", build)
+    with pytest.raises(InputError, match="the engine 'mine' must be an Engine, not None"):
+        make_engine("mine")
