@@ -10,35 +10,42 @@ from guiderail.diagrams.envs.options import CommonOptions, PrimitiveOptions, Tem
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
+from guiderail.diagrams.hardware.driver import DRIVERS
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.diagrams.tasks.task import Task
+from guiderail.models.common.registry import Registry
 from guiderail.models.primitives.kernels import KERNELS
-from guiderail.models.robots.robot import end_effector_names, find_end_effector, find_robot, robot_names
+from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS, find_end_effector, find_robot
 from guiderail.tools.environments import task_options
+from guiderail.tools.experiments.engines.engine import ENGINES
 from guiderail.tools.learning.learner import LEARNERS
 
 
 def describe_all() -> dict[str, Any]:
-    """Describe all registered tasks, guidance, stations, robots, end effectors, learners and kernels by name.
+    """Describe all registered tasks, guidance, stations, robots, end effectors, drivers, learners, kernels and engines.
 
     Guidance and stations have their ports and options, tasks their options. The entry `options` has the options that
-    tasks share.
+    tasks share. Entries of installed packages that cannot be used are left out.
     """
+    described: dict[str, Registry[Any]] = {"drivers": DRIVERS, "kernels": KERNELS, "engines": ENGINES}
     return {
-        "tasks": {name: describe_task(name) for name in TASKS.names()},
-        "guidance": {name: _guidance(name) for name in GUIDANCE.names()},
-        "stations": {name: _station(name) for name in STATIONS.names()},
+        "tasks": {name: describe_task(name) for name in TASKS.usable()},
+        "guidance": {name: _guidance(name) for name in GUIDANCE.usable()},
+        "stations": {name: _station(name) for name in STATIONS.usable()},
         "robots": {
             name: {"description": find_robot(name).title, "joints": find_robot(name).num_joints}
-            for name in robot_names()
+            for name in ROBOTS.usable()
         },
-        "end_effectors": {name: {"description": find_end_effector(name).title} for name in end_effector_names()},
-        "learners": {name: {} for name in LEARNERS.names()},
-        "kernels": {name: {"description": _first_line(KERNELS.get(name))} for name in KERNELS.names()},
+        "end_effectors": {name: {"description": find_end_effector(name).title} for name in END_EFFECTORS.usable()},
+        "learners": {name: {} for name in LEARNERS.usable()},
+        **{
+            key: {name: {"description": _first_line(registry.get(name))} for name in registry.usable()}
+            for key, registry in described.items()
+        },
         "options": {
             "common": describe_options(CommonOptions),
             "primitive": describe_options(PrimitiveOptions),
@@ -92,13 +99,15 @@ def describe_task_options(name: str) -> dict[str, str]:
     for model in (CommonOptions, *map(type, config.parts.values())):
         for row in describe_options(model):
             texts[row["name"]] = _describe_option(row, config.options[row["name"]], choices.get(row["name"], ()))
-    kinds: dict[tuple[str, str], list[str]] = {}  # names of guidance, by option and text
-    for kind in map(GUIDANCE.get, choices["guidance"]):
-        if kind.name != config.guidance:
-            for row in describe_options(kind.options):
-                kinds.setdefault((row["name"], _describe_option(row, row["default"])), []).append(kind.name)
-    for (name, text), names in kinds.items():
-        text = f"with guidance={' or '.join(names)}: {text}"
+    others: dict[tuple[str, str, str], list[str]] = {}  # names of guidance or stations, by option and text
+    registries: dict[str, Registry[Any]] = {"guidance": GUIDANCE, "station": STATIONS}
+    for choice, registry in registries.items():
+        for kind in map(registry.get, choices[choice]):
+            for row in describe_options(kind.options) if kind.name != getattr(config, choice) else ():
+                key = row["name"], choice, _describe_option(row, row["default"])
+                others.setdefault(key, []).append(kind.name)
+    for (name, choice, text), names in others.items():
+        text = f"with {choice}={' or '.join(names)}: {text}"
         texts[name] = f"{texts[name]}; {text}" if name in texts else text
     for difficulty, settings in declared.difficulties.items():
         if settings:

@@ -93,26 +93,43 @@ def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
 
     def list_names() -> list[str]:
         tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
-        return sorted({name for task in tasks.names() for name in getattr(tasks.get(task), attribute)})
+        return sorted({name for task in tasks.usable() for name in getattr(tasks.get(task), attribute)})
 
     return list_names
 
 
+REGISTRIES = {
+    "tasks": ("diagrams.tasks.registry", "TASKS"),
+    "guidance": ("diagrams.guidance.registry", "GUIDANCE"),
+    "stations": ("diagrams.stations.registry", "STATIONS"),
+    "robots": ("models.robots.robot", "ROBOTS"),
+    "drivers": ("diagrams.hardware.driver", "DRIVERS"),
+    "kernels": ("models.primitives.kernels", "KERNELS"),
+    "learners": ("tools.learning.learner", "LEARNERS"),
+    "engines": ("tools.experiments.engines.engine", "ENGINES"),
+}
+"""Module and name of each registry that `guiderail list` prints."""
+
 LISTED: dict[str, Callable[[], list[str]]] = {
+    **{key: _names(*place) for key, place in REGISTRIES.items()},
     "tasks": _names("diagrams.tasks.registry", "known_tasks"),
-    "guidance": _names("diagrams.guidance.registry", "GUIDANCE"),
-    "stations": _names("diagrams.stations.registry", "STATIONS"),
-    "robots": _names("models.robots.robot", "robot_names"),
     "presets": _names("tools.learning.config", "PRESETS"),
-    "learners": _names("tools.learning.learner", "LEARNERS"),
 }
 """Lists that `guiderail list` prints, by name."""
+
+
+def find_broken(key: str) -> dict[str, str]:
+    """Return the message of each entry point of a list in `LISTED` that cannot be used, by name."""
+    if key not in REGISTRIES:
+        return {}
+    module, attribute = REGISTRIES[key]
+    return dict(getattr(import_module(f"guiderail.{module}"), attribute).broken)
+
 
 CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "rewards": _declared_by_tasks("rewards"),
     "observations": _declared_by_tasks("observations"),
     "templates": _names("models.templates.schema", "shipped_templates"),
-    "engines": _names("tools.experiments.engines.engine", "ENGINES"),
     "log_formats": _names("tools.learning.learner", "LOG_FORMATS"),
     "pictures": _names("tools.files", "PICTURES"),
     "videos": _names("tools.files", "VIDEOS"),

@@ -1,6 +1,9 @@
 """`guiderail list`."""
 
-from typing import Annotated
+from itertools import chain
+from typing import Annotated, Any
+
+import typer
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
@@ -16,7 +19,7 @@ def list_(
     imports: cli.Imports = None,
     as_json: cli.Json = False,
 ) -> None:
-    """List tasks, guidance, stations, robots, presets and learners.
+    """List tasks, guidance, stations, robots, drivers, kernels, learners, engines and presets.
 
     With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
     a table. `guiderail list --json` also prints descriptions, ports, and options with their ranges.
@@ -27,12 +30,15 @@ def list_(
     import_modules(imports or ())
     name = None if what is None else cli.find_task(what)[0]
     if name is None:
-        names = {key: list_names() for key, list_names in cli.LISTED.items()}
+        names: dict[str, Any] = {key: _usable(key) for key in cli.LISTED}
+        broken = {key: messages for key in cli.LISTED if (messages := cli.find_broken(key))}
         if as_json:
             from guiderail.tools.catalog import describe_all
 
-            names |= describe_all()
+            names |= describe_all() | {"broken": broken}
         print_result(names, as_json)
+        for message in () if as_json else chain(*map(dict.values, broken.values())):
+            typer.echo(f"broken: {message}")
     elif name == "metrics":
         from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
@@ -40,7 +46,9 @@ def list_(
         text = {prefix + one.name: one.description + (f" [{one.unit}]" if one.unit else "") for prefix, one in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
-        print_result({name: cli.LISTED[name]()}, as_json)
+        print_result({name: _usable(name)}, as_json)
+        for message in () if as_json else cli.find_broken(name).values():
+            typer.echo(f"broken: {message}")
     elif name in cli.LISTED["tasks"]():
         from guiderail.tools.catalog import describe_task, describe_task_options
 
@@ -49,3 +57,9 @@ def list_(
     else:
         known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORT_HINT)
         raise InputError(f"there is no list of {name!r}: {known}")
+
+
+def _usable(key: str) -> list[str]:
+    """Return the names of a list without those of broken entry points."""
+    broken = cli.find_broken(key)
+    return [name for name in cli.LISTED[key]() if name not in broken]

@@ -13,6 +13,7 @@ import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.kernels import KERNELS
 from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
 from guiderail.tools.environments import as_value
@@ -453,14 +454,48 @@ def test_env_values_are_read_as_yaml(text, value):
     assert (read, type(read)) == (value, type(value))
 
 
+def test_list_names_broken_entry_points_and_leaves_them_out(capsys, tmp_path, monkeypatch):
+    information = tmp_path / "lab_broken-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: lab_broken\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[guiderail.kernels]\nlab = lab_broken:Kernel\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in ("_points", "broken"):
+        monkeypatch.delitem(vars(KERNELS), name, raising=False)
+    sentence = "the kernel 'lab' of the installed package lab_broken cannot be used: importing lab_broken:Kernel failed"
+    try:
+        code, out, _ = call(capsys, "list", "kernels")
+        kernels, broken = out.splitlines()
+        assert code == 0
+        assert " lab" not in kernels
+        assert "matern52" in kernels
+        assert broken.startswith(f"broken: {sentence}")
+        listed = json.loads(call(capsys, "list", "--json")[1])
+        assert "lab" not in listed["kernels"]
+        assert listed["broken"]["kernels"]["lab"].startswith(sentence)
+        code, _, err = call(capsys, "visualize", "NarrowPassage", "--policy", "zero", "--env", "kernel=lab")
+        assert code == 2
+        assert sentence in err
+    finally:
+        for name in ("_points", "broken"):
+            vars(KERNELS).pop(name, None)
+
+
 def test_list_prints_json_options_and_metrics(capsys):
     listed = json.loads(call(capsys, "list", "--json")[1])
-    assert {"tasks", "guidance", "learners", "presets"} <= listed.keys()
+    assert {"tasks", "guidance", "learners", "presets", "drivers", "kernels", "engines"} <= listed.keys()
+    assert {"fci"} <= listed["drivers"].keys()
+    assert {"matern52", "squared_exponential"} <= listed["kernels"].keys()
+    assert {"process"} <= listed["engines"].keys()
+    text = call(capsys, "list")[1].splitlines()
+    assert {line.split()[0] for line in text} >= {"drivers", "kernels", "engines"}
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
     assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["action_repeat"]
     assert "first ten consecutive successes" in call(capsys, "list", "metrics")[1]
     # What `hard` stands for can be given option by option.
-    assert "offset_range=[0.0026,0.003]" in call(capsys, "list", "BncConnector")[1]
+    connector = call(capsys, "list", "BncConnector")[1]
+    assert "offset_range=[0.0026,0.003]" in connector
+    assert "with station=arm or hardware: " in connector
     assert json.loads(call(capsys, "list", "GridClamp", "--json")[1])["difficulties"]["hard"]["force_limit"] == 10.0
 
 
