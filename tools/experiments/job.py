@@ -428,15 +428,20 @@ def attempt(
     _append(job, f" attempt of study call {call}{BEGIN}{host}, process {os.getpid()}\n")
     try:
         rows = work(job)
-    except InputError as error:
-        _append(job, f" failed: {error}\n")
-        return Outcome(failure=str(error))
     except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
-        _append(job, f" failed:\n{traceback.format_exc()}")
-        message = " ".join(str(error).split())[:200]
-        return Outcome(failure=f"{type(error).__name__}: {message} (the traceback is in {job.log})")
+        return log_failure(job, error)
     _append(job, " is done\n")
     return Outcome(tuple(rows))
+
+
+def log_failure(job: Job, error: BaseException) -> Outcome:
+    """Append an error to the log of its job, and return the outcome of the job: one sentence on the failure."""
+    if isinstance(error, InputError):
+        _append(job, f" failed: {error}\n")
+        return Outcome(failure=str(error))
+    _append(job, f" failed:\n{''.join(traceback.format_exception(error))}")
+    message = " ".join(str(error).split())[:200]
+    return Outcome(failure=f"{type(error).__name__}: {message} (the traceback is in {job.log})")
 
 
 def count_attempts(log: Path, call: str) -> int:

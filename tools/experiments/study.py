@@ -25,7 +25,17 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.metrics import statistics_of, wilson
 from guiderail.tools.experiments.declaration import Ratio, Study, Sweep, source_file
 from guiderail.tools.experiments.engines.engine import Engine, Outcome, make_engine
-from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job, attempt, check_job, check_source, is_done, run_job
+from guiderail.tools.experiments.job import (
+    EVALUATED,
+    TRAINING,
+    Job,
+    attempt,
+    check_job,
+    check_source,
+    is_done,
+    log_failure,
+    run_job,
+)
 from guiderail.tools.experiments.progress import StudyProgress
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
@@ -243,8 +253,8 @@ def _run_jobs(jobs: list[Job], groups: list[list[int]], engine: Engine) -> dict[
                 if index not in to_run:
                     try:
                         end(index, Outcome(tuple(run_job(job))))
-                    except InputError as error:
-                        end(index, Outcome(failure=str(error)))
+                    except (Exception, SystemExit) as error:  # as in `attempt`
+                        end(index, log_failure(job, error))
                 elif source is not None and source.folder.path in failed:
                     end(index, Outcome(failure=f"it starts from the run of {failed[source.folder.path]}, which failed"))
                 else:

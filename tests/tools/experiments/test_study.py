@@ -1,5 +1,6 @@
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.metrics import statistics_of, wilson
+from guiderail.tools.evaluation.metrics import STATISTICS, statistics_of, wilson
 from guiderail.tools.experiments.declaration import EvalSet, Ratio, Study, load_study, source_file
 from guiderail.tools.experiments.engines.engine import make_engine
 from guiderail.tools.experiments.job import Job, check_job
@@ -115,6 +116,28 @@ def test_failed_job_is_listed_and_stops_no_other(tmp_path, capsys):
     file_of_episodes.write_bytes(table)
     checkpoint.write_bytes(whole)
     assert without_clock(run(study(), out)) == without_clock(expected)
+
+
+def test_finished_job_is_listed_when_its_statistic_raises(tmp_path, monkeypatch):
+    returns = []
+
+    def compute(rows):
+        if rows["return"].iloc[0] in returns:
+            raise ZeroDivisionError("no path")
+        return 1.0
+
+    fragile = replace(STATISTICS["success_rate"], name="fragile", compute=compute)
+    monkeypatch.setitem(STATISTICS, "fragile", fragile)
+    one = study(statistics=["fragile"], after_episodes=[2])
+    expected = without_clock(run(one, tmp_path))
+    returns.append(read_table(tmp_path / "learner-5" / "episodes.csv")["return"].iloc[0])
+    with pytest.raises(RunsFailedError) as failed:
+        run(one, tmp_path)
+    (sentence,) = failed.value.sentences
+    log = tmp_path / "logs" / "beads-learner-5.txt"
+    assert sentence == f"learner, seed 5, failed: ZeroDivisionError: no path (the traceback is in {log})"
+    assert "in compute" in log.read_text()
+    assert without_clock(failed.value.rows) == [row for row in expected if row["seed"] == 6]
 
 
 def continued(episodes=4, source="coarse-{seed}"):
