@@ -12,6 +12,7 @@ import inspect
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -263,7 +264,7 @@ class LearningLog:
             return
         row = rows[-1]
         entry = {} if is_finished else {name: row[column] for column, name in LOGGED_COLUMNS.items() if column in row}
-        entry |= metrics()
+        entry |= _checked_metrics(metrics)
         if not entry:
             return
         if self._logger is None:
@@ -286,6 +287,18 @@ class LearningLog:
         """Close the files."""
         if self._logger is not None:
             self._logger.close()
+
+
+def _checked_metrics(metrics: Callable[[], Mapping[str, float]]) -> Mapping[str, float]:
+    """Return a learner's metrics; raise an InputError unless they are numbers by name."""
+    values: Any = metrics()
+    owner = f"{type(getattr(metrics, '__self__', metrics)).__name__}.metrics"
+    if not isinstance(values, Mapping):
+        raise InputError(f"{owner} must return numbers by name, not {brief(values)}")
+    for name, value in values.items():
+        if not (isinstance(name, str) and isinstance(value, Real)):
+            raise InputError(f"{owner} must return numbers by name, and {brief(name)} is {brief(value)}")
+    return values
 
 
 def _make_wandb_output(folder: str) -> Any:

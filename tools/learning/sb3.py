@@ -127,7 +127,8 @@ def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
     if torch.cuda.is_initialized():  # so that a resumed run samples the same numbers
         arrays["random/cuda"] = torch.cuda.get_rng_state().numpy()
-    return arrays, {"numpy": [kind, *rest], "python": random.getstate()}
+    version, state, gauss = random.getstate()
+    return arrays, {"numpy": [kind, *rest], "python": [version, list(state), gauss]}
 
 
 def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:

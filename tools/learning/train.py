@@ -105,7 +105,7 @@ def _names_code(config: Mapping[str, Any]) -> bool:
 
 
 def train(
-    task: str,
+    task: str | None = None,
     guidance: str | None = None,
     *,
     out: Path | str,
@@ -123,7 +123,7 @@ def train(
     """Train a policy and write its run folder.
 
     Args:
-        task: Name of the task, or the path of a task folder.
+        task: Name of the task, or the path of a task folder; with `resume` it may be left out.
         guidance: Name of the guidance; None for the task's default.
         out: Folder of the run; with `resume`, that of the run to continue.
         episodes: Total number of episodes; None for 60.
@@ -147,7 +147,7 @@ def train(
         InputError: If a name is unknown, a value is out of range, the folder is not empty, an argument contradicts the
             run to resume, an episode fails, or learning diverges.
     """
-    if not isinstance(task, str | PathLike):
+    if not (isinstance(task, str | PathLike) or (task is None and resume)):
         raise InputError(
             f"training needs the name of a task or its folder, not {brief(task)}: register an environment of your own "
             "with gymnasium.register as guiderail/NAME-v0, and give NAME"
@@ -156,9 +156,10 @@ def train(
         raise InputError(f"out is the path of the run's folder, not {brief(out)}")
     if not (settings is None or isinstance(settings, Mapping)):
         raise InputError(f"settings of the learner are values by name, not {brief(settings)}")
-    name, imports = task_named(str(task))
+    name, imports = (None, ()) if task is None else task_named(str(task))
     environment = options if guidance is None else {"guidance": guidance, **options}
-    _refuse_misspelled(name, environment, options)
+    if name is not None:
+        _refuse_misspelled(name, environment, options)
     return start_or_resume(
         name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
         episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,

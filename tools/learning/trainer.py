@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from numbers import Number
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.metrics import WORDS
@@ -103,12 +103,14 @@ def run_training(
                 "the setting demonstration_episodes out"
             )
         arguments = learner_arguments(config, task_of(env, config.task))
-        try:
-            learner: Learner = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
-        except MemoryError as error:
-            raise InputError(
-                f"the replay buffer does not fit into memory ({error}): give a smaller --set buffer_size=..."
-            ) from error
+        kind = LEARNERS.get(config.learner.algorithm)
+        with _naming_failures(config, f"constructing the learner {getattr(kind, '__name__', brief(kind))}"):
+            try:
+                learner: Learner = kind(config.learner, env, **arguments)
+            except MemoryError as error:
+                raise InputError(
+                    f"the replay buffer does not fit into memory ({error}): give a smaller --set buffer_size=..."
+                ) from error
         env.reset(seed=config.seed)  # samples the hidden values of the run
         if not resume:
             folder.refuse_existing()
@@ -188,11 +190,16 @@ def _train(
     callbacks += [] if sb3_callbacks is None else [sb3_callbacks]
     num_demonstrated = 0 if demonstrator is None else config.learner.demonstration_episodes
     training_time, saving_time, last_saving_time = 0.0, 0.0, 0.0
+
+    def learner_act(observation: np.ndarray) -> np.ndarray:
+        with _naming_failures(config, f"{type(learner).__name__}.act"):
+            return learner.act(observation)
+
     for episode in range(len(rows), config.episodes):
         if _ends_with_successes(rows, config.learner.stop_after_successes):
             break
         started = time.perf_counter()
-        act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner.act
+        act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner_act
         if config.learner.num_envs:
             row = cast("ParallelLearner", learner).episode(episode)
         elif supervised is None:
@@ -200,7 +207,7 @@ def _train(
         else:
             row = supervised.rollout(act, learner, *callbacks, index=episode)
             env = supervised.env
-        if learner.has_diverged():
+        if _has_diverged(learner):
             raise divergence_error()
         if num_demonstrated:
             row["is_demonstration"] = int(episode < num_demonstrated)
@@ -241,6 +248,18 @@ def _train(
     return rows
 
 
+def _naming_failures(config: RunConfig, action: str) -> AbstractContextManager[None]:
+    """Return `naming_failures` for a learner of a user, and a context without effect for one of this package."""
+    return nullcontext() if LEARNERS.is_packaged(config.learner.algorithm) else naming_failures(action)
+
+
+def _has_diverged(learner: Learner) -> bool:
+    diverged = learner.has_diverged()
+    if not isinstance(diverged, bool | np.bool_):
+        raise InputError(f"{type(learner).__name__}.has_diverged must return True or False, not {brief(diverged)}")
+    return bool(diverged)
+
+
 def _ends_with_successes(rows: Sequence[Mapping[str, Any]], number: int) -> bool:
     """Return True if the last `number` episodes are successes of the learner itself; False if `number` is 0."""
     last = rows[-number:] if number else []
@@ -274,7 +293,8 @@ def write_checkpoint(
     """Write the checkpoint: the run's identity, the episodes' rows, the states of learner and environment, and `more`.
 
     Raises:
-        InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold.
+        InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold and
+            does not change.
     """
     state = learner.state()
     if not (isinstance(state, tuple) and len(state) == 2 and all(isinstance(part, Mapping) for part in state)):
@@ -287,6 +307,11 @@ def write_checkpoint(
         json.dumps(values)
     except (TypeError, ValueError) as error:
         raise InputError(f"the values of {type(learner).__name__}.state must be values of JSON: {error}") from error
+    for changed in _changed_by_json(values):
+        raise InputError(
+            f"the values of {type(learner).__name__}.state must not contain {changed}, because JSON changes it: use "
+            "lists, and text as keys"
+        )
     stored = {
         "run": config.identity,
         "rows": rows,
@@ -294,6 +319,19 @@ def write_checkpoint(
         "environment": env.unwrapped.np_random.bit_generator.state,
     }
     save_checkpoint(folder.checkpoint, arrays, stored | dict(more or {}))
+
+
+def _changed_by_json(value: Any) -> Iterator[str]:
+    """Yield a description of each tuple, and of each key that is not a text, of values that JSON can hold."""
+    if isinstance(value, tuple):
+        yield f"the tuple {brief(value)}"
+    elif isinstance(value, Mapping):
+        yield from (f"the key {brief(key)}" for key in value if not isinstance(key, str))
+        for entry in value.values():
+            yield from _changed_by_json(entry)
+    elif isinstance(value, list):
+        for entry in value:
+            yield from _changed_by_json(entry)
 
 
 def restore_checkpoint(

@@ -271,6 +271,8 @@ def test_learner_that_cannot_be_constructed_is_not_registered(name, learner, wor
         (([], {}), "Odd.state must return two dictionaries"),
         (({"words": np.array(["a"])}, {}), "the array 'words' of Odd.state has no numbers"),
         (({}, {"mean": np.zeros(2)}), "the values of Odd.state must be values of JSON: Object of type ndarray"),
+        (({}, {"a": [{"b": (1, 2)}]}), r"the values of Odd.state must not contain the tuple \(1, 2\), because JSON"),
+        (({}, {"a": {3: 4}}), "the values of Odd.state must not contain the key 3, because JSON changes it"),
     ],
 )
 def test_state_that_cannot_be_stored_is_named(state, words, tmp_path):
@@ -279,3 +281,19 @@ def test_state_that_cannot_be_stored_is_named(state, words, tmp_path):
             return state
 
     assert_refused(Odd, words, tmp_path / "run", episodes=1)
+
+
+@pytest.mark.parametrize(
+    ("method", "words"),
+    [
+        ("__init__", r"constructing the learner Odd failed: test_interventions\.py, line \d+: ZeroDivisionError"),
+        ("act", r"Odd\.act failed: test_interventions\.py, line \d+: ZeroDivisionError: division by zero"),
+    ],
+)
+def test_error_in_a_method_of_a_learner_is_named(method, words, tmp_path):
+    assert_refused(type("Odd", (ZeroLearner,), {method: lambda *_, **__: 1 / 0}), words, tmp_path / "run", episodes=1)
+
+
+def test_has_diverged_that_returns_nothing_is_named(tmp_path):
+    odd = type("Odd", (ZeroLearner,), {"has_diverged": lambda self: None})
+    assert_refused(odd, "Odd.has_diverged must return True or False, not None", tmp_path / "run", episodes=1)

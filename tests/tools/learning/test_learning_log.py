@@ -127,3 +127,24 @@ def test_train_refuses_arguments_of_another_type(wrong, message, tmp_path):
     with pytest.raises(InputError, match=message):
         train("NarrowPassage", **{"guidance": "kgrl", "out": tmp_path / "run", **wrong})
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("values", [None, {"a": object()}, {"a": "word"}, {3: 1.0}, [1.0]])
+def test_log_refuses_metrics_that_are_no_numbers_by_name(values, tmp_path):
+    class Odd:
+        def metrics(self):
+            return values
+
+    log = LearningLog(tmp_path, ["csv"])
+    with pytest.raises(InputError, match=r"Odd\.metrics must return numbers by name"):
+        log.record([{"episode": 0, "return": 1.0, "steps": 3}], Odd().metrics)
+
+
+def test_train_resumes_a_run_without_its_task(tmp_path):
+    arguments = {"algorithm": "sac", "pictures": False}
+    train("NarrowPassage", "kgrl", out=tmp_path / "parts", episodes=1, **arguments)
+    train(resume=True, out=tmp_path / "parts", episodes=2, pictures=False)
+    train("NarrowPassage", "kgrl", out=tmp_path / "whole", episodes=2, **arguments)
+    assert differences(tmp_path / "whole", tmp_path / "parts") == []
+    with pytest.raises(InputError, match="training needs the name of a task or its folder, not None"):
+        train(out=tmp_path / "other")
