@@ -23,8 +23,6 @@ TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "ti
 - ``"time_limit"``: the maximum number of steps was reached.
 """
 
-SUCCESS = TERMINATIONS.index("success")
-
 
 @dataclass(frozen=True)
 class TerminationTerm:

@@ -359,7 +359,3 @@ class MotionLimits:
         velocity, acceleration, jerk = self.angular
         acceleration -= velocity**2 / 2.0
         return velocity, acceleration, jerk - 1.5 * velocity * acceleration - velocity**3 / 3.0
-
-
-FRANKA_LIMITS = MotionLimits((1.7, 13.0, 6500.0), (2.5, 25.0, 12500.0))
-"""Published limits of the Cartesian motion of a Franka Emika Panda; an FR3 has lower accelerations and jerks."""

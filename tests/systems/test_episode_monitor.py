@@ -3,7 +3,9 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.episode_monitor import SUCCESS, TERMINATIONS, EpisodeMonitor, TerminationTerm
+from guiderail.systems.episode_monitor import TERMINATIONS, EpisodeMonitor, TerminationTerm
+
+SUCCESS = TERMINATIONS.index("success")
 
 PERIOD = 0.1
 BLOCKED = TERMINATIONS.index("blocked")

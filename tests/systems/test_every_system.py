@@ -29,11 +29,11 @@ from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
+from oracles.franka import FRANKA_LIMITS
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent

@@ -7,9 +7,9 @@ from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems import pose_motion_limiter
 from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
+from oracles.franka import FRANKA_LIMITS
 
 PERIOD = 0.005
 START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])

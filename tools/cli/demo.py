@@ -1,4 +1,4 @@
-"""`guiderail demo`: train a policy in about a minute, and show what the run folder contains."""
+"""Run of `guiderail demo`: training in about a minute, evaluation, and the contents of the run folder."""
 
 import shlex
 import shutil

@@ -23,10 +23,10 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault
-from guiderail.models.control.motion_constraints import FRANKA_LIMITS
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.preflight import PreflightChecks, check_robot, confirm_checks
 from guiderail.tools.hardware.sim_driver import START
+from oracles.franka import FRANKA_LIMITS
 
 WORKCELL = BncWorkcell()
 IMPEDANCE = Impedance().with_max_force(18.0)

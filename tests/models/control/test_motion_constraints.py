@@ -4,13 +4,13 @@ from motion_adversary import KINDS, attack, is_violated
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import (
-    FRANKA_LIMITS,
     MotionConstraintFilter,
     MotionConstraints,
     MotionLimits,
 )
 from guiderail.models.control.shapes import Box, Sphere
 from guiderail.models.primitives import LinearConstraints
+from oracles.franka import FRANKA_LIMITS
 
 PERIOD = 0.02
 LINEAR = LinearConstraints.box([0.0, 0.0], [0.6, 1.0])
