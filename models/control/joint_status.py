@@ -63,6 +63,7 @@ class Fault(IntEnum):
     MONITOR_STOP = 22, "a safety monitor stopped the arm, or its heartbeat timed out"
     SECOND_COMMANDER = 23, "another program commands the arm as well"
     INITIALIZED = 24, "the simulation was initialized while it controlled the arm"
+    COMMAND_FAILED = 25, "a command could not be sent to the robot"
 
 
 STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CLOCK_RATE)
@@ -71,7 +72,7 @@ STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CL
 
 @dataclass(frozen=True)
 class JointStatus:
-    """Decoded status message of a robot driver; neither sizes nor values have been checked."""
+    """Decoded status message of a robot driver; `parse_status` and `check_status` check types, sizes and values."""
 
     time: float  # time stamp by the robot's clock [s]; NaN if the message could not be decoded
     positions: np.ndarray  # joint positions, (n,) [rad]
@@ -109,6 +110,41 @@ class Heartbeat:
 
 MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 """Status for a message that could not be decoded."""
+
+
+def parse_status(value: object) -> JointStatus | None:
+    """Return a driver's status with floating-point arrays of its own; None if there is no status.
+
+    A status is malformed (`MALFORMED_STATUS`) if it is of another type, or if one of its values is not a real number,
+    such as text, None or a complex number. Neither sizes nor finiteness of positions, velocities and torques are
+    checked.
+    """
+    if value is None:
+        return None
+    if not isinstance(value, JointStatus):
+        return MALFORMED_STATUS
+    try:
+        scalars = [_to_numbers(number) for number in (value.time, value.conflicts, value.foreign_commands)]
+        if any(scalar.ndim for scalar in scalars):
+            return MALFORMED_STATUS
+        return JointStatus(
+            float(scalars[0]),
+            _to_numbers(value.positions),
+            _to_numbers(value.velocities),
+            _to_numbers(value.external_torque),
+            int(scalars[1]),
+            int(scalars[2]),
+        )
+    except Exception:  # objects of a driver can raise any error
+        return MALFORMED_STATUS
+
+
+def _to_numbers(value: object) -> np.ndarray:
+    """Return a new array of floats; raise an error if there is anything but real numbers."""
+    array = np.array(value)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"{array.dtype} is no type of real numbers")
+    return array.astype(float)
 
 
 @dataclass(frozen=True)
@@ -163,22 +199,33 @@ class LastStatus:
     values: np.ndarray  # `JointStatus.values`, (3n,)
 
 
-def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Check the newest status, or None before the first message, against the last one at the local time `now` [s].
+def check_content(status: JointStatus | None, num_joints: int) -> Fault:
+    """Check types, sizes and finiteness of a status, or None before the first message, without other statuses.
 
     Returns:
-        The first fault, or `Fault.NONE`.
+        The first fault, or `Fault.NONE`; a status that `parse_status` refuses is `Fault.MALFORMED`.
     """
+    status = parse_status(status)
     if status is None:
         return Fault.NO_STATUS
     if not status.is_readable:
         return Fault.MALFORMED
-    num_joints = len(limits.velocity)
-    if {len(part) for part in (status.positions, status.velocities, status.external_torque)} != {num_joints}:
+    if {part.shape for part in (status.positions, status.velocities, status.external_torque)} != {(num_joints,)}:
         return Fault.WRONG_SIZE
+    return Fault.NONE if np.isfinite(status.values()).all() else Fault.NOT_FINITE
+
+
+def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
+    """Check the newest status, or None before the first message, against the last one at the local time `now` [s].
+
+    Returns:
+        The first fault, beginning with those of `check_content`, or `Fault.NONE`.
+    """
+    num_joints = len(limits.velocity)
+    fault = check_content(status, num_joints)
+    if status is None or fault:
+        return fault
     values = status.values()
-    if not np.isfinite(values).all():
-        return Fault.NOT_FINITE
     if not np.isfinite(last.time):
         return Fault.NONE
     if last.time - status.time > limits.max_age:

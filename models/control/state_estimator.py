@@ -10,7 +10,14 @@ import numpy as np
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault, JointStatus, LastStatus, StatusLimits, check_status
+from guiderail.models.control.joint_status import (
+    Fault,
+    JointStatus,
+    LastStatus,
+    StatusLimits,
+    check_status,
+    parse_status,
+)
 from guiderail.models.control.message_sequence import RESOLUTION
 
 ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # a status with them is accepted
@@ -173,7 +180,7 @@ class StateEstimator:
 
         Args:
             before: State after the last check.
-            status: Newest status; None before the first.
+            status: Newest status; None before the first. One that `parse_status` refuses is malformed.
             now: Local time [s].
             M: Mass matrix at the accepted positions, (n, n).
             drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
@@ -181,6 +188,7 @@ class StateEstimator:
         Returns:
             The fault, the age of the accepted status and the estimate; `advance` completes the state.
         """
+        status = parse_status(status)
         state = self._predict(before, now, M, drag)
         is_doubted = np.isfinite(before.doubt_time)
         is_trusted = not is_doubted or (status is not None and self._agrees(status, state, now))
@@ -249,6 +257,14 @@ class StateEstimator:
         state = estimate.state
         torque = np.where(np.isfinite(torque), torque, 0.0)
         return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))
+
+    def forget_torque(self, state: EstimatorState) -> EstimatorState:
+        """Return the state after a command that was not sent: the torques in effect are unknown.
+
+        The velocity is then not compared with torques, and no bias is learned. Until the next status, the prediction is
+        that of no torque.
+        """
+        return replace(state, torque=self._zeros, tolerance=self._period * self._torque_tolerance)
 
     def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
         """Return the state with the effect of the torques since the last check."""

@@ -18,6 +18,7 @@ from guiderail.models.control.joint_status import (
     StatusLimits,
     check_status,
     damping_torque,
+    parse_status,
 )
 
 # Dyadic numbers, so that rounding does not decide on a value exactly at a limit.
@@ -48,6 +49,58 @@ def test_missing_and_malformed_statuses_are_faults():
     assert not MALFORMED_STATUS.values().size
     assert status().is_readable
     assert not status(time=np.inf).is_readable
+
+
+class Unreadable:
+    def __array__(self, *arguments, **keywords):
+        raise OSError("cable unplugged")
+
+
+FIELDS = ("positions", "velocities", "external_torque")
+NO_NUMBERS = [["a", "b"], "text", None, [None, 0.0], [0.5j, 0.0], [True, False], [[0.0], [0.0, 0.0]], Unreadable()]
+NO_NUMBERS += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="datetime64[s]")]
+
+
+@pytest.mark.parametrize("part", FIELDS)
+@pytest.mark.parametrize("value", NO_NUMBERS, ids=str)
+def test_part_that_is_no_real_numbers_is_malformed(part, value):
+    wrong = replace(status(), **{part: value})
+    assert check_status(wrong, LAST, 116.0, LIMITS) == Fault.MALFORMED
+    assert parse_status(wrong) is MALFORMED_STATUS
+
+
+@pytest.mark.parametrize("part", ["time", "conflicts", "foreign_commands"])
+@pytest.mark.parametrize("value", ["now", None, 1j, True, [16.0], np.zeros(2), Unreadable()], ids=str)
+def test_scalar_that_is_no_real_number_is_malformed(part, value):
+    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+
+
+@pytest.mark.parametrize("part", ["conflicts", "foreign_commands"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_counter_that_is_not_finite_is_malformed(part, value):
+    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+
+
+@pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, object()], ids=str)
+def test_object_that_is_no_status_is_malformed(value):
+    assert check_status(value, LAST, 116.0, LIMITS) == Fault.MALFORMED
+
+
+@pytest.mark.parametrize("part", FIELDS)
+@pytest.mark.parametrize("value", [0.0, np.zeros((2, 1)), np.zeros((1, 2)), np.zeros((2, 2)), []], ids=np.shape)
+def test_part_of_another_shape_has_a_wrong_size(part, value):
+    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.WRONG_SIZE
+
+
+def test_parsed_status_has_the_same_numbers_in_its_own_arrays():
+    original = replace(status(), conflicts=2, foreign_commands=3)
+    parsed = parse_status(original)
+    assert (parsed.time, parsed.conflicts, parsed.foreign_commands) == (original.time, 2, 3)
+    np.testing.assert_array_equal(parsed.values(), original.values())
+    original.positions[0] = 7.0
+    assert parsed.positions[0] == 0.5
+    assert check_status(replace(status(), positions=[0, -1]), LAST, 116.0, LIMITS) == Fault.POSITION_JUMP
+    assert parse_status(None) is None
 
 
 @pytest.mark.parametrize("part", ["positions", "velocities", "external"])

@@ -180,6 +180,29 @@ def test_fault_is_reported_while_its_cause_lasts(fault):
             np.testing.assert_array_equal(rig.accepted, before)
 
 
+@pytest.mark.parametrize("is_doubted", [False, True])
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"time": "now"},
+        {"time": None},
+        {"positions": ["a", "b"]},
+        {"velocities": np.array([1j, 0])},
+        {"conflicts": None},
+    ],
+    ids=str,
+)
+def test_status_of_another_type_is_dropped(changed, is_doubted):
+    rig = Rig().settle()
+    if is_doubted:
+        assert rig.check(lambda status: replace(status, positions=status.positions + 1.0)) == Fault.POSITION_JUMP
+    before, velocity = rig.state, rig.v.copy()
+    assert rig.check(lambda status: replace(status, **changed)) == Fault.MALFORMED
+    np.testing.assert_array_equal(rig.accepted, before.accepted_values)
+    assert not rig.estimate.is_new
+    np.testing.assert_allclose(rig.estimate.state.velocity, velocity, atol=0.02)
+
+
 def test_repeated_status_is_stale_just_above_the_maximum_age():
     rig = Rig().settle()
     last = rig.status()
