@@ -93,6 +93,10 @@ class StatusWatchdog(LeafSystem):
     get_fault_output_port = output_getter("fault", "present or recent fault, (1,), a code of `Fault`")
     get_age_output_port = output_getter("age", "age of the accepted status, (1,) [s]")
 
+    def forget_torque(self, context: Context) -> None:
+        """Treat the torques since the last check as unknown, as a command was not sent; `context` is this system's."""
+        context.SetDiscreteState(self._state, self._estimator.forget_torque(self._state_of(context)).vector())
+
     def _state_of(self, context: Context) -> EstimatorState:
         return EstimatorState.from_vector(context.get_discrete_state().value(self._state), self._num_joints)
 

@@ -12,7 +12,8 @@ from guiderail.systems.support.declarations import check_period, input_getter
 class TorquePublisher(LeafSystem):
     """Publish joint torques once per period while enabled; otherwise no message is sent, not even zeros.
 
-    While ``is_holding`` is 1, `hold` is called once per period instead.
+    While ``is_holding`` is 1, `hold` is called once per period instead; if it returns False, the driver cannot hold the
+    arm, and torques are published as usual.
 
     .. pydrake_system::
 
@@ -26,10 +27,10 @@ class TorquePublisher(LeafSystem):
     ``is_holding`` is (1,), 1 while the driver has to hold the arm.
 
     Args:
-        write: Function that sends torques (n,) [Nm] at a time [s], such as `Driver.write`.
+        write: Function that sends torques (n,) [Nm] at a time [s], such as `DriverGuard.write`.
         num_joints: Number n of joints, at least 1.
         period: Publishing period [s], positive.
-        hold: Function that makes the driver hold the arm, such as `Driver.hold`.
+        hold: Function that makes the driver hold the arm, such as `DriverGuard.hold`.
 
     Raises:
         InputError: If an argument is out of range.
@@ -37,11 +38,11 @@ class TorquePublisher(LeafSystem):
 
     def __init__(
         self,
-        write: Callable[[np.ndarray, float], None],
+        write: Callable[[np.ndarray, float], object],
         num_joints: int,
         *,
         period: float,
-        hold: Callable[[], None],
+        hold: Callable[[], bool | None],
     ):
         super().__init__()
         check_period(period)
@@ -58,7 +59,7 @@ class TorquePublisher(LeafSystem):
     get_is_holding_input_port = input_getter("is_holding", "flag that the driver holds the arm, (1,)")
 
     def _publish(self, context: Context) -> None:
-        if self._is_holding_port.Eval(context)[0] > 0.0:
-            self._hold()
-        elif self._is_sending_port.Eval(context)[0] > 0.0:
+        if self._is_holding_port.Eval(context)[0] > 0.0 and self._hold() is not False:
+            return
+        if self._is_sending_port.Eval(context)[0] > 0.0:
             self._write(self._torque_port.Eval(context), context.get_time())

@@ -202,14 +202,20 @@ class TorqueSafetyLimiter(LeafSystem):
     get_is_holding_output_port = output_getter("is_holding", "flag that the driver holds the arm, (1,)")
     get_not_following_output_port = output_getter("not_following", "flag that the desired pose is not followed, (1,)")
 
-    def stop(self, context: Context) -> None:
-        """Stop the arm with the fault `Fault.USER_STOP`, unless it is stopped already; `context` is this system's."""
+    def stop(self, context: Context, fault: Fault = Fault.USER_STOP) -> None:
+        """Stop the arm with a fault, unless it is stopped already; `context` is this system's."""
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state == ArmState.WAITING:
             # No velocity has been accepted yet and no torque has been sent, so there is nothing to damp.
-            context.SetDiscreteState(self._state, [ArmState.OFF, Fault.USER_STOP, np.inf, 0.0])
+            context.SetDiscreteState(self._state, [ArmState.OFF, fault, np.inf, 0.0])
         elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
-            context.SetDiscreteState(self._state, [ArmState.DAMPING, Fault.USER_STOP, 0.0, 0.0])
+            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
+
+    def damp_again(self, context: Context) -> None:
+        """Begin damping again in a stop, after commands could not be sent; `context` is this system's."""
+        arm_state, fault, _, _ = self._state_of(context)
+        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
 
     def resume(self, context: Context) -> None:
         """Resume after a stop, from the present pose of the arm; `context` is this system's.

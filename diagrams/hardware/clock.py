@@ -151,7 +151,7 @@ class WallClock(Clock):
 
     def begin(self) -> None:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
-        self._driver.receive()
+        self._driver.guard.receive()
         self._num_used, self._last_step = self._driver.num_statuses, time.monotonic()
         self._due = self._last_step + self._period / self._rate
 
@@ -161,8 +161,8 @@ class WallClock(Clock):
         time.sleep(max(self._due - 0.5 * period - time.monotonic(), 0.0))
         end = self._last_step + 1.5 * period
         while self._driver.num_statuses == self._num_used and (left := end - time.monotonic()) > 0.0:
-            self._driver.receive(left)
-        self._driver.receive()
+            self._driver.guard.receive(left)
+        self._driver.guard.receive()
         self._num_used, now = self._driver.num_statuses, time.monotonic()
         self.intervals.add(now - self._last_step)
         self._last_step = now

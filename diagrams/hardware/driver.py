@@ -6,12 +6,14 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
+from guiderail.diagrams.hardware.driver_guard import DriverGuard
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry, check_class
@@ -76,6 +78,11 @@ class Driver(ABC):
         self.url = url
         self.num_statuses = self.num_foreign_commands = 0
         self._last_time = np.nan
+
+    @cached_property
+    def guard(self) -> DriverGuard:
+        """Guard by which stations and monitors call this driver."""
+        return DriverGuard(self)
 
     @abstractmethod
     def read(self) -> JointStatus | None:
@@ -202,8 +209,9 @@ register_driver = DRIVERS.register
 
 
 def describe_stop(fault: Fault, driver: Driver) -> str:
-    """Return the reason of a stop in words, with the robot's own error if there is one."""
-    return f"{fault.description} ({driver.error})" if driver.error else fault.description
+    """Return the reason of a stop in words, with the robot's own error or the driver's exception if there is one."""
+    cause = driver.guard.describe(fault)
+    return f"{fault.description} ({cause})" if cause else fault.description
 
 
 def find_driver(robot: Robot | str) -> type[Driver]:

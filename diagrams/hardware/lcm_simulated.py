@@ -130,7 +130,7 @@ class LockstepClock(Clock):
 
     def begin(self) -> None:
         """Prepare to advance a simulator that has just been initialized with the newest status."""
-        self._driver.receive()
+        self._driver.guard.receive()
         self._used = self._driver.statuses.head
 
     def _wait_for_step(self) -> None:
@@ -140,7 +140,7 @@ class LockstepClock(Clock):
         self._acknowledge()
         while statuses.head == self._used and (left := end - time.monotonic()) > 0.0:
             repeats = statuses.repeats
-            self._driver.receive(min(left, CHECK_INTERVAL))
+            self._driver.guard.receive(min(left, CHECK_INTERVAL))
             if self.check_robot is not None:
                 self.check_robot()
             if statuses.head == self._used and statuses.repeats > repeats:

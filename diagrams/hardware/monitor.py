@@ -43,7 +43,9 @@ class SafetyMonitor:
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
     (`CommandSequence`): the arm is damped, and then has zero torque until only one program sends commands. During a
     stop the monitor sends torques even if no status arrives, so that the driver never repeats an old torque. If the
-    status is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead.
+    status is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead. An exception of the driver
+    does not end the monitor (`DriverGuard`): a status that cannot be read is wrong, and a command that fails is sent
+    again at the next check.
 
     Attributes:
         state: Current state.
@@ -71,6 +73,7 @@ class SafetyMonitor:
         driver.check_usable()
         self.state, self.fault = MonitorState.IDLE, Fault.NO_STATUS
         self._driver, self._plant, self._limits, self._clock = driver, plant, limits, clock
+        self._guard = driver.guard
         self._dynamics = JointDynamics(plant)
         self._context = plant.CreateDefaultContext()
         self._estimator = StateEstimator(status_limits(plant, driver), torque_tolerance(limits), period=driver.period)
@@ -86,7 +89,7 @@ class SafetyMonitor:
 
     def receive(self, timeout: float = 0.0) -> None:
         """Receive messages, waiting at most `timeout` [s] if there are none, and check the newest status."""
-        self._driver.receive(timeout)
+        self._guard.receive(timeout)
         self.check()
 
     def check(self) -> None:
@@ -94,7 +97,7 @@ class SafetyMonitor:
 
         If there is no new status, the check is skipped until one period has passed since the last check.
         """
-        status, now = self._driver.read(), self._clock()
+        status, now = self._guard.read(), self._clock()
         is_due = now - self._checked_at >= 0.99 * self._driver.period
         if not is_due and (status is None or status.time == self._estimated.last_time):
             return
@@ -108,17 +111,19 @@ class SafetyMonitor:
         estimate = self._estimator.evaluate(self._estimated, status, now, M, drag)
         self.fault = estimate.fault
         self._update_state(now)
-        is_stopping = self._is_stopping
+        is_stopping, is_failing = self._is_stopping, False
         # The heartbeat precedes the torque, so that the commanding program attributes the torque to this monitor.
         self._num_heartbeats += 1
-        self._driver.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
-        if self._is_holding:
-            self._driver.hold()
-        elif is_stopping:
+        self._guard.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
+        if is_stopping and not (self._is_holding and self._guard.hold()):
             self._command = self._torque(estimate, M)
-            self._driver.write(self._command, now)
+            if not self._guard.write(self._command, now):
+                is_failing = True
+                self.state, self._entered_at = MonitorState.DAMPING, now  # until commands can be sent again
         command = np.zeros(len(M)) if self._command is None else self._command
         self._estimated = self._estimator.advance(estimate, command)
+        if is_failing:
+            self._estimated = self._estimator.forget_torque(self._estimated)
 
     @property
     def _is_stopping(self) -> bool:
@@ -132,7 +137,7 @@ class SafetyMonitor:
         if torque.shape != self._torque_limits.shape:
             return
         self._commanded_at = self._clock()
-        heartbeats = self._driver.read_heartbeats()
+        heartbeats = self._guard.read_heartbeats()
         # While another monitor stops the arm, the command may be that monitor's.
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
             self._commands.add(torque, command_time, self._commanded_at)
@@ -141,7 +146,7 @@ class SafetyMonitor:
             # answer each other endlessly.
             if self._num_repeats < MAX_REPEATS:
                 self._num_repeats += 1
-                self._driver.write(self._command, self._commanded_at)
+                self._guard.write(self._command, self._commanded_at)
             return
         self._command = torque
         if self.state == MonitorState.IDLE:

@@ -41,7 +41,7 @@ from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import damping_matrix
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, StatusLimits
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault, StatusLimits
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.robot import EndEffector, Robot, find_robot
 from guiderail.systems.command_watchdog import CommandWatchdog
@@ -160,7 +160,7 @@ class HardwareStation(Station):
         self._build()
 
     def _build(self) -> None:
-        period, model, builder = self.period, self.controller_plant, DiagramBuilder()
+        period, model, builder, guard = self.period, self.controller_plant, DiagramBuilder(), self.driver.guard
         n = model.plant.num_positions()
         status = StatusWatchdog(model.plant, self.status_limits, torque_tolerance(self.limits), period=period)
         self._status = builder.AddNamedSystem("status", status)
@@ -208,7 +208,7 @@ class HardwareStation(Station):
         safe_torque, arm_state = limiter.get_safe_torque_output_port(), limiter.get_arm_state_output_port()
         if isinstance(self.driver, PoseDriver):
             X_BaseTarget = model.target.CalcPoseInWorld(model.plant.CreateDefaultContext())
-            poses = PosePublisher(self.driver.write_pose, self.driver.stop, X_BaseTarget, period=period)
+            poses = PosePublisher(guard.write_pose, guard.stop, X_BaseTarget, period=period)
             add_system(builder, "publisher", poses, pose=limited_pose, arm_state=arm_state)
             # The torques of the robot's own controller are unknown: velocities are compared with positions only.
             no_torque = builder.AddSystem(ConstantVectorSource(np.zeros(n)))
@@ -217,7 +217,7 @@ class HardwareStation(Station):
             add_system(
                 builder,
                 "publisher",
-                TorquePublisher(self.driver.write, n, period=period, hold=self.driver.hold),
+                TorquePublisher(guard.write, n, period=period, hold=guard.hold),
                 torque=safe_torque,
                 is_sending=limiter.get_is_sending_output_port(),
                 is_holding=limiter.get_is_holding_output_port(),
@@ -260,35 +260,62 @@ class HardwareStation(Station):
     def start(self, simulator: Simulator, check_process: Callable[[], object] | None = None) -> None:
         """Wait for the robot's first status, and initialize a simulator that contains this station.
 
-        `check_process` is called while it waits; it raises an error if the robot's program has ended.
+        `check_process` is called while it waits; it raises an error if the robot's program has ended. While another
+        station controls the arm, use `take_over`, which does not wait.
 
         Raises:
-            InputError: If no status arrives in time, or a `PoseDriver` cannot be configured.
+            InputError: If no status arrives in time, the driver raises an exception while it is read, or a `PoseDriver`
+                cannot be configured.
         """
-        end = time.monotonic() + self._robot_timeout
-        self.driver.receive()
-        while self.driver.read() is None:
+        end, guard = time.monotonic() + self._robot_timeout, self.driver.guard
+        guard.forget_errors()
+        guard.receive()
+        while guard.read() is None:
             if (left := end - time.monotonic()) <= 0.0:
                 raise InputError(f"no robot answers on {self.driver}: start its driver, and check the address")
             if check_process is not None:
                 check_process()
-            self.driver.receive(min(left, PROCESS_CHECK_PERIOD))
+            guard.receive(min(left, PROCESS_CHECK_PERIOD))
+        guard.check_readable()
         if isinstance(self.driver, PoseDriver):
-            self.driver.configure(make_robot_impedance(self.controller_plant, self.impedance))
+            guard.call_at_rest("configure", make_robot_impedance(self.controller_plant, self.impedance))
+        self.receive(simulator.get_mutable_context())
+        guard.check_readable()
+        simulator.Initialize()
+
+    def take_over(self, simulator: Simulator, other: HardwareStation, other_context: Context) -> None:
+        """Initialize a simulator that contains this station, and take control from another station without a gap.
+
+        It neither waits nor raises if the driver fails, because the arm may be moving. The other station and its
+        context are those of `copy_state_from`.
+        """
+        self.driver.guard.receive()
+        if isinstance(self.driver, PoseDriver):
+            self.driver.guard.configure(make_robot_impedance(self.controller_plant, self.impedance))
         self.receive(simulator.get_mutable_context())
         simulator.Initialize()
+        self.copy_state_from(self.GetMyMutableContextFromRoot(simulator.get_mutable_context()), other, other_context)
 
     def receive(self, context: Context, clock: float | None = None) -> None:
         """Read the newest status and heartbeat before a step; `context` is the root context.
 
-        `clock` is the wall clock time [s]; without it, each step counts as one period after the previous step.
+        If a command has failed since the last step, the arm is stopped, and damped as soon as commands can be sent
+        again. `clock` is the wall clock time [s]; without it, each step counts as one period after the previous step.
         """
-        self.driver.receive()
+        guard = self.driver.guard
+        guard.receive()
+        heartbeats = guard.read_heartbeats()
         status, heartbeat = (system.GetMyMutableContextFromRoot(context) for system in (self._status, self._heartbeat))
-        self._status.get_status_input_port().FixValue(status, Value[object](self.driver.read()))
-        self._heartbeat.get_heartbeats_input_port().FixValue(heartbeat, Value[object](self.driver.read_heartbeats()))
+        self._status.get_status_input_port().FixValue(status, Value[object](guard.read()))
+        self._heartbeat.get_heartbeats_input_port().FixValue(heartbeat, Value[object](heartbeats))
         if clock is not None:
             self._status.get_clock_input_port().FixValue(status, [clock])
+        limiter = self._limiter.GetMyMutableContextFromRoot(context)
+        if guard.take_failure():
+            self._status.forget_torque(status)
+            self._limiter.stop(limiter, Fault.COMMAND_FAILED)
+        elif guard.take_recovery():
+            self._limiter.damp_again(limiter)
 
     def stop(self, context: Context) -> None:
         """Damp the arm to rest; `context` is the root context."""

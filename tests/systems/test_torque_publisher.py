@@ -29,6 +29,20 @@ def test_message_is_sent_once_per_period_only_while_enabled():
     assert (len(written), held) == (3, [True, True])
 
 
+def test_torques_are_sent_when_the_driver_fails_to_hold():
+    written = []
+    system = TorquePublisher(lambda torque, time: written.append(time), 1, period=PERIOD, hold=lambda: False)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    for port in ("torque", "is_holding", "is_sending"):
+        system.GetInputPort(port).FixValue(context, [1.0])
+    simulator.AdvanceTo(PERIOD)
+    assert written == [0.0, PERIOD]
+    system.get_is_sending_input_port().FixValue(context, [0.0])
+    simulator.AdvanceTo(2 * PERIOD)
+    assert written == [0.0, PERIOD]
+
+
 @pytest.mark.parametrize("wrong", [{"period": 0.0}, {"num_joints": 0}])
 def test_constructor_refuses_arguments_out_of_range(wrong):
     with pytest.raises(InputError):

@@ -44,8 +44,10 @@ from guiderail.tools.hardware.operator import operator_keys
 from guiderail.tools.hardware.preflight import (
     SPEED,
     PreflightChecks,
+    advance_to_rest,
     confirm_checks,
     describe_distance,
+    hold_where_it_is,
     is_near,
     pose_distance,
     slow_approach,
@@ -121,7 +123,8 @@ class SkillExecutor:
     def run(self, log: Log) -> Outcome:
         """Take control of the arm, approach the skill's start slowly, execute the skill, and damp the arm to rest.
 
-        The arm is brought to rest after any exception too, for example if a policy returns no action.
+        The arm is brought to rest after any exception too, for example if a policy returns no action. An exception of
+        the driver stops the arm as a fault does. If the commands that bring the arm to rest fail, the outcome says so.
 
         Raises:
             InputError: If no robot answers.
@@ -136,9 +139,12 @@ class SkillExecutor:
                 outcome = self._execute()
         except BaseException:
             self._return_control()
-            self._rest()
+            if failure := self._rest():
+                log(failure)
             raise
-        self._rest()
+        if failure := self._rest():
+            fault = outcome.fault or Fault.COMMAND_FAILED
+            return replace(outcome, fault=fault, description=f"{outcome.description}; {failure}")
         return outcome
 
     def _warm_up(self) -> None:
@@ -152,10 +158,11 @@ class SkillExecutor:
         self._clock.begin()
         self._clock.advance(simulator, self._skill_station, round(duration / self._skill_station.period))
 
-    def _rest(self) -> None:
+    def _rest(self) -> str:
+        """Damp the arm to rest; return a sentence on commands that could not be sent, or an empty text."""
         station, context = self._active_station()
         station.stop(context)
-        self._clock.advance(self._simulator, station, round((station.limits.damping_time + 0.1) / station.period))
+        return advance_to_rest(self._clock, self._simulator, station)
 
     def _return_control(self) -> None:
         """Control the arm by the approach's station in a new simulator.
@@ -164,8 +171,10 @@ class SkillExecutor:
         """
         station, root_context = self._active_station()
         context = station.GetMyContextFromRoot(root_context)
-        self._simulator = start_simulator(self._station, self._clock, self._max_wrench)
-        self._station.copy_state_from(self._simulator.get_mutable_context(), station, context)
+        simulator = hold_where_it_is(self._station, self._max_wrench)
+        self._station.take_over(simulator, station, context)
+        self._simulator = simulator
+        self._clock.begin()
 
     def _active_station(self) -> tuple[HardwareStation, Context]:
         """Return the station that controls the arm, and the root context."""
@@ -217,9 +226,8 @@ class SkillExecutor:
         approach_context = self._simulator.get_context()
         station = self._skill_station
         simulator = Simulator(self._diagram)
-        station.start(simulator)
+        station.take_over(simulator, self._station, approach_context)
         context = simulator.get_mutable_context()
-        station.copy_state_from(station.GetMyMutableContextFromRoot(context), self._station, approach_context)
         self._simulator = simulator
         while len(self.trace) < self._skill.num_steps:
             outcome = self._step()

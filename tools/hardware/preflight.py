@@ -13,6 +13,7 @@ from guiderail.diagrams.hardware.driver import Check, PoseDriver
 from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, pose_difference
+from guiderail.models.control.joint_status import check_content
 from guiderail.tools.hardware.operator import confirm
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # speeds of a slow approach [m/s], [rad/s]
@@ -73,6 +74,7 @@ def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
 MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # largest distance and angle from the start pose for an approach [m], [rad]
 MAX_JOINT_SPEED = 0.05  # largest joint speed of an arm at rest [rad/s]
 MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
+MAX_RESTS = 3  # how often the time of a stop is waited for if commands cannot be sent in it
 NUM_STATUSES = 20  # statuses that are received before the checks
 
 
@@ -83,7 +85,7 @@ class PreflightChecks:
     """Pre-flight checks of a station that receives statuses and sends nothing.
 
     Attributes:
-        driver: Driver of the robot; its `error` is the reason why the robot stopped by itself earlier, if it is known.
+        driver: Driver of the robot.
         simulator: Simulator of the station, with the newest status.
     """
 
@@ -105,13 +107,27 @@ class PreflightChecks:
             max_wrench: Largest wrench of the station, (8,), or None.
 
         Raises:
-            InputError: If no robot answers.
+            InputError: If no robot answers, or its statuses cannot be read.
         """
         self._station, self._clock, self._start, self._num_steps = station, clock, start, num_steps
         self._max_wrench, self.driver = max_wrench, station.driver
         self.simulator = start_simulator(station, clock, max_wrench)
         self._commands_before = self.driver.num_foreign_commands
         self._receive_statuses()
+
+    @property
+    def error(self) -> str:
+        """Reason why the robot stopped by itself earlier; empty if there is none or it is unknown."""
+        return self.driver.guard.error
+
+    def clear_error(self) -> None:
+        """Clear the robot's error and receive new statuses; the arm does not move.
+
+        Raises:
+            InputError: If the error persists.
+        """
+        self.driver.guard.recover()
+        self.repeat()
 
     def run(self) -> list[Check]:
         """Return the checks on the newest status."""
@@ -122,7 +138,7 @@ class PreflightChecks:
         """Receive new statuses after a pause in which none were received, and repeat the checks.
 
         Raises:
-            InputError: If no statuses arrive any more.
+            InputError: If no statuses arrive any more, or they cannot be read.
         """
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
@@ -132,11 +148,29 @@ class PreflightChecks:
         return self.run()
 
     def _receive_statuses(self) -> None:
-        """Receive `NUM_STATUSES`; nothing is sent, and a safety monitor's first heartbeat may take a status or two."""
-        before = self.driver.num_statuses
+        """Receive `NUM_STATUSES`; nothing is sent, and a safety monitor's first heartbeat may take a status or two.
+
+        Raises:
+            InputError: If no statuses arrive any more, the driver raises an exception while it is read, or the newest
+                status is malformed without an error of the robot.
+        """
+        driver, before = self.driver, self.driver.num_statuses
         self._clock.advance(self.simulator, self._station, NUM_STATUSES)
-        if self.driver.num_statuses == before:
-            raise InputError(f"no statuses arrive any more on {self.driver}: start its driver again")
+        if driver.num_statuses == before:
+            raise InputError(f"no statuses arrive any more on {driver}: start its driver again")
+        driver.guard.check_readable()
+        fault = check_content(driver.guard.read(), self._station.robot.num_joints)
+        if fault and not self.error:
+            raise InputError(f"the arm stays where it is: {fault.description}: check the driver {driver.name}")
+
+
+def hold_where_it_is(station: HardwareStation, max_wrench: np.ndarray | None) -> Simulator:
+    """Return a simulator of a station without a valid desired pose; arguments as for `start_simulator`."""
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
+    if max_wrench is not None:
+        station.GetInputPort("max_wrench").FixValue(simulator.get_mutable_context(), max_wrench)
+    return simulator
 
 
 def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:
@@ -145,15 +179,29 @@ def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarr
     `max_wrench` is the value of the station's input of this name, (8,), or None if it has no value.
 
     Raises:
-        InputError: If no robot answers.
+        InputError: If no robot answers, or the driver raises an exception while it is read.
     """
-    simulator = Simulator(station)
-    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
-    if max_wrench is not None:
-        station.GetInputPort("max_wrench").FixValue(simulator.get_mutable_context(), max_wrench)
+    simulator = hold_where_it_is(station, max_wrench)
     station.start(simulator, clock.check_robot)
     clock.begin()
     return simulator
+
+
+def advance_to_rest(clock: Clock, simulator: Simulator, station: HardwareStation) -> str:
+    """Advance a stopped station until the arm is damped and its torque is zero, longer if commands cannot be sent.
+
+    Returns:
+        A sentence on commands that could not be sent, or an empty text.
+    """
+    guard = station.driver.guard
+    first = guard.num_failed_commands
+    for _ in range(MAX_RESTS):
+        before = guard.num_failed_commands
+        clock.advance(simulator, station, round((station.limits.damping_time + 0.1) / station.period))
+        if guard.num_failed_commands == before:
+            break
+    failed = guard.num_failed_commands - first
+    return f"{failed} commands that bring the arm to rest could not be sent: {guard.command_error}" * (failed > 0)
 
 
 def check_robot(station: HardwareStation, context: Context, start: np.ndarray, num_commands: int) -> list[Check]:
@@ -231,7 +279,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
             f"{torques}; the full force takes {torque_share:.0%} of the nearest limit{hint}",
         ),
         Check("workspace", f"from {_numbers(limits.lower)} to {_numbers(limits.upper)} m around the target"),
-        *driver.check_setup(),
+        *driver.guard.call_at_rest("check_setup"),
     ]
 
 
@@ -248,12 +296,11 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an
             error and nothing is asked.
     """
-    if error := checks.driver.error:
+    if error := checks.error:
         if assume_yes:
             raise InputError(f"the robot reports {error}: look at it, and start again without --yes")
         confirm(f"The robot reports {error}. Clear the error? The arm does not move.")
-        checks.driver.recover()  # raises an InputError if the error persists
-        checks.repeat()
+        checks.clear_error()
     results = checks.run()
     for check in results:
         log(f"{MARKS[check.passed]}  {check.name:<12}{check.description}")

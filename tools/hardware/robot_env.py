@@ -26,6 +26,7 @@ from guiderail.tools.hardware.connection import Log
 from guiderail.tools.hardware.operator import OperatorKeys
 from guiderail.tools.hardware.preflight import (
     PreflightChecks,
+    advance_to_rest,
     describe_distance,
     is_near,
     pose_distance,
@@ -153,10 +154,7 @@ class RobotEnv(DiagramEnv):
 
     def _switch_station(self, simulator: Simulator, station: HardwareStation) -> None:
         """Transfer control of the arm to another station, without a gap in the commands."""
-        previous, previous_context = self._station, self._context
-        station.start(simulator)
-        context = station.GetMyMutableContextFromRoot(simulator.get_mutable_context())
-        station.copy_state_from(context, previous, previous_context)
+        station.take_over(simulator, self._station, self._context)
         if station is self._task_station:
             self.simulator = simulator
         else:
@@ -389,7 +387,11 @@ class RobotEnv(DiagramEnv):
 
     def _come_to_rest(self) -> None:
         """Advance until the arm is at rest and its commanded torque is zero."""
-        self._advance_statuses(round((self._station.limits.damping_time + 0.1) / self._station.period))
+        self._is_stepping = True
+        failure = advance_to_rest(self._clock, self._active_simulator, self._station)
+        self._is_stepping = False
+        if failure:
+            self._log(failure)
 
     def _resume(self) -> None:
         """If the arm is at rest after a stop, have the operator confirm, and resume.
@@ -406,7 +408,7 @@ class RobotEnv(DiagramEnv):
         else:
             self._confirm_resume(describe_stop(self._active_fault, self._station.driver))
         self._keys.clear_stop()
-        self._station.driver.recover()
+        self._station.driver.guard.recover()
         # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
         # accepted only after the settling time.
         self._clock.begin()

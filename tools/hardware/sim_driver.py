@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
-from guiderail.diagrams.hardware.driver import DRIVERS, find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import DRIVERS, describe_stop, find_driver, safety_limits
 from guiderail.diagrams.hardware.lcm import IiwaDriver, LcmDriver, open_bus
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
@@ -23,6 +23,7 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.insertion import InsertionTask, part_poses
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.control.joint_status import Fault
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.robot import robot_names
 from guiderail.tools.hardware.connection import FCI, SIMULATED, check_simulation
@@ -167,13 +168,16 @@ def run_safety_monitor(
     monitor = SafetyMonitor(driver, plant, safety_limits(plant, driver), clock=lambda: rate * time.monotonic())
     suffix = "" if set_realtime_priority() else "; without real-time priority"
     log(f"watching {driver}{suffix}")
-    state = monitor.state
+    state, failure = monitor.state, ""
     while True:
         monitor.receive(driver.period / rate)
+        if driver.guard.command_error != failure:
+            failure = driver.guard.command_error
+            log(f"{Fault.COMMAND_FAILED.description}: {failure}")
         if monitor.state != state:
             state = monitor.state
-            cause = f": {monitor.fault.description}" if state == MonitorState.DAMPING and monitor.fault else ""
-            log(state.name.lower() + cause)
+            has_cause = state == MonitorState.DAMPING and monitor.fault
+            log(state.name.lower() + (f": {describe_stop(monitor.fault, driver)}" if has_cause else ""))
 
 
 def _insertion_task(name: str) -> InsertionTask:

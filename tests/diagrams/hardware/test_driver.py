@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from direct_driver import START, DirectDriver
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
-from guiderail.diagrams.hardware.driver import DRIVERS, Driver, PoseDriver, find_driver, register_driver, safety_limits
+from guiderail.diagrams.hardware.driver import DRIVERS, PoseDriver, find_driver, register_driver, safety_limits
 from guiderail.diagrams.hardware.fci import FciDriver
 from guiderail.diagrams.hardware.lcm import IiwaDriver, PandaDriver
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
@@ -16,39 +17,8 @@ from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import JointStatus
 from guiderail.models.robots.robot import find_robot
 from guiderail.systems.torque_safety_limiter import ArmState
-
-START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
-
-
-class DirectDriver(Driver):
-    """Joints without gravity and friction that are integrated when a torque is written."""
-
-    name = "direct"
-    torque_reflex_limits = (60.0,) * 7
-    has_command_timeout = True
-
-    def __init__(self, url=""):
-        super().__init__(url)
-        self.model = ArmControllerPlant(BncWorkcell())
-        self.positions = self.model.solve(START, self.model.posture)
-        self.velocities, self.time, self.torques = np.zeros(7), 0.0, []
-
-    def read(self):
-        return JointStatus(self.time, self.positions.copy(), self.velocities.copy(), np.zeros(7))
-
-    def write(self, torque, time):
-        plant = self.model.plant
-        context = plant.CreateDefaultContext()
-        plant.SetPositions(context, self.positions)
-        M = plant.CalcMassMatrix(context)
-        self.velocities = self.velocities + self.period * np.linalg.solve(M, torque)
-        self.torques.append(torque)
-
-    def elapse(self):
-        self.positions, self.time = self.positions + self.period * self.velocities, self.time + self.period
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from guiderail.diagrams.hardware.monitor import MAX_REPEATS, MonitorState, Safet
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault, damping_torque
+from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault, JointStatus, damping_torque
 from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
@@ -280,6 +280,65 @@ def test_monitors_heartbeats_have_its_number(arm):
     assert [sequence for sequence, _, _ in sent] == [1, 2, 3]
     assert len({sender for _, _, sender in sent}) == 1
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
+
+
+def unplugged(*arguments):
+    raise OSError("cable unplugged")
+
+
+@pytest.mark.parametrize(
+    ("method", "replacement"),
+    [
+        ("read", unplugged),
+        ("receive", unplugged),
+        ("read", lambda: {"time": 1.0}),
+        ("read", lambda: JointStatus("now", None, 0.0, 0.0)),
+    ],
+)
+def test_monitor_damps_when_the_driver_fails(arm, method, replacement):
+    bus = Bus(arm).watch()
+    setattr(bus.monitor._driver, method, replacement)
+    moving = bus.speed
+    bus.go(1)
+    assert (bus.monitor.state, bus.monitor.fault, bus.is_stopping) == (MonitorState.DAMPING, Fault.MALFORMED, True)
+    bus.go(20)
+    assert bus.speed < 0.2 * moving
+
+
+@pytest.mark.parametrize("failures", [1, 20, 60])
+def test_monitor_damps_when_its_commands_have_failed(arm, failures):
+    """The robot executes the last torque meanwhile."""
+    bus = Bus(arm).watch()
+    bus.monitor._driver.write = unplugged
+    bus.go(MAX_MISSED_MESSAGES + failures)
+    assert (bus.monitor.state, bus.is_stopping, bus.commands) == (MonitorState.DAMPING, True, [])
+    del bus.monitor._driver.write
+    speed = bus.speed
+    bus.go(1)
+    for _ in range(30):
+        bus.go(1)
+        assert bus.speed < 1.05 * speed
+    assert bus.speed < 0.1 * speed
+    bus.go(60)
+    assert bus.monitor.state == MonitorState.IDLE
+
+
+@pytest.mark.parametrize("method", ["write_heartbeat", "read_heartbeats"])
+def test_monitor_continues_when_heartbeats_fail(arm, method):
+    bus = Bus(arm).watch()
+    setattr(bus.monitor._driver, method, unplugged)
+    bus.go(MAX_MISSED_MESSAGES + 10)
+    assert bus.monitor.state == MonitorState.DAMPING
+    assert bus.commands
+
+
+def test_monitor_sends_torques_when_the_driver_fails_to_hold(arm):
+    bus = Bus(arm).watch()
+    bus.monitor._driver.can_hold, bus.monitor._driver.hold = True, unplugged
+    moving = bus.speed
+    bus.go(20, status=b"text")
+    assert bus.monitor.state == MonitorState.DAMPING
+    assert bus.speed < 0.2 * moving
 
 
 def test_monitor_sends_heartbeats_before_the_first_status(arm):

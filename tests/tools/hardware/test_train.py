@@ -20,7 +20,7 @@ from guiderail.diagrams.hardware.lcm import IiwaDriver
 from guiderail.diagrams.stations.station import max_wrench
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE, MAX_HOLD_MOTION, HoldTest
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault
+from guiderail.models.control.joint_status import Fault, JointStatus
 from guiderail.models.policy import Policy
 from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.evaluation.rollout import rollout
@@ -217,6 +217,46 @@ def test_single_wrong_status_before_control_is_taken_moves_nothing(monkeypatch):
     assert np.linalg.norm((env.pose - START)[:3]) > 0.05
     env._take_control()
     np.testing.assert_allclose(env.pose, START, atol=1e-3)
+
+
+def unplugged(*arguments):
+    raise OSError("cable unplugged")
+
+
+@pytest.mark.parametrize(
+    ("method", "replacement", "fault"),
+    [
+        ("read", unplugged, Fault.MALFORMED),
+        ("receive", unplugged, Fault.MALFORMED),
+        ("read", lambda: JointStatus("now", 0.0, None, 0.0), Fault.MALFORMED),
+        ("read", lambda: None, Fault.NO_STATUS),
+        ("write", unplugged, Fault.COMMAND_FAILED),
+    ],
+)
+def test_episode_is_truncated_when_the_driver_fails(env, monkeypatch, method, replacement, fault):
+    driver, messages = env._task_station.driver, []
+    env.reset()
+    monkeypatch.setattr(env, "_log", messages.append)
+    with monkeypatch.context() as patch:
+        env.clock.happens = {env.clock.step + 10: lambda: patch.setattr(driver, method, replacement)}
+        *_, truncated, info = env.step(np.zeros(2))
+        assert (truncated, info["termination"], env.fault) == (True, "stopped", fault)
+        env.rest()
+        env._switch_to_new_transfer()  # neither waits nor raises
+    assert any("could not be sent: write raised OSError" in message for message in messages) == (method == "write")
+    env.reset()  # asks, and resumes
+    assert len(env.asked) == 1
+    assert ("raised OSError: cable unplugged" in env.asked[0]) == (replacement is unplugged)
+
+
+def test_arm_does_not_resume_when_the_recovery_raises(env, monkeypatch):
+    env.reset()
+    env.keys.request_stop()
+    env.step(np.zeros(2))
+    with monkeypatch.context() as patch:
+        patch.setattr(env._station.driver, "recover", unplugged)
+        with pytest.raises(InputError, match="the driver iiwa failed: recover raised OSError: cable unplugged"):
+            env.reset()
 
 
 def test_motions_between_episodes_have_the_bound_of_the_episode(monkeypatch):

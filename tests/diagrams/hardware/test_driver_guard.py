@@ -1,0 +1,324 @@
+"""Drivers that raise exceptions or return wrong objects: a moving arm is damped to rest nevertheless."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from direct_driver import START, DirectDriver
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.hardware.clock import WallClock
+from guiderail.diagrams.hardware.driver import PoseDriver, describe_stop
+from guiderail.diagrams.hardware.station import HardwareStation
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import MALFORMED_STATUS, Fault, Heartbeat, JointStatus
+from guiderail.systems.torque_safety_limiter import ArmState
+
+DAMPING_STEPS = 60  # steps in which the arm is damped to rest
+PERIOD = DirectDriver.period
+
+
+class NoisyDriver(DirectDriver):
+    """Robot with noise in its velocities; constant ones would count as frozen."""
+
+    repeats = False  # the last torque stays in effect while `write` fails
+
+    def read(self):
+        status = super().read()
+        return replace(status, velocities=status.velocities + 1e-9 * (-1) ** round(self.time / self.period))
+
+    def elapse(self):
+        if self.repeats:
+            DirectDriver.write(self, self.torques.pop(), self.time)
+        super().elapse()
+
+
+class Moving:
+    """Arm that moves at 0.3 rad/s under a station."""
+
+    def __init__(self, driver=None):
+        self.driver = driver or NoisyDriver()
+        self.station = HardwareStation(BncWorkcell(), self.driver)
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        self.step = 0
+        desired_pose = self.station.get_desired_pose_input_port()
+        desired_pose.FixValue(self.context, START)
+        self.station.start(self.simulator)
+        self.go(200)
+        desired_pose.FixValue(self.context, START + [0.03, 0.0, 0.03, 0.0, 0.0, 0.0])
+        self.go(50)
+        assert self.speed > 0.2
+        self.num_torques = len(self.driver.torques)
+
+    def go(self, steps=1):
+        for _ in range(steps):
+            self.step += 1
+            self.driver.elapse()
+            self.simulator.AdvancePendingEvents()
+            self.station.receive(self.context)
+            self.simulator.AdvanceTo(self.step * PERIOD)
+
+    @property
+    def speed(self):
+        return np.abs(self.driver.velocities).max()
+
+    @property
+    def fault(self):
+        return Fault(int(self.station.get_fault_output_port().Eval(self.context)[0]))
+
+    @property
+    def arm_state(self):
+        return ArmState(int(self.station.get_arm_state_output_port().Eval(self.context)[0]))
+
+    @property
+    def torques(self):
+        return self.driver.torques[self.num_torques :]
+
+
+def unplugged(*arguments):
+    raise OSError("cable  unplugged")
+
+
+def exits(*arguments):
+    raise SystemExit(3)
+
+
+def returned(change, driver):
+    """Let a driver return a changed status."""
+    read = driver.read
+    driver.read = lambda: change(read())
+
+
+STATUSES = {
+    "text": (lambda status: replace(status, positions=["a"] * 7), Fault.MALFORMED),
+    "scalar": (lambda status: JointStatus(status.time, 0.0, 0.0, 0.0), Fault.WRONG_SIZE),
+    "none": (lambda status: replace(status, positions=None), Fault.MALFORMED),
+    "column": (lambda status: replace(status, positions=status.positions[:, None]), Fault.WRONG_SIZE),
+    "complex": (lambda status: replace(status, positions=status.positions + 0j), Fault.MALFORMED),
+    "text as time": (lambda status: replace(status, time="now"), Fault.MALFORMED),
+    "no time": (lambda status: replace(status, time=None), Fault.MALFORMED),
+    "array as time": (lambda status: replace(status, time=np.zeros(2)), Fault.MALFORMED),
+    "dictionary": (lambda status: {"time": status.time}, Fault.MALFORMED),
+    "no status": (lambda status: None, Fault.NO_STATUS),
+}
+METHODS = ("read", "receive", "read_heartbeats")
+
+
+@pytest.mark.parametrize("name", STATUSES)
+def test_arm_is_damped_when_a_status_is_malformed(name):
+    change, fault = STATUSES[name]
+    arm = Moving()
+    returned(change, arm.driver)
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (fault, ArmState.OFF)
+    assert arm.speed < 0.05
+    assert len(arm.torques) >= 40
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fail", [unplugged, exits])
+def test_arm_is_damped_when_a_read_raises(method, fail):
+    arm = Moving()
+    setattr(arm.driver, method, fail)
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+    assert len(arm.torques) >= 40
+    reason = "OSError: cable unplugged" if fail is unplugged else "SystemExit: 3"
+    assert describe_stop(arm.fault, arm.driver) == f"{Fault.MALFORMED.description} ({method} raised {reason})"
+
+
+@pytest.mark.parametrize("heartbeats", [None, 3, ["heartbeat"]])
+def test_arm_is_damped_when_heartbeats_are_wrong(heartbeats):
+    arm = Moving()
+    arm.driver.read_heartbeats = lambda: heartbeats
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_single_exception_stops_the_arm(method):
+    arm = Moving()
+    setattr(arm.driver, method, unplugged)
+    arm.go()
+    delattr(arm.driver, method)
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+
+
+def test_heartbeats_of_the_driver_are_returned():
+    driver, heartbeat = DirectDriver(), Heartbeat(1, False)
+    driver.read_heartbeats = lambda: [heartbeat]
+    assert driver.guard.read_heartbeats() == (heartbeat,)
+
+
+@pytest.mark.parametrize("fail", [unplugged, exits])
+@pytest.mark.parametrize("repeats", [False, True])
+@pytest.mark.parametrize("failures", [1, 5, 20, 38, 60])
+def test_arm_is_damped_when_commands_fail(fail, repeats, failures):
+    """A stop of 40 steps begins again after commands could not be sent."""
+    arm = Moving()
+    arm.driver.write, arm.driver.repeats = fail, repeats
+    arm.go(failures)
+    del arm.driver.write
+    arm.driver.repeats, speed = False, arm.speed
+    assert len(arm.torques) == 0
+    for _ in range(DAMPING_STEPS):
+        arm.go()
+        assert arm.speed <= speed + 0.01
+    assert (arm.fault, arm.arm_state) == (Fault.COMMAND_FAILED, ArmState.OFF)
+    assert arm.speed < 0.03
+    assert arm.driver.guard.num_failed_commands == failures
+    assert describe_stop(arm.fault, arm.driver).startswith("a command could not be sent to the robot (write raised ")
+
+
+@pytest.mark.parametrize(("failures", "bound"), [(1, 0.05), (5, 0.1), (15, 0.2)])
+def test_arm_is_damped_when_reads_and_commands_fail(failures, bound):
+    """The velocity is predicted for 20 steps, without torques that were not sent."""
+    arm = Moving()
+    arm.driver.write = arm.driver.read = unplugged
+    arm.go(failures)
+    del arm.driver.write
+    for _ in range(DAMPING_STEPS):
+        speed = arm.speed
+        arm.go()
+        assert arm.speed <= speed + 1e-3
+    assert arm.arm_state == ArmState.OFF
+    assert arm.speed < bound
+
+
+def test_arm_is_stopped_when_all_commands_fail():
+    arm = Moving()
+    arm.driver.write = unplugged
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.COMMAND_FAILED, ArmState.OFF)
+    assert arm.driver.guard.num_failed_commands > 40  # each step tries again
+
+
+def test_fault_remains_when_a_later_command_fails():
+    arm = Moving()
+    arm.station.stop(arm.context)
+    arm.driver.write = unplugged
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.USER_STOP, ArmState.OFF)
+
+
+class HoldingDriver(NoisyDriver):
+    can_hold = True
+
+    def hold(self):
+        unplugged()
+
+
+def test_arm_is_damped_when_the_driver_fails_to_hold():
+    arm = Moving(HoldingDriver())
+    returned(lambda status: MALFORMED_STATUS, arm.driver)
+    arm.go(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+
+
+def test_arm_is_not_damped_when_the_driver_holds():
+    arm, calls = Moving(HoldingDriver()), []
+    arm.driver.hold = partial(calls.append, 1)
+    returned(lambda status: MALFORMED_STATUS, arm.driver)
+    arm.go(5)
+    assert (len(calls), arm.torques) == (5, [])
+
+
+@pytest.mark.parametrize("method", ["read", "receive"])
+def test_other_station_takes_over_without_waiting_when_a_read_fails(method):
+    """A start would wait for the robot, or raise, while the arm moves."""
+    arm = Moving()
+    if method == "read":
+        arm.driver.read = lambda: None
+    else:
+        arm.driver.receive = unplugged
+    other = arm.station.clone(BncWorkcell())
+    simulator = Simulator(other)
+    other.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
+    other.take_over(simulator, arm.station, arm.context)
+    arm.station, arm.simulator, arm.context, arm.step = other, simulator, simulator.get_mutable_context(), 0
+    arm.go(DAMPING_STEPS)
+    assert arm.fault == (Fault.NO_STATUS if method == "read" else Fault.MALFORMED)
+    assert arm.speed < 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_start_raises_when_a_read_raises(method):
+    driver = DirectDriver()
+    station = HardwareStation(BncWorkcell(), driver)
+    setattr(driver, method, unplugged)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    sentence = f"no status can be read from the driver direct: {method} raised OSError: cable unplugged"
+    with pytest.raises(InputError, match=sentence):
+        station.start(simulator)
+    delattr(driver, method)
+    station.start(simulator)  # an earlier error is forgotten
+
+
+def test_wall_clock_steps_when_receiving_raises():
+    driver = DirectDriver()
+    station, clock = HardwareStation(BncWorkcell(), driver), WallClock(driver)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    station.start(simulator)
+    calls = []
+
+    def receive(timeout=0.0):
+        calls.append(timeout)
+        unplugged()
+
+    driver.receive = receive
+    clock.begin()
+    clock.advance(simulator, station, 3)
+    assert simulator.get_context().get_time() == 3 * driver.period
+    assert len(calls) < 20  # it waits, and does not spin
+
+
+def test_error_that_cannot_be_read_is_described():
+    class Broken(DirectDriver):
+        error = property(unplugged)
+
+    assert describe_stop(Fault.STALE, Broken()).endswith("(error raised OSError: cable unplugged)")
+    assert describe_stop(Fault.STALE, DirectDriver()) == Fault.STALE.description
+
+
+def test_exception_is_not_named_when_a_later_status_is_malformed():
+    driver = DirectDriver()
+    driver.read = unplugged
+    assert driver.guard.read() is MALFORMED_STATUS
+    driver.read = lambda: "status"
+    assert driver.guard.read() is MALFORMED_STATUS
+    assert describe_stop(Fault.MALFORMED, driver) == Fault.MALFORMED.description
+
+
+def test_recovery_that_raises_is_refused():
+    driver = DirectDriver()
+    driver.recover = unplugged
+    with pytest.raises(InputError, match="the driver direct failed: recover raised OSError: cable unplugged"):
+        driver.guard.recover()
+
+    def persists():
+        raise InputError("the error persists")
+
+    driver.recover = persists
+    with pytest.raises(InputError, match="the error persists"):
+        driver.guard.recover()
+
+
+@pytest.mark.parametrize("method", ["configure", "write_pose", "stop"])
+def test_command_of_a_pose_driver_that_raises_is_a_failure(method):
+    class Poses(PoseDriver):
+        name = "poses"
+        configure = write_pose = stop = read = unplugged
+
+    guard = Poses().guard
+    getattr(guard, method)(*[None] * {"configure": 1, "write_pose": 2, "stop": 0}[method])
+    assert guard.command_error == f"{method} raised OSError: cable unplugged"
+    assert [guard.take_failure(), guard.take_failure()] == [True, False]

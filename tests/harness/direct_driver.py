@@ -1,0 +1,38 @@
+"""A driver without messages: a robot in the same process that implements `read` and `write` only."""
+
+import numpy as np
+
+from guiderail.diagrams.hardware.driver import Driver
+from guiderail.diagrams.stations.arm import ArmControllerPlant
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.models.control.joint_status import JointStatus
+
+START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
+
+
+class DirectDriver(Driver):
+    """Joints without gravity and friction that are integrated when a torque is written."""
+
+    name = "direct"
+    torque_reflex_limits = (60.0,) * 7
+    has_command_timeout = True
+
+    def __init__(self, url=""):
+        super().__init__(url)
+        self.model = ArmControllerPlant(BncWorkcell())
+        self.positions = self.model.solve(START, self.model.posture)
+        self.velocities, self.time, self.torques = np.zeros(7), 0.0, []
+
+    def read(self):
+        return JointStatus(self.time, self.positions.copy(), self.velocities.copy(), np.zeros(7))
+
+    def write(self, torque, time):
+        plant = self.model.plant
+        context = plant.CreateDefaultContext()
+        plant.SetPositions(context, self.positions)
+        M = plant.CalcMassMatrix(context)
+        self.velocities = self.velocities + self.period * np.linalg.solve(M, torque)
+        self.torques.append(torque)
+
+    def elapse(self):
+        self.positions, self.time = self.positions + self.period * self.velocities, self.time + self.period
