@@ -1,9 +1,11 @@
 """Parsing of local model files, without access to the network."""
 
+import math
 import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from xml.etree import ElementTree
 
 from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import MultibodyPlant
@@ -39,13 +41,35 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
     """
     with _allow_package_map():
         parser = _make_parser(plant)
+        _refuse_crossed_limits(Path(path))
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
         try:
             return parser.AddModels(str(path))
-        except RuntimeError as error:
+        except (RuntimeError, SystemExit) as error:  # a failed assertion of Drake is a SystemExit
             words = " ".join(str(error).split())
             raise InputError(f"the model {path}, or a mesh in it, can't be read: {words}") from error
+
+
+def _refuse_crossed_limits(path: Path) -> None:
+    """Raise an `InputError` that names the joint if a lower limit is above the upper one; Drake would not name it."""
+    try:
+        joints = list(ElementTree.parse(path).iter("joint"))
+    except (ElementTree.ParseError, OSError, ValueError):
+        return  # a file of another type, or one that the parser refuses
+    for joint in joints:
+        for limit in joint.iter("limit"):  # attributes in URDF, elements in SDF
+            lower, upper = (_to_float(limit.get(name, limit.findtext(name))) for name in ("lower", "upper"))
+            if lower > upper:
+                name = joint.get("name", "")
+                raise InputError(f"the lower position limit of joint {name!r} in {path} is above the upper one")
+
+
+def _to_float(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan
 
 
 def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:
@@ -57,7 +81,7 @@ def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective
     try:
         with _allow_package_map():
             ProcessModelDirectives(ModelDirectives(directives=list(directives)), _make_parser(plant))
-    except RuntimeError as error:
+    except (RuntimeError, SystemExit) as error:
         words = " ".join(str(error).split())
         raise InputError(f"the model directives of the robot's surroundings can't be processed: {words}") from error
 

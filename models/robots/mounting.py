@@ -64,7 +64,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
     actuators = _list_actuators(plant, joints, label)
-    _check_joints(robot, joints, actuators, label)
+    _check_joints(plant, robot, joints, actuators, label)
     return MountedRobot(model, base, find("frame", robot.flange_frame), actuators)
 
 
@@ -162,9 +162,23 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
     return actuators
 
 
-def _check_joints(robot: Robot, joints: Sequence[Joint], actuators: Sequence[JointActuator], label: str) -> None:
-    """Raise an `InputError` unless the drives are complete and the postures are within the limits of the joints."""
+def _check_joints(
+    plant: MultibodyPlant, robot: Robot, joints: Sequence[Joint], actuators: Sequence[JointActuator], label: str
+) -> None:
+    """Raise an `InputError` unless limits, masses and drives are complete and the postures are within the limits."""
     for index, (joint, actuator) in enumerate(zip(joints, actuators, strict=True)):
+        lower, upper = joint.position_lower_limits().item(), joint.position_upper_limits().item()
+        if not -math.inf < lower < upper < math.inf:
+            raise InputError(
+                f"{label}: joint {joint.name()!r} needs finite position limits in the model file, the lower one below "
+                "the upper one"
+            )
+        if not 0.0 < joint.velocity_upper_limits().item() < math.inf:
+            raise InputError(
+                f"{label}: joint {joint.name()!r} needs a positive, finite velocity limit in the model file"
+            )
+        if not sum(body.default_mass() for body in plant.GetBodiesWeldedTo(joint.child_body())) > 0.0:
+            raise InputError(f"{label}: the link that joint {joint.name()!r} moves needs a mass in the model file")
         if not 0.0 < actuator.effort_limit() < math.inf:
             raise InputError(f"{label}: joint {joint.name()!r} needs a finite effort limit in the model file")
         if not actuator.default_reflected_inertia() > 0.0:
@@ -172,7 +186,6 @@ def _check_joints(robot: Robot, joints: Sequence[Joint], actuators: Sequence[Joi
                 f"{label}: joint {joint.name()!r} needs a transmission with rotor inertia and gear ratio in the model "
                 "file, because an impedance controller is unstable without reflected inertia"
             )
-        lower, upper = joint.position_lower_limits().item(), joint.position_upper_limits().item()
         for what, posture in (("home", robot.home), ("level_posture", robot.level_posture)):
             if posture is not None and not lower <= posture[index] <= upper:
                 raise InputError(

@@ -8,6 +8,7 @@ import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.parsing import add_models
 from guiderail.models.robots.mounting import add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import find_end_effector, find_robot
 
@@ -48,6 +49,20 @@ def drop(pattern, by=""):
     ("change", "fields", "match"),
     [
         (drop(r' effort="[\d.]+"'), {}, "shoulder_pan_joint' needs a finite effort limit"),
+        (drop(r' lower="[^"]*" upper="[^"]*"'), {}, "shoulder_pan_joint' needs finite position limits"),
+        (drop(r'lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"'), {}, "pan_joint' needs finite position limits"),
+        (drop(r' velocity="[^"]*"'), {}, "shoulder_pan_joint' needs a positive, finite velocity limit"),
+        (drop(r'velocity="[^"]*"', 'velocity="0"'), {}, "shoulder_pan_joint' needs a positive, finite velocity limit"),
+        (
+            drop(r"(?s)<inertial>.*?</inertial>"),
+            {},
+            "robot 'mine': the link that joint 'ur5e_shoulder_pan_joint' moves needs a mass",
+        ),
+        (
+            drop(r'lower="([^"]*)" upper="([^"]*)"', r'lower="\2" upper="\1"'),
+            {},
+            "robot 'mine': the lower position limit of joint 'ur5e_shoulder_pan_joint' in .* is above the upper one",
+        ),
         (drop(r"<drake:rotor_inertia[^>]*/>"), {}, "shoulder_pan_joint' needs a transmission with rotor inertia"),
         (drop(r'gear_ratio value="\d+"', 'gear_ratio value="0"'), {}, "rotor inertia and gear ratio"),
         (
@@ -64,6 +79,15 @@ def test_robot_with_incomplete_drives_or_a_posture_out_of_range_is_refused(tmp_p
     model.write_text(change(UR5E.model.read_text()))
     with pytest.raises(InputError, match=match):
         add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, name="mine", model=model, **fields))
+
+
+def test_crossed_limits_of_an_sdf_file_name_the_joint(tmp_path):
+    limit = "<axis><xyz>0 0 1</xyz><limit><lower>1</lower><upper>-1</upper></limit></axis>"
+    joint = f"<joint name='hinge' type='revolute'><parent>world</parent><child>link</child>{limit}</joint>"
+    file = tmp_path / "arm.sdf"
+    file.write_text(f"<sdf version='1.9'><model name='arm'><link name='link'/>{joint}</model></sdf>")
+    with pytest.raises(InputError, match="the lower position limit of joint 'hinge' in .*arm.sdf is above the upper"):
+        add_models(MultibodyPlant(0.0), file)
 
 
 def test_lighten_rotors_scales_the_rotor_inertia():
