@@ -226,6 +226,15 @@ TaskImports = Annotated[
 ]
 
 
+HardwareImports = Annotated[
+    list[str] | None, option("Module or file (.py) that registers a robot or a driver.", "--import", metavar="MODULE")
+]
+TemplateImports = Annotated[
+    list[str] | None,
+    option("Module or file (.py) that registers parts of templates.", "--import", metavar="MODULE"),
+]
+
+
 def _trust(context: typer.Context, value: bool) -> bool:
     """Allow imports that a file names until the command ends, if the option is given; return the option's value."""
     if value:
@@ -354,6 +363,18 @@ def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]
     return environment
 
 
+def import_files(imports: Sequence[str] | None) -> None:
+    """Import the modules and files that are given by `--import`.
+
+    Raises:
+        InputError: If an import fails.
+    """
+    if imports:
+        from guiderail.tools.imports import import_modules
+
+        import_modules(imports)
+
+
 def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
     """Import modules and register the task if it is given by its folder.
 
@@ -362,10 +383,7 @@ def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tu
     Raises:
         InputError: If an import fails or the task folder is invalid.
     """
-    if imports:
-        from guiderail.tools.imports import import_modules
-
-        import_modules(imports)
+    import_files(imports)
     if not (Path(typed) / "task.yaml").is_file():
         return typed, ()
     from guiderail.tools.environments import task_named

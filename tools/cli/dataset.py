@@ -108,11 +108,13 @@ def fit_bounds(
 def validate_template(
     file: Annotated[Path, argument("Template (.yaml), or one of {templates}.", "FILE")],
     draw: Annotated[Path | None, option("Picture of the states to write: .png, .svg, .pdf or .dot.")] = None,
+    imports: cli.TemplateImports = None,
     as_json: cli.Json = False,
 ) -> None:
     """Validate and summarize a shared control template before it is used."""
     from guiderail.tools.datasets.validate import validate_template as check
 
+    cli.import_files(imports)
     print_result(check(file, draw), as_json)
 
 

@@ -28,6 +28,7 @@ def deploy(
     out: Annotated[
         Path | None, option("Folder of the recording.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]")
     ] = None,
+    imports: cli.HardwareImports = None,
     trust_imports: cli.TrustImports = False,
 ) -> None:
     """Execute a policy on a robot.
@@ -38,6 +39,7 @@ def deploy(
     """
     from guiderail.tools.hardware.executor import deploy as deploy_policy
 
+    cli.import_files(imports)
     environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
     connection = cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
     code = deploy_policy(

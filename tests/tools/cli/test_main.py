@@ -118,6 +118,8 @@ def trained(bead_run):
         (["dataset", "validate", "new.yaml"], "there is no file new.yaml"),
         (["dataset", "fit-bounds", "new.npz", "--outputs", "x"], "whole numbers separated by commas"),
         (["dataset", "import", "new.csv", "--out", "new.npz", "--target", "1_0,0,0,0,0,0"], "takes 6 numbers"),
+        (["template", "validate", "pouring", "--import", "new.py"], "no module, file or task folder new.py to import"),
+        (["deploy", "new", "--import", "new.py"], "no module, file or task folder new.py to import"),
         (["template", "validate", "pourin"], "or one of end_effector_velocity, grid_clamp, pouring"),
         (["template", "validate", "."], "a template is .yaml"),
         (["study", "connector.yaml", "--out", "new"], "there is no file connector.yaml"),
