@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Real
 from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.hardware.driver_guard import DriverGuard
+from guiderail.diagrams.hardware.driver_guard import ERRORS, DriverGuard
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import Registry, check_class
@@ -32,6 +33,15 @@ TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 TORQUE_TOLERANCE_SHARE = 0.02  # largest error of a joint torque by friction, gravity and sensor, relative to its limit
 
 MAX_DIFFERENCE = 0.02  # largest difference of an entry of a flange's pose from that of the driver's robot [m, 1]
+
+# What a driver must give as each of its attributes, for messages.
+NEEDED = {
+    "name": "a text",
+    "torque_reflex_limits": "a positive number of each joint [Nm]",
+    "has_command_timeout": "True or False",
+    "period": "a positive time [s]",
+    "hold_off": "a time that is not negative [s]",
+}
 
 CommandCallback = Callable[[np.ndarray, float], None]
 
@@ -221,6 +231,51 @@ def find_driver(robot: Robot | str) -> type[Driver]:
         InputError: If no driver has this name, or the name of the robot.
     """
     return DRIVERS.get(robot if isinstance(robot, str) else robot.name)
+
+
+def open_driver(driver: Robot | str, url: str) -> Driver:
+    """Return a connection by the default driver of a robot, or by the driver with a name.
+
+    Raises:
+        InputError: If there is no such driver, it cannot be opened at `url`, or it is incomplete (`check_driver`).
+    """
+    name = driver if isinstance(driver, str) else driver.name
+    try:
+        opened = find_driver(driver)(url)
+    except InputError:
+        raise
+    except ERRORS as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"the driver {name} can't be opened: {type(error).__name__}: {words}") from error
+    if not isinstance(opened, Driver):
+        raise InputError(f"the driver {name} is no Driver: register a class that is derived from Driver")
+    check_driver(opened)
+    return opened
+
+
+def check_driver(driver: Driver) -> None:
+    """Check that a driver has the attributes that a station needs.
+
+    Raises:
+        InputError: If an attribute is missing, has another type, or a limit or time is out of range.
+    """
+    limits = getattr(driver, "torque_reflex_limits", None)
+    needed = {
+        "name": isinstance(getattr(driver, "name", None), str) and bool(driver.name),
+        "torque_reflex_limits": isinstance(limits, Sequence) and bool(limits) and all(map(_is_positive, limits)),
+        "has_command_timeout": isinstance(getattr(driver, "has_command_timeout", None), bool),
+        "period": _is_positive(driver.period),
+        "hold_off": driver.hold_off == 0.0 or _is_positive(driver.hold_off),
+    }
+    for attribute, is_given in needed.items():
+        if not is_given:
+            raise InputError(f"the driver {type(driver).__name__} needs {NEEDED[attribute]} as its {attribute}")
+    if not hasattr(driver, "num_statuses"):
+        raise InputError(f"the driver {type(driver).__name__} must call super().__init__(url) in its constructor")
+
+
+def _is_positive(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and 0.0 < float(value) < np.inf
 
 
 def check_robot(driver: Driver, robot: Robot) -> None:

@@ -16,8 +16,9 @@ from guiderail.diagrams.hardware.driver import (
     Driver,
     PoseDriver,
     RobotImpedance,
+    check_driver,
     check_robot,
-    find_driver,
+    open_driver,
     safety_limits,
     torque_tolerance,
 )
@@ -134,13 +135,15 @@ class HardwareStation(Station):
             control_period: Time between commands of a skill [s], a whole multiple of `period`.
 
         Raises:
-            InputError: If the robot has no driver or does not fit it (`check_robot`), the address is unusable, the
-                settling time is shorter than the driver's `hold_off`, or the control period is no multiple of `period`.
+            InputError: If the robot has no driver or does not fit it (`check_robot`), the driver is incomplete
+                (`check_driver`), the address is unusable, the settling time is shorter than the driver's `hold_off`, or
+                the control period is no multiple of `period`.
         """
         super().__init__()
         robot = find_robot(robot)
         if not isinstance(driver, Driver):
-            driver = find_driver(driver or robot)(robot_url)
+            driver = open_driver(driver or robot, robot_url)
+        check_driver(driver)
         check_robot(driver, robot)
         self.driver, self.robot = driver, robot
         self.period = period = driver.period if period is None else period

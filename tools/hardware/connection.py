@@ -143,7 +143,7 @@ class RobotConnection:
     def __post_init__(self) -> None:
         if not self.robot:
             own = find_driver(self.driver) if self.driver else None
-            object.__setattr__(self, "robot", own.robot or own.name if own else DEFAULT_ROBOT)
+            object.__setattr__(self, "robot", getattr(own, "robot", "") or getattr(own, "name", "") or DEFAULT_ROBOT)
         if self.synchronous and not self.sim:
             raise InputError("a real robot does not wait for commands: --synchronous is for a simulated driver, --sim")
         if self.sim and not self.driver:

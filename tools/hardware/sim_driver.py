@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.hardware.clock import check_rate, set_realtime_priority
-from guiderail.diagrams.hardware.driver import DRIVERS, describe_stop, find_driver, safety_limits
+from guiderail.diagrams.hardware.driver import DRIVERS, describe_stop, open_driver, safety_limits
 from guiderail.diagrams.hardware.lcm import IiwaDriver, LcmDriver, open_bus
 from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa, serve_in_lockstep, serve_in_real_time
 from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
@@ -162,9 +162,8 @@ def run_safety_monitor(
     check_rate(rate)
     if robot not in (known := [name for name in robot_names() if name in DRIVERS.names()]):
         raise InputError(f"a safety monitor watches no robot {brief(robot)}: {did_you_mean(robot, known)}")
-    driver_type = find_driver(robot)
     plant = ArmControllerPlant(_insertion_task(task).workcell(), robot).plant
-    driver = driver_type(url)
+    driver = open_driver(robot, url)
     monitor = SafetyMonitor(driver, plant, safety_limits(plant, driver), clock=lambda: rate * time.monotonic())
     suffix = "" if set_realtime_priority() else "; without real-time priority"
     log(f"watching {driver}{suffix}")

@@ -68,6 +68,62 @@ def test_driver_is_found_by_name_when_registered(registered):
     assert (np.array(safety_limits(plant, DirectDriver).torque) <= 0.9 * 60.0).all()
 
 
+@pytest.mark.parametrize(
+    ("attribute", "value", "message"),
+    [
+        ("name", None, "the driver Incomplete needs a text as its name"),
+        ("name", "", "needs a text as its name"),
+        ("torque_reflex_limits", None, "needs a positive number of each joint .* as its torque_reflex_limits"),
+        ("torque_reflex_limits", (), "as its torque_reflex_limits"),
+        ("torque_reflex_limits", (np.nan,) * 7, "as its torque_reflex_limits"),
+        ("torque_reflex_limits", (-1.0,) * 7, "as its torque_reflex_limits"),
+        ("torque_reflex_limits", 60.0, "as its torque_reflex_limits"),
+        ("has_command_timeout", None, "needs True or False as its has_command_timeout"),
+        ("period", 0.0, "needs a positive time .* as its period"),
+        ("hold_off", np.nan, "needs a time that is not negative .* as its hold_off"),
+    ],
+)
+def test_driver_without_an_attribute_is_refused(attribute, value, message):
+    class Incomplete(DirectDriver):
+        pass
+
+    setattr(Incomplete, attribute, value)
+    with pytest.raises(InputError, match=message):
+        HardwareStation(BncWorkcell(), Incomplete())
+
+
+def test_driver_without_the_base_constructor_is_refused():
+    class Incomplete(DirectDriver):
+        def __init__(self, url=""):
+            pass
+
+    with pytest.raises(InputError, match=r"Incomplete must call super\(\).__init__\(url\) in its constructor"):
+        HardwareStation(BncWorkcell(), Incomplete())
+
+
+def fails(url):
+    raise OSError("no such port")
+
+
+@pytest.mark.parametrize(
+    ("factory", "message"),
+    [
+        (fails, "the driver refused can't be opened: OSError: no such port"),
+        (lambda: None, "the driver refused can't be opened: TypeError"),
+        (lambda url: url, "the driver refused is no Driver"),
+    ],
+)
+def test_driver_that_cannot_be_opened_is_refused(monkeypatch, factory, message):
+    monkeypatch.setitem(DRIVERS._entries, "refused", factory)
+    with pytest.raises(InputError, match=message):
+        HardwareStation(BncWorkcell(), "refused", robot_url="")
+
+
+def test_driver_that_is_not_callable_is_not_registered():
+    with pytest.raises(InputError, match="a driver is registered as a class of drivers, not 3"):
+        register_driver("number", 3)
+
+
 IIWA = replace(find_robot("iiwa14"), name="mine", flange_frame="iiwa_link_7")  # a user's model of the same arm
 
 
