@@ -29,7 +29,7 @@ from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible
+from guiderail.tools.evaluation.rollout import Callback, PolicyFn, has_same_shapes, is_compatible
 from guiderail.tools.imports import import_modules, is_trusted, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
@@ -55,6 +55,8 @@ _SB3_UNUSED: dict[str, Any] = {
     "buffer_size": 1,
 }
 
+_MAX_ERROR = 200  # largest number of characters of an exception's message that are repeated
+
 
 class ForeignPolicy(Callback):
     """Policy of another library, as a function from an observation to an action.
@@ -70,30 +72,75 @@ class ForeignPolicy(Callback):
         *,
         observation_shape: tuple[int, ...] | None = None,
         action_shape: tuple[int, ...] | None = None,
-        errors: tuple[type[Exception], ...] = (),
+        name: str = "",
     ):
         """Construct the policy from `act`, a function from an observation to an action.
 
-        An action of shape (1, A) becomes (A,). A shape is None if it is unknown. `errors` are the exceptions
-        that `act` raises for an observation of a wrong shape.
+        An action of shape (1, A) becomes (A,). A shape is None if it is unknown. `name` is for error messages.
         """
         self.observation_shape, self.action_shape = observation_shape, action_shape
-        self._act, self._errors = act, errors
+        self._act, self._name = act, name
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return the action for an observation.
 
         Raises:
-            ValueError: If the observation has another shape than the policy takes, or the function raised one of its
-                `errors`.
+            InputError: If the observation has another shape than the policy takes, or the function raised an exception
+                or called `sys.exit`.
         """
         if self.observation_shape not in (None, np.shape(observation)):
-            raise ValueError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
+            raise InputError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
         try:
-            action = np.asarray(self._act(observation))
-        except self._errors as error:
-            raise ValueError(f"the policy failed: {' '.join(str(error).split())[:200]}") from error
-        return action[0] if action.ndim == 2 and len(action) == 1 else action
+            return self._converted(self._act(observation))
+        except InputError:
+            raise
+        except (Exception, SystemExit) as error:  # code of others can raise any exception
+            policy = f"the policy {self._name}".rstrip()
+            raise InputError(f"{policy} raised {_describe_error(error)}") from error
+
+    def _converted(self, action: Any) -> Any:
+        array = np.asarray(action)
+        return array[0] if array.ndim == 2 and len(array) == 1 else array
+
+
+def _describe_error(error: BaseException) -> str:
+    """Return the type of an exception and the beginning of its message, on one line."""
+    text = " ".join(str(error).split())[:_MAX_ERROR].rstrip(": ")
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+class FunctionPolicy(ForeignPolicy):
+    """Policy of a function from an observation to an action, which is returned as it is."""
+
+    def __init__(self, function: Callable[[np.ndarray], Any]):
+        """Construct the policy of `function`, whose name is in error messages."""
+        name = getattr(function, "__name__", type(function).__name__)
+        super().__init__(function, name="" if name == "<lambda>" else name)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the function, such as `start_episode` of an object that can be called."""
+        if name.startswith("_"):  # `_act` itself, before a copy has it
+            raise AttributeError(name)
+        return getattr(self._act, name)
+
+    def _converted(self, action: Any) -> Any:
+        if isinstance(action, tuple) and len(action) == 2 and _is_pair(action):
+            raise InputError(
+                f"the policy returned {brief(action)}, and only a predict method returns an action and a state: return "
+                "the action alone"
+            )
+        return action
+
+
+def _is_pair(returned: tuple[Any, Any]) -> bool:
+    """Return True if a tuple of two is an action and a state, and not an action of two numbers."""
+    if returned[1] is None:
+        return True
+    try:
+        np.shape(returned)
+    except ValueError:  # ragged
+        return True
+    return False
 
 
 class PredictPolicy(ForeignPolicy):
@@ -107,7 +154,12 @@ class PredictPolicy(ForeignPolicy):
         """Construct the policy of `model`, whose `predict` returns an action, or an action and a state."""
         shapes = (getattr(getattr(model, f"{kind}_space", None), "shape", None) for kind in ("observation", "action"))
         observation_shape, action_shape = shapes
-        super().__init__(self._predict, observation_shape=observation_shape, action_shape=action_shape)
+        super().__init__(
+            self._predict,
+            observation_shape=observation_shape,
+            action_shape=action_shape,
+            name=type(model).__name__,
+        )
         self.model = model
         parameters = inspect.signature(model.predict).parameters
         self._options = {"deterministic": True} if "deterministic" in parameters else {}
@@ -137,7 +189,9 @@ class PredictPolicy(ForeignPolicy):
 
 
 def as_policy(given: Any) -> PolicyFn:
-    """Convert an object with a `predict` method to a function from observation to action; return a function unchanged.
+    """Convert a function or an object with a `predict` method to a policy whose errors name the policy.
+
+    A policy of this package and a `Callback` that can be called are returned unchanged.
 
     Raises:
         InputError: If `given` is neither.
@@ -149,7 +203,7 @@ def as_policy(given: Any) -> PolicyFn:
     if callable(getattr(given, "predict", None)):
         return PredictPolicy(given)
     if callable(given):
-        return given
+        return FunctionPolicy(given)
     raise InputError(
         f"{brief(given)} is no policy: give the folder of a run, a function from an observation to an action, or an "
         "object with a predict method"
@@ -223,7 +277,11 @@ def _load_function(module: str, name: str) -> PolicyFn:
         names = [one for one in vars(loaded or object) if not one.startswith("_")]
         raise InputError(f"{module} has no {brief(name)}: {did_you_mean(name, names)}")
     result = getattr(loaded, name)
-    return as_policy(result() if inspect.isclass(result) else result)
+    try:
+        policy = result() if inspect.isclass(result) else result
+    except (Exception, SystemExit) as error:  # code of others can raise any exception
+        raise InputError(f"{module}:{name} cannot be constructed: it raised {_describe_error(error)}") from error
+    return as_policy(policy)
 
 
 def _load_sb3(path: Path) -> PolicyFn:
@@ -242,9 +300,8 @@ def _load_sb3(path: Path) -> PolicyFn:
         kind: Any = getattr(import_module(package), algorithm)
         model = kind.load(path, device="cpu", custom_objects=_SB3_UNUSED)
     except Exception as error:  # reading a pickle can raise any exception
-        text = " ".join(str(error).split())[:200]
         raise InputError(
-            f"{path} cannot be read ({type(error).__name__}: {text}): save it with the installed versions"
+            f"{path} cannot be read ({_describe_error(error)}): save it with the installed versions"
         ) from error
     return PredictPolicy(model)
 
@@ -260,13 +317,17 @@ def _load_torchscript(path: Path) -> PolicyFn:
     module.eval()
 
     def act(observation: np.ndarray) -> np.ndarray:
-        with torch.inference_mode():
-            action = module(torch.as_tensor(observation, dtype=torch.float32)[None])
+        try:
+            with torch.inference_mode():
+                action = module(torch.as_tensor(observation, dtype=torch.float32)[None])
+        except (RuntimeError, torch.jit.Error) as error:  # the lines before the last one are a traceback of TorchScript
+            reason = ([line.strip() for line in str(error).splitlines() if line.strip()] or [""])[-1]
+            raise RuntimeError(reason.removeprefix("RuntimeError: ")) from error
         if not isinstance(action, torch.Tensor):
             raise InputError(f"{path} returns {brief(action)} instead of a tensor of actions")
         return action.numpy()
 
-    return ForeignPolicy(act, errors=(RuntimeError,))
+    return ForeignPolicy(act, name=path.name)
 
 
 def _load_onnx(path: Path) -> PolicyFn:
@@ -292,28 +353,45 @@ def _load_onnx(path: Path) -> PolicyFn:
         return session.run([outputs[0].name], {name: values[None] if is_batched else values})[0]
 
     is_known = all(isinstance(size, int) for size in observation_shape)
-    return ForeignPolicy(act, observation_shape=observation_shape if is_known else None, errors=(Exception,))
+    return ForeignPolicy(act, observation_shape=observation_shape if is_known else None, name=path.name)
 
 
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
-    """Return a policy unchanged if its observation and action shapes match an environment.
+    """Return a policy, as `as_policy` does, if its observation and action shapes match an environment.
 
     `learned_in` has the options of the environment in training; the error message names those that differ.
 
     Raises:
-        InputError: If the shape of the policy's observations or actions differs from the environment's.
+        InputError: If the shape of the policy's observations or actions differs from the environment's, or the policy
+            raises an exception.
     """
-    if is_compatible(lambda env: policy, env):
-        return policy
-    raise InputError(_describe_mismatch(policy, env, learned_in))
+    policy, raised = as_policy(policy), None
+    try:
+        if has_same_shapes(policy, env):
+            return policy
+    except (IndexError, ValueError) as error:
+        raised = error
+    raise InputError(_describe_mismatch(policy, env, learned_in, raised)) from raised
 
 
 _MAX_DIFFERENCES = 5  # largest number of options that a message names
 
 
-def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None) -> str:
-    """Return a sentence with the shapes of policy and environment, and the options that differ or would fit."""
+def _describe_mismatch(
+    policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None, raised: Exception | None
+) -> str:
+    """Return a sentence with the shapes of policy and environment, and the options that differ or would fit.
+
+    `raised` is the policy's exception for this environment's observations. It is the sentence if the policy takes these
+    observations otherwise, or takes none at all.
+    """
     observation_shape, action_shape = shapes(policy, env)
+    expected = env.action_space.shape
+    if isinstance(raised, InputError):
+        if (observation_shape, action_shape) == (env.observation_space.shape, expected):
+            return str(raised)
+        if observation_shape in (None, env.observation_space.shape) and not _flat_shapes(policy):
+            return f"{raised}, for observations of shape {env.observation_space.shape}"
     takes = "cannot take these observations" if observation_shape is None else f"takes observations {observation_shape}"
     returns = "" if action_shape is None else f" and returns actions {action_shape}"
     declaration = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
@@ -324,7 +402,6 @@ def _describe_mismatch(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping
         for name, value in (learned_in or {}).items()
         if name in options and options[name] != value
     ][:_MAX_DIFFERENCES]
-    expected = env.action_space.shape
     if changed:
         hint = f"; it learned with {', '.join(changed)}: change --env"
     elif task and (fitting := fitting_options(task, options, policy)):
@@ -353,22 +430,23 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
         try:
             action_shape = np.shape(policy(np.zeros(observation_shape, np.float32)))
         except (IndexError, ValueError):
-            return (given, None) if given is not None else _only_shapes(policy)
+            found = _flat_shapes(policy) if given is None else []
+            return found[0] if len(found) == 1 else (given, None)
     return observation_shape, action_shape
 
 
 _MAX_SIZE = 256  # largest size of a flat observation that is tried
 
 
-def _only_shapes(policy: PolicyFn) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Return the only flat observation shape that a policy takes, and its action's shape; None if it is not unique."""
-    found = []
+def _flat_shapes(policy: PolicyFn) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
+    """Return the first flat observation shapes that a policy takes, at most two, with its actions' shapes."""
+    found: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
     for size in range(1, _MAX_SIZE + 1):
         with suppress(Exception):  # code of others can raise any exception
             found.append(((size,), np.shape(policy(np.zeros(size, np.float32)))))
         if len(found) > 1:
             break
-    return found[0] if len(found) == 1 else (None, None)
+    return found
 
 
 _MAX_FITTING = 2  # largest number of combinations that a message names

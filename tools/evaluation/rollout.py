@@ -147,7 +147,7 @@ def rollout(
     infos: list[Mapping[str, Any]] = []  # `info` of each step, for an environment without a trace
     is_over = False
     while not is_over:
-        action, privileged = act(observation), getattr(base, "privileged", None)
+        action, privileged = _without_batch(act(observation), env), getattr(base, "privileged", None)
         if not is_own:
             _check_action(action, env)
         following, reward, terminated, truncated, info = env.step(action)
@@ -172,6 +172,12 @@ def rollout(
     for callback in callbacks:
         row |= new_columns(callback, row)
     return row
+
+
+def _without_batch(action: Any, env: gymnasium.Env) -> Any:
+    """Return the only row of an action (1, A) in an environment with actions (A,); return another one unchanged."""
+    shape = env.action_space.shape
+    return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
 
 
 def _check_action(action: Any, env: gymnasium.Env) -> None:
@@ -225,28 +231,36 @@ class Paths(EnvCallback):
 
 
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if the policy's actions for several observations have the shape of the environment's actions.
-
-    It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
-    others have certain values. An object with `predict` is not called if it declares both shapes; otherwise a deep
-    copy of it is called, if it can be copied.
+    """Return True if a policy's observations and actions have the shapes of the environment's; see `has_same_shapes`.
 
     Raises:
         InputError: If `make_policy` returns no function.
     """
-    from guiderail.tools.evaluation.policies import PredictPolicy
-
-    act, shape = make_policy(env), env.observation_space.shape or ()
+    act = make_policy(env)
     if not callable(act):
         raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
+    try:
+        return has_same_shapes(act, env)
+    except (IndexError, ValueError):
+        return False
+
+
+def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
+    """Return True if the policy's actions for several observations have the shape of the environment's actions.
+
+    It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
+    others have certain values. An object with `predict` is not called if it declares both shapes; otherwise a deep
+    copy of it is called, if it can be copied. An exception of the policy is passed on.
+    """
+    from guiderail.tools.evaluation.policies import PredictPolicy
+
+    shape = env.observation_space.shape or ()
     if isinstance(act, PredictPolicy):
         if act.observation_shape is not None and act.action_shape is not None:
             return (act.observation_shape, act.action_shape) == (env.observation_space.shape, env.action_space.shape)
         act = act.copy()
-    try:
-        shapes = {np.shape(act(np.full(shape, value, np.float32))) for value in np.linspace(-1.0, 1.0, 21)}
-    except (IndexError, ValueError):
-        return False
+    observations = (np.full(shape, value, np.float32) for value in np.linspace(-1.0, 1.0, 21))
+    shapes = {np.shape(_without_batch(act(observation), env)) for observation in observations}
     return shapes == {env.action_space.shape}
 
 

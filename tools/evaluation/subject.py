@@ -22,7 +22,7 @@ from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
 from guiderail.tools.evaluation.evaluation import policy_digest
 from guiderail.tools.evaluation.metrics import COLLISION
-from guiderail.tools.evaluation.policies import as_policy, check_compatible, is_policy_file, load_policy
+from guiderail.tools.evaluation.policies import FunctionPolicy, as_policy, check_compatible, is_policy_file, load_policy
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible
 from guiderail.tools.files import path_exists
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
@@ -185,7 +185,7 @@ def find_subject(
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
         unknown = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
-        if act is policy and not isinstance(act, Policy):
+        if isinstance(act, FunctionPolicy) or (act is policy and not isinstance(act, Policy)):
             return Subject("policy", config, lambda env: act, digest=unknown)
         return Subject("policy", config, partial(check_compatible, act), digest=unknown)
     source = find_run(policy)

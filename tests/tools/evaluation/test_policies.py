@@ -255,7 +255,7 @@ def test_mismatch_names_the_only_size_that_a_network_takes(env, tmp_path):
     assert "--env" not in str(error.value)
 
 
-@pytest.mark.parametrize("shape", [(), (3,), (1, 2)])
+@pytest.mark.parametrize("shape", [(), (3,), (2, 1)])
 def test_mismatch_of_the_action_names_the_shape_to_return(shape, env):
     with pytest.raises(InputError, match=r"takes observations \(3,\) .*: it must return an array of shape \(2,\)$"):
         check_compatible(lambda observation: np.zeros(shape), env)
@@ -263,10 +263,89 @@ def test_mismatch_of_the_action_names_the_shape_to_return(shape, env):
 
 def test_mismatch_with_every_option_does_not_name_options():
     env = make_environment("NarrowPassage", {})
-    with pytest.raises(InputError, match=r"returns actions \(1, 2\), .*: it must return an array of shape \(2,\)$"):
-        check_compatible(lambda observation: np.zeros((1, 2)), env)
+    with pytest.raises(InputError, match=r"returns actions \(2, 2\), .*: it must return an array of shape \(2,\)$"):
+        check_compatible(lambda observation: np.zeros((2, 2)), env)
     with pytest.raises(InputError, match=r"takes observations \(77,\) .* no options of NarrowPassage fit it"):
         check_compatible(lambda observation: np.ones((2, 77)) @ observation, env)
+
+
+def raises(observation):
+    raise ValueError("boom")
+
+
+def raises_late(observation):
+    if observation[0] > 0.0:
+        raise RuntimeError("late")
+    return np.zeros(2)
+
+
+def leaves(observation):
+    raise SystemExit
+
+
+class Raising:
+    """Model whose code has an error."""
+
+    def predict(self, observation):
+        raise KeyError("x")
+
+
+@pytest.mark.parametrize(
+    ("policy", "message"),
+    [
+        (raises, r"^the policy raises raised ValueError: boom, for observations of shape \(3,\)$"),
+        (raises_late, r"^the policy raises_late raised RuntimeError: late(?!,)"),
+        (leaves, r"^the policy leaves raised SystemExit, for"),
+        (lambda: np.zeros(2), r"^the policy raised TypeError: .*takes 0 positional arguments"),
+        (Raising(), r"^the policy Raising raised KeyError: 'x', for"),
+    ],
+)
+def test_exception_of_a_policy_is_named(policy, message, env):
+    with pytest.raises(InputError, match=message):
+        check_compatible(policy, env)
+    with pytest.raises(InputError, match=message.split(", for")[0]):
+        evaluate(policy, "Bead", 2, baselines=(), processes=2)
+
+
+class Asserting(torch.nn.Module):
+    """Fail for every observation."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        assert bool(observation.sum() > 1e9), "too small"
+        return observation
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [(Asserting(), "RuntimeError: AssertionError: too small"), (torch.nn.Linear(3, 2).double(), ".*Float and Double")],
+)
+def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
+    torch.jit.script(module).save(tmp_path / "policy.pt")
+    with pytest.raises(InputError, match=rf"^the policy policy\.pt raised {message}, for observations"):
+        check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
+
+
+def test_class_of_a_file_that_cannot_be_constructed_is_named(tmp_path):
+    (tmp_path / "model_of_mine.py").write_text(
+        "class Model:\n    def __init__(self):\n        raise OSError('no disk')\n"
+    )
+    with pytest.raises(InputError, match=r"model_of_mine\.py:Model cannot be constructed: it raised OSError: no disk"):
+        load_policy(f"{tmp_path}/model_of_mine.py:Model")
+
+
+def test_function_that_returns_a_pair_gets_a_hint(env):
+    with pytest.raises(
+        InputError, match="only a predict method returns an action and a state: return the action alone"
+    ):
+        check_compatible(lambda observation: (np.zeros(2), None), env)
+
+
+@pytest.mark.parametrize("where", ["Bead", None])
+def test_function_may_return_a_batch_of_one_action(where):
+    target, rows = where or Pointer(), []
+    for policy in (lambda observation: -observation[:2], lambda observation: -observation[None, :2]):
+        rows.append(evaluate(policy, target, 2, baselines=())["mean_return"])
+    assert rows[0] == rows[1]
 
 
 class Pointer(gymnasium.Env):
@@ -372,7 +451,7 @@ def test_evaluation_in_something_else_is_refused(arguments, message):
         evaluate(*arguments, episodes=1)
 
 
-@pytest.mark.parametrize("returned", [0.0, np.zeros(3), None, np.zeros((1, 2)), [0.0, [0.0]]])
+@pytest.mark.parametrize("returned", [0.0, np.zeros(3), None, np.zeros((2, 2)), [0.0, [0.0]]])
 def test_action_of_a_function_with_another_shape_is_refused(returned):
     with pytest.raises(InputError, match=r"the policy returned .*, and the actions .* have the shape \(2,\)"):
         evaluate(lambda point: returned, Pointer(), 1, baselines=(), processes=1)
