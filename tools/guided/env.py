@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
@@ -228,14 +229,24 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return None if self._is_pending else self.guide.request(self.env, self._observation, self._action, measured)
 
     def advance(self, output: np.ndarray | None) -> None:
-        """Step the environment with the predicted output (O,); None without a request or a solution."""
+        """Step the environment with the predicted output (O,); None without a request or a solution.
+
+        Raises:
+            InputError: If `to_action` returns no action of the environment (it has not moved then), or the environment
+                returns a reward that is not finite or an observation with NaN.
+        """
         command = self._command
         if command is None or not self._is_pending:
             self._command = command = self.guide.finish(output)
         self._is_pending = True
         action = self._to_action(self.env, self._observation, command.output, command.extra)
+        self._check_action(action)
         self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
         self._is_pending = False
+        if not math.isfinite(reward):
+            raise InputError(f"the environment returned {reward} as reward: a reward is a finite number")
+        if _has_nan(self._observation):
+            raise InputError("the environment returned an observation that contains NaN: check its step")
         self._reward += float(reward)
         self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
         self._fallbacks += command.is_fallback
@@ -258,6 +269,18 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             "segment": self.guide.segment_name,
         }
         return self._extended(), self._reward, bool(self._terminated), bool(self._truncated), info
+
+    def _check_action(self, action: Any) -> None:
+        """Raise an InputError if the result of `to_action` has another shape than the actions, or is not finite."""
+        space = self.env.action_space
+        if not isinstance(space, Box):
+            return
+        try:
+            is_action = np.shape(action) == space.shape and bool(np.isfinite(action).all())
+        except (TypeError, ValueError):  # no numbers, or ragged
+            is_action = False
+        if not is_action:
+            raise InputError(f"to_action must return finite numbers of shape {space.shape}, not {brief(action)}")
 
     def _measured(self) -> np.ndarray:
         measured = as_numbers(self._pose(self.env, self._observation), "the measured pose")
@@ -294,6 +317,13 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if isinstance(space, Dict):
             return {**self._observation, **extra}
         return {"observation": self._observation, **extra}
+
+
+def _has_nan(observation: Any) -> bool:
+    """Return True if an observation, or an entry of one, is an array of floating-point numbers with NaN."""
+    if isinstance(observation, Mapping):
+        return any(map(_has_nan, observation.values()))
+    return isinstance(observation, np.ndarray) and observation.dtype.kind == "f" and bool(np.isnan(observation).any())
 
 
 def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment]:

@@ -747,3 +747,38 @@ def test_frames_of_a_template_that_are_no_poses_are_refused(frames):
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
     with pytest.raises(InputError, match=r"poses by name, not|the frame mug_tip is a RigidTransform, as of Drake, not"):
         template_guide.reset(None, None, np.zeros(6))
+
+
+class Broken(PointEnv):
+    """Environment whose step returns NaN in one place."""
+
+    where = "observation"
+
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return (observation * np.nan, reward, *rest) if self.where == "observation" else (observation, np.nan, *rest)
+
+
+class BrokenReward(Broken):
+    where = "reward"
+
+
+def stepped(make, is_vector, to_action):
+    keywords = {"demonstrations": SHOWN, "frame": at_target, "pose": pose, "to_action": to_action, "period": PERIOD}
+    env = GuidedVectorEnv([make] * 2, **keywords) if is_vector else GuidedEnv(make(), **keywords)
+    env.reset(seed=0)
+    env.step(np.zeros((2, 3) if is_vector else 3))
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+@pytest.mark.parametrize("wrong", [None, np.zeros(3), np.full(4, np.nan), [0.0, [0.0]], "open", np.full(4, np.inf)])
+def test_to_action_that_returns_no_action_is_refused(wrong, is_vector):
+    with pytest.raises(InputError, match=r"to_action must return finite numbers of shape \(4,\), not"):
+        stepped(PointEnv, is_vector, lambda env, observation, command, extra: wrong)
+
+
+@pytest.mark.parametrize("is_vector", [False, True])
+@pytest.mark.parametrize("make", [Broken, BrokenReward])
+def test_environment_that_returns_nan_is_refused(make, is_vector):
+    with pytest.raises(InputError, match=r"the environment returned .*(nan|NaN)"):
+        stepped(make, is_vector, to_action)
