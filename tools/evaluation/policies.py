@@ -362,16 +362,31 @@ def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[s
     `learned_in` has the options of the environment in training; the error message names those that differ.
 
     Raises:
-        InputError: If the shape of the policy's observations or actions differs from the environment's, or the policy
-            raises an exception.
+        InputError: If the shape of the policy's observations or actions differs from the environment's, a model's
+            action space has other bounds, or the policy raises an exception.
     """
     policy, raised = as_policy(policy), None
     try:
-        if has_same_shapes(policy, env):
-            return policy
+        is_same = has_same_shapes(policy, env)
     except (IndexError, ValueError) as error:
-        raised = error
+        is_same, raised = False, error
+    if is_same:
+        _check_bounds(policy, env)
+        return policy
     raise InputError(_describe_mismatch(policy, env, learned_in, raised)) from raised
+
+
+def _check_bounds(policy: PolicyFn, env: gymnasium.Env) -> None:
+    """Raise an InputError if the action space that a model declares has other bounds than the environment's."""
+    declared, space = getattr(getattr(policy, "model", None), "action_space", None), env.action_space
+    if not isinstance(declared, gymnasium.spaces.Box) or not isinstance(space, gymnasium.spaces.Box):
+        return
+    if not (np.array_equal(declared.low, space.low) and np.array_equal(declared.high, space.high)):
+        raise InputError(
+            f"the policy was trained with actions from {declared.low.min():g} to {declared.high.max():g}, and those of "
+            f"this environment are from {space.low.min():g} to {space.high.max():g}: evaluate it through its wrapper "
+            "from Python"
+        )
 
 
 _MAX_DIFFERENCES = 5  # largest number of options that a message names

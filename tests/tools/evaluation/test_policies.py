@@ -231,6 +231,14 @@ def test_python_model_is_evaluated_in_a_task(env):
         evaluate(model)
 
 
+def test_model_with_other_action_bounds_is_refused(env, tmp_path):
+    rescaled = gymnasium.wrappers.RescaleAction(env, np.float32(-2.0), np.float32(2.0))
+    SAC("MlpPolicy", rescaled, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "rescaled")
+    message = "actions from -2 to 2, and those of this environment are from -1 to 1: evaluate it through its wrapper"
+    with pytest.raises(InputError, match=message):
+        check_compatible(load_policy(tmp_path / "rescaled.zip", trust_policy=True), env)
+
+
 def test_spaces_that_differ_are_named_with_options_that_fit():
     """The hard connector observes the center of pressure."""
     policy = SAC("MlpPolicy", make_environment("BncConnector", {"observation": "center_of_pressure"}), device="cpu")
