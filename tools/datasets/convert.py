@@ -17,6 +17,7 @@ from guiderail.tools.datasets.formats.csv_layouts import read_csv_files
 from guiderail.tools.datasets.formats.lerobot import INFO, read_lerobot, write_lerobot
 from guiderail.tools.datasets.formats.recorded import describe_time_shift
 from guiderail.tools.datasets.formats.ros_bag import find_bags, read_bags, write_mcap
+from guiderail.tools.datasets.validate import other_units
 from guiderail.tools.files import ENDINGS, check_new, load_demonstrations, path_exists
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}
@@ -78,10 +79,12 @@ def import_recording(
             f"{source} holds {numbers} numbers, and a file at most {MAX_NUMBERS}: give --rate to resample them"
         )
     demonstrations.save(out)
+    remarks = other_units(demonstrations)
     return (
         {"out": str(out), "from": kind}
         | _summarize(demonstrations)
         | {"assumed": "; ".join(recorded.assumptions) or "nothing"}
+        | ({"remark": "; ".join(remarks)} if remarks else {})
     )
 
 

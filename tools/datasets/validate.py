@@ -85,7 +85,9 @@ def fit_bounds(
     fastest = [float(f"{speed:.4g}") for speed in bounds.max_rates]
     files = [str(path) for path in (draw, out, None if task is None else task / "task.yaml") if path is not None]
     written = {"written": ", ".join(files)} if files else {}
-    return {"demonstrations": str(file), **rows, "fastest per second": fastest, **written}
+    remarks = other_units(demonstrations)
+    remark = {"remark": "; ".join(remarks)} if remarks else {}
+    return {"demonstrations": str(file), **rows, "fastest per second": fastest, **written, **remark}
 
 
 def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
@@ -186,17 +188,14 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         draw_demonstrations(common, draw)
         summary["picture"] = str(draw)
     summary |= fitted
-    remarks = [*_other_units(outputs), *_irregularities(demonstrations), *_unended(file)]
+    remarks = [*other_units(demonstrations), *_irregularities(demonstrations), *_unended(file)]
     remarks = [*remarks, *([summary["remark"]] if "remark" in summary else [])]
     return summary | ({"remark": "; ".join(remarks)} if remarks else {})
 
 
-def _other_units(outputs: np.ndarray) -> list[str]:
-    """Return a sentence for each demonstration more than `UNIT_RATIO` times larger or smaller than the median one.
-
-    `outputs` are those of all M demonstrations, (M, N, O).
-    """
-    lengths = np.linalg.norm(np.ptp(outputs, axis=1), axis=1)
+def other_units(demonstrations: Demonstrations) -> list[str]:
+    """Return a sentence for each demonstration more than `UNIT_RATIO` times larger or smaller than the median one."""
+    lengths = np.linalg.norm(np.ptp(np.stack(demonstrations.resampled().outputs), axis=1), axis=1)
     median = float(np.median(lengths))
     return [
         f"demonstration {index} extends over {length:.3g} and the median one over {median:.3g}: check its unit"

@@ -1,8 +1,10 @@
 """Tests of the warning about a primitive whose motion without actions leaves the demonstrations."""
 
+import numpy as np
 import pytest
 
-from guiderail.tools.datasets.validate import warn_of_deviation
+from guiderail.tools.datasets.convert import import_recording
+from guiderail.tools.datasets.validate import fit_bounds, warn_of_deviation
 
 
 def test_strong_regularization_is_warned_about_with_a_remedy():
@@ -19,3 +21,14 @@ def test_no_warning_for_a_task_without_demonstrations():
 @pytest.mark.parametrize("length_scale", [50.0])
 def test_long_length_scale_is_warned_about(length_scale):
     assert "standard deviation" in warn_of_deviation("NarrowPassage", {"length_scale": length_scale})
+
+
+def test_recording_in_another_unit_is_remarked_when_used(tmp_path):
+    folder, times = tmp_path / "recorded", np.linspace(0.0, 1.0, 20)
+    folder.mkdir()
+    for index, scale in enumerate((1.0, 1.0, 1000.0)):
+        rows = np.column_stack([times, scale * times, scale * times, scale * times])
+        np.savetxt(folder / f"a{index}.csv", rows, delimiter=",", header="t [s],x [m],y [m],z [m]", comments="")
+    message = "demonstration 2 extends over 1.73e+03 and the median one over 1.73: check its unit"
+    assert fit_bounds(folder)["remark"] == message
+    assert import_recording(folder, tmp_path / "out.npz")["remark"] == message
