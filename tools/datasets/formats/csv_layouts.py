@@ -313,6 +313,12 @@ def _rotations(
     """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
     for names in _QUATERNION:
         if matches := _columns(file, columns, names):
+            places = {id(one): place for place, one in enumerate(columns)}
+            in_file = sorted(zip(matches, "xyzw", strict=True), key=lambda pair: places[id(pair[0])])
+            order = "".join(letter for _, letter in in_file)
+            if quaternion not in (None, order):
+                listed = ", ".join(one.name for one, _ in in_file)
+                raise InputError(f"{file} has {listed}, which contradicts --quaternion {quaternion}: leave it out")
             return matches, rotations_of(np.column_stack([one.values for one in matches]), str(file))
     numbers = {one.plain for one in columns if re.fullmatch("q[0-9]+", one.plain)}
     for names in _UNNAMED if len(numbers) == 4 else ():
@@ -326,6 +332,12 @@ def _rotations(
                 )
             values = np.column_stack([one.values for one in matches])
             return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
+    fixed = [[one for one in columns if re.fullmatch(rf"R{axis} ?\[(deg|rad)\]", one.name)] for axis in "xyz"]
+    if all(len(one) == 1 for one in fixed):  # the names of guiderail; a rotation vector has rx, ry and rz
+        matches = [one for (one,) in fixed]
+        scales = [_ANGLE_UNITS[str(unit)] for unit in _units(file, matches, _ANGLE_UNITS, angles, "--angles")]
+        assumptions.append("Rz, Ry and Rx are ZYX Euler angles, Rz Ry Rx")
+        return matches, Rotation.from_euler("xyz", np.column_stack([one.values for one in matches]) * scales)
     for euler in _EULER:
         if matches := _columns(file, columns, euler):
             units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")
