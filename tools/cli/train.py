@@ -61,7 +61,7 @@ def train(
         bool | None,
         option(
             "Draw the learning curve and a page of held-out episodes at the end; guiderail visualize RUN draws the "
-            "page later.  [default: yes]",
+            "page later. Not stored: give it again with --resume.  [default: yes]",
             "--pictures/--no-pictures",
         ),
     ] = None,
