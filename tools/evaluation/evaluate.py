@@ -248,7 +248,7 @@ def evaluate(
         env: Environment of a policy without a run: name of a task, an environment, or an id that is registered with
             Gymnasium. An environment that is not of this package is reset with the seed of the episode, which succeeds
             if `info["is_success"]` or `info["success"]` is true at any step. If `info` has neither, the statistics of
-            success are None.
+            success are None. It needs a limit of steps, such as that of `gymnasium.wrappers.TimeLimit`.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
             None is the default set of the task. The demonstration alone is always evaluated if the guidance of a task
