@@ -52,6 +52,9 @@ def test_missing_and_malformed_statuses_are_faults():
 
 
 class Unreadable:
+    def __repr__(self):
+        return "unreadable"  # the names of tests must not depend on the process
+
     def __array__(self, *arguments, **keywords):
         raise OSError("cable unplugged")
 
@@ -81,7 +84,7 @@ def test_counter_that_is_not_finite_is_malformed(part, value):
     assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
-@pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, object()], ids=str)
+@pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, Unreadable()], ids=str)
 def test_object_that_is_no_status_is_malformed(value):
     assert check_status(value, LAST, 116.0, LIMITS) == Fault.MALFORMED
 
