@@ -34,7 +34,7 @@ from guiderail.tools.tables import table_text
 
 if TYPE_CHECKING:
     from guiderail.tools.learning.actors import ParallelLearner
-    from guiderail.tools.learning.interventions import Supervisor
+    from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -223,11 +223,7 @@ def _train(
         is_last = is_last or _ends_with_successes(rows, config.learner.stop_after_successes)
         if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode == 0 or is_last:
             started = time.perf_counter()
-            # The checkpoint holds the table too, and is written first: a kill between the two loses nothing.
-            write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())
-            if supervised is not None:
-                folder.write_config(supervised.config)
-            folder.write_episodes(rows)
+            _save(folder, config, rows, learner, env, supervised)
             last_saving_time = time.perf_counter() - started
             saving_time += last_saving_time
         learner.submit_episode()
@@ -280,6 +276,21 @@ def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored
     for name, value in row.items():
         if name not in WORDS and not isinstance(value, Number | None):
             raise InputError(f"the column {name!r} of an episode must be a number, not {brief(value)}")
+
+
+def _save(
+    folder: RunFolder,
+    config: RunConfig,
+    rows: list[dict[str, Any]],
+    learner: Learner,
+    env: Any,
+    supervised: SupervisedTraining | None,
+) -> None:
+    """Write the checkpoint, which holds the table too, and then the table: a kill between the two loses nothing."""
+    write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())
+    if supervised is not None:
+        folder.write_config(supervised.config)
+    folder.write_episodes(rows)
 
 
 def write_checkpoint(
