@@ -88,7 +88,6 @@ class LcNsKmpSystem(LeafSystem):
         for one in (primitive, *(other for other, _ in shorter)):
             if not isinstance(one, LcNsKmp):
                 raise InputError(f"a primitive of this system is an LcNsKmp, not {brief(one)}")
-            _check_reference_period(one, period)
         outputs = primitive.num_outputs
         if any(other.history not in range(1, primitive.history) for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
@@ -223,17 +222,6 @@ def _checked_pairs(shorter: object) -> tuple[tuple[LcNsKmp, np.ndarray], ...]:
     if isinstance(shorter, Sequence) and all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in shorter):
         return tuple((primitive, gain) for primitive, gain in shorter)
     raise InputError(f"shorter is a list of primitives with their gains, not {brief(shorter)}")
-
-
-def _check_reference_period(primitive: LcNsKmp, period: float) -> None:
-    """Raise an InputError unless the period is that of the reference trajectory, up to a percent."""
-    times = primitive.reference.times
-    step = float(times[-1] - times[0]) / (len(times) - 1)
-    if not abs(period - step) <= 0.01 * step:
-        raise InputError(
-            f"the reference has a step every {step:.6g} s, and the system's period is {period:g} s: resample the "
-            "reference (ReferenceTrajectory.resampled), or choose its period"
-        )
 
 
 def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:

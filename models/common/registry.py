@@ -16,6 +16,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 from guiderail.models.common.errors import InputError, brief, naming_failures
 
 Entry = TypeVar("Entry")
+_NO_VALUE: Any = object()  # default of `register`, because None is refused like any other value
 
 
 class Registry(Generic[Entry]):
@@ -51,10 +52,10 @@ class Registry(Generic[Entry]):
         self._loaded: set[str] = set()  # names whose entry points were loaded
 
     @overload
-    def register(self, name: str, value: None = None) -> Callable[[Entry], Entry]: ...
+    def register(self, name: str) -> Callable[[Entry], Entry]: ...
     @overload
     def register(self, name: str, value: Entry) -> Entry: ...
-    def register(self, name: str, value: Entry | None = None) -> Entry | Callable[[Entry], Entry]:
+    def register(self, name: str, value: Any = _NO_VALUE) -> Any:
         """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
@@ -63,7 +64,7 @@ class Registry(Generic[Entry]):
                 registry's `check` refuses it.
         """
         self.check_name(name)
-        if value is None:
+        if value is _NO_VALUE:
             return lambda decorated: self.register(name, decorated)
         self._check(name, value)
         origin = _origin(value)

@@ -132,14 +132,21 @@ class SharedControlTemplate:
         return None
 
     def check_consistency(self) -> None:
-        """Raise an InputError if active constraints of a state are proven to contradict each other."""
+        """Refuse active constraints of a state that are proven to contradict each other.
+
+        Raises:
+            InputError: If there are such constraints.
+        """
         if self.contradiction is not None:
             raise InputError(f"the template {self.name}, state {self.contradiction}")
 
     def check_start(self, X_WE: RigidTransform, frames: Frames) -> None:
-        """Raise an InputError if an episode begins too far outside of the active constraints to move inside.
+        """Refuse a start too far outside of the active constraints to move inside.
 
         The largest distance is `MAX_START_DISTANCE`, and the largest angle `MAX_START_ANGLE`.
+
+        Raises:
+            InputError: If the start is farther outside.
         """
         state = self.state_at(X_WE, frames)
         X_WP = self.project(state, X_WE, frames)

@@ -26,7 +26,6 @@ from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController
-from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.contact_detector import ContactDetector
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.measured_pose import MeasuredPose
@@ -45,7 +44,7 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (MeasuredPose, "_pose"),
     (ContactDetector, "_update"),
     (LastValidPose, "_update"),
-    (CommandWatchdog, "_calc_safe_pose"),
+    (LastValidPose, "eval"),
     (ImpedanceMonitor, "_contact_force"),
     (ImpedanceMonitor, "_saturation"),
     (Recorder, "_record"),

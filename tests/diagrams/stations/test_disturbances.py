@@ -144,7 +144,7 @@ def test_payload_lowers_the_tool_of_an_arm():
     ("options", "message"),
     [
         ({"payload": 0.5}, "station=arm"),
-        ({"clock_factor": 0.6}, "whole number"),
+        ({"clock_factor": 0.6}, "whole multiple"),
         ({"friction_factor": (2.0, 1.0)}, "smaller one first"),
         ({"wrench_bias": (-1.0, 0.0)}, "none negative"),
         ({"lost_commands": 1.0}, "less than 1"),

@@ -292,7 +292,7 @@ def test_deploy_exits_with_2_when_given_another_policy(capsys):
 
 def test_confirm_checks_raises_when_a_check_fails():
     messages = []
-    checks = SimpleNamespace(run=lambda: [preflight.Check("load", "9 N", False)], driver=SimpleNamespace(error=""))
+    checks = SimpleNamespace(run=lambda: [preflight.Check("load", "9 N", False)], error="")
     with pytest.raises(InputError, match="stays where it is: load"):
         preflight.confirm_checks(checks, messages.append, assume_yes=True)
     assert messages == ["NOT   load        9 N"]
