@@ -54,8 +54,7 @@ class LcNsKmp:
 
     Raises:
         InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
-            length, `check_kernel` refuses the kernel, the motion misses the demonstrations (`check_deviation`), or the
-            constraints are far from them (`check_constraints`).
+            length, or by `check_kernel`, `check_deviation` or `check_constraints`.
 
     Warns:
         UserWarning: If `deviation` exceeds one.
@@ -93,15 +92,14 @@ class LcNsKmp:
             raise InputError(f"cache_bytes and max_deviation must not be negative: {cache_bytes} and {max_deviation}")
         if not isinstance(reference, ReferenceTrajectory):
             raise InputError(f"a primitive needs a ReferenceTrajectory (from_demonstrations), not {brief(reference)}")
-        kernel = kernel if kernel is not None else SquaredExponential()
-        check_kernel(kernel, reference.inputs(np.arange(-history, reference.num_steps + min(horizon, 10**6))))
+        self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
+        check_kernel(self.kernel, reference.inputs(np.arange(-history, reference.num_steps + min(horizon, 10**6))))
         constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)
         if not isinstance(constraints, LinearConstraints):
             raise InputError(f"constraints of a primitive are LinearConstraints, not {brief(constraints)}")
         constraints.check_sizes(reference.num_outputs, reference.num_steps)
         check_constraints(reference, constraints, max_deviation)
         self.reference = reference
-        self.kernel: Kernel = kernel
         self.lambda_, self.beta = float(lambda_), float(beta)
         self.horizon, self.history, self.history_variance = int(horizon), int(history), float(history_variance)
         self.constraints = constraints
