@@ -195,10 +195,10 @@ def demonstrated_episodes(row: Row) -> int:
     """
     study = load_study(study_path(row.study))
     choices = [study.learner, study.methods[row.method].learner]
-    algorithm, preset = (
-        next((value for choice in reversed(choices) if (value := getattr(choice, name)) is not None), None)
-        for name in ("algorithm", "preset")
-    )
+    # As in `Job.config`: a method may remove the study's choice by null.
+    names = ("algorithm", "preset")
+    given = {name: getattr(one, name) for one in choices for name in names if name in one.model_fields_set}
+    algorithm, preset = given.get("algorithm"), given.get("preset")
     settings = {**choices[0].settings, **choices[1].settings}
     if "demonstration_episodes" in settings or algorithm is None:
         return int(settings.get("demonstration_episodes", 0))

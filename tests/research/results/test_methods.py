@@ -123,7 +123,8 @@ def test_few_equal_seeds_have_no_interval(number, middle, tmp_path):
 def test_methods_of_unequal_knowledge_are_marked():
     (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard")
     (sentence,) = knowledge(hard, TABLES)
-    assert "equal knowledge.** 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other" in sentence
+    assert "; 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other methods." in sentence
+    assert "10 demonstrated episodes: RL-SCT by behavior cloning, RL-SCT by RLPD, RL-SCT by DroQ; 3" in sentence
     assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
     assert knowledge(SECTIONS["NarrowPassage"][0], TABLES) == ["Demonstrated episodes of every learned method: 10."]
 
@@ -154,8 +155,8 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
 
 def test_results_with_the_offset_of_the_run_are_marked():
     table = {row[0]: row for row in rows(readme_table(TABLES))}
-    assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99.5 (96–100) †", "100 †", "98 / 52"]
-    assert table["Grid clamp, hard"][6] == "60, 3 of them demonstrated (10); residual RL: 60 (5)"
+    assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
+    assert table["Grid clamp, hard"][6] == "60 (10)"
     assert "†" not in "".join(table["Connector, hard"])
     (clamp,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp")
     (sentence,) = offsets(clamp, TABLES)

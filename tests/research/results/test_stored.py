@@ -84,6 +84,22 @@ def test_template_needs_least_force_and_residual_most():
     assert force["sct"] < force["none"] < force["residual"]
 
 
+def test_peers_of_the_hard_clamp():
+    success = {
+        method: sorted((100 * rows_of("peers_grid_clamp_hard", method)["success_rate"]).round())
+        for method in ("sct", "sct_alone", "sct_crossq", "sct_bc", "sct_rlpd", "sct_droq", "residual", "crossq", "none")
+    }
+    assert all(len(each) == 10 for each in success.values())
+    assert (success["sct_alone"][0], success["crossq"][0], success["sct_crossq"][0]) == (93, 94, 99)
+    assert min(success[method][0] for method in ("sct_bc", "sct_rlpd", "sct_droq")) == 79
+    assert (success["none"][0], success["none"][1]) == (0, 97)
+    for method in ("residual", "policy_decorator", "droq"):
+        assert (rows_of("peers_grid_clamp_hard", method)["success_rate"] == 1.0).all()
+    table = read_table(RESULTS / "peers_grid_clamp_hard.csv")
+    assert table["training_ended_in_collision"].max() == 0
+    assert table["max_commanded_violation"].max() <= TOLERANCE
+
+
 def test_bounded_force_makes_the_hard_clamp_easy():
     """docs/results.md: a search ends no episode, so random actions succeed within the time and residual RL learns."""
     methods = {method: rows_of("grid_clamp_hard", method) for method in ("sct", "residual", "none")}
