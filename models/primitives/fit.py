@@ -18,7 +18,8 @@ from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
-from guiderail.models.primitives.reference import ReferenceTrajectory, information_criteria
+from guiderail.models.primitives.mixture import information_criteria
+from guiderail.models.primitives.reference import ReferenceTrajectory
 
 MIN_SHARE = 0.95
 """Share of the steps that must be within one standard deviation for a motion to follow the demonstrations."""

@@ -1,32 +1,24 @@
 """Reference trajectory: the mean and covariance of demonstrations over time (thesis, sections 2.2.3 to 2.2.5).
 
-scikit-learn fits the Gaussian mixture; this module adds its initialization and the regression on time.
+`mixture` fits the Gaussian mixture and regresses it on time.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from guiderail.models.common.arrays import as_number, as_numbers, as_whole, find_asymmetric
+from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel, check_kernel
+from guiderail.models.primitives.mixture import fit_mixture, regress
 from guiderail.models.primitives.promp import ProMp
-
-# Importing scikit-learn takes over a second, and reading a file does not need it.
-if TYPE_CHECKING:
-    from sklearn.mixture import GaussianMixture
 
 # Smallest eigenvalue of a correlation matrix that is regular in double precision.
 _SINGULAR = 1e-13
-# Variance added to every component, relative to the data's variance: EM needs it where demonstrations coincide.
-_REGULARIZATION = 1e-6
-_MAX_COMPONENTS = 20
 VIA_POINT_VARIANCE = 1e-4  # variance of a via-point, relative to the kernel's; contradicting via-points are averaged
 
 
@@ -358,125 +350,3 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
     K = kernel(times[at], times[at]) + VIA_POINT_VARIANCE * np.eye(len(at))
     displacement = kernel(times, times[at]) @ np.linalg.solve(K, rows[:, 1:] - reference.means[at])
     return ReferenceTrajectory(times, reference.means + displacement, reference.covariances)
-
-
-@dataclass(frozen=True)
-class Mixture:
-    """Joint Gaussian mixture of (time, outputs), standardized by `center` and `scale`."""
-
-    weights: np.ndarray  # weights of the components (C,)
-    means: np.ndarray  # means (C, 1 + O)
-    covariances: np.ndarray  # covariances (C, 1 + O, 1 + O)
-    center: np.ndarray  # mean of the data (1 + O,) [s, unit of the output]
-    scale: np.ndarray  # standard deviations of the data (1 + O,) [s, unit of the output]
-
-
-def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> Mixture:
-    """Fit C components to M demonstrations by expectation maximization, initialized with C equal slices of time.
-
-    With this initialization the components stay in order along the motion. With a random one, several of them share a
-    wide region and blur a narrow one.
-
-    Args:
-        times: Common clock (N,) [s].
-        outputs: Outputs (M, N, O).
-        components: Number of components C, from 1 to half the number of steps. By default the number with the least
-            Bayesian information criterion, at most 20; the search stops once two numbers in a row are worse than the
-            best before.
-        seed: Seed of scikit-learn's generator, from 0 to 2^32 − 1.
-
-    Raises:
-        InputError: If there are fewer than two steps for each component, less than one component, or the number of
-            components or the seed is not a whole number in its range.
-    """
-    _, center, scale = _standardize(times, outputs)
-    candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)
-    best, _ = min(_fit_candidates(times, outputs, candidates, seed).values(), key=lambda fit: fit[1])
-    return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
-
-
-def information_criteria(
-    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
-) -> dict[int, float]:
-    """Compute the Bayesian information criterion of mixtures by number of components; less is better.
-
-    `candidates` are increasing; the search stops once two in a row are worse than the best before. The other
-    arguments and the errors are those of `fit_mixture`.
-    """
-    return {count: criterion for count, (_, criterion) in _fit_candidates(times, outputs, candidates, seed).items()}
-
-
-def _fit_candidates(
-    times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
-) -> dict[int, tuple[GaussianMixture, float]]:
-    """Return mixtures and their criteria by number of components; the search stops after two that are worse."""
-    candidates, seed = [as_whole(count, "components") for count in candidates], as_whole(seed, "seed")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed must be from 0 to 2^32 − 1, not {brief(seed)}")
-    for count in candidates:
-        if not 1 <= count <= len(times) // 2:
-            raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")
-    data, _, _ = _standardize(times, outputs)
-    phase = np.tile(np.arange(len(times)), len(outputs)) / len(times)  # phase of each sample, from 0 to below 1
-    fits: dict[int, tuple[GaussianMixture, float]] = {}
-    for count in candidates:
-        mixture = _fit(data, phase, count, seed)
-        fits[count] = mixture, float(mixture.bic(data))
-        criteria = [criterion for _, criterion in fits.values()]
-        if len(criteria) > 2 and min(criteria[-2:]) > min(criteria[:-2]):
-            break
-    return fits
-
-
-def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute Gaussian mixture regression on times (N,) [s].
-
-    Conditioned on time, each component is a line with a constant covariance. The results are the means (N, O) and the
-    covariances (N, O, O) of their mixture, weighted by the likelihood of the time under each component.
-    """
-    offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
-    variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]
-    log = np.log(mixture.weights) - 0.5 * (np.log(variance) + offset**2 / variance)
-    weights = np.exp(log - log.max(axis=1, keepdims=True))  # scaled to avoid underflow far from every component
-    weights /= weights.sum(axis=1, keepdims=True)
-    slopes = across / variance[:, None]
-    lines = mixture.means[:, 1:] + offset[..., None] * slopes  # (N, C, O)
-    within = mixture.covariances[:, 1:, 1:] - slopes[:, :, None] * across[:, None, :]
-    means = np.einsum("nc,nco->no", weights, lines)
-    apart = lines - means[:, None, :]
-    covariances = np.einsum("nc,cop->nop", weights, within) + np.einsum("nc,nco,ncp->nop", weights, apart, apart)
-    covariances = (covariances + covariances.transpose(0, 2, 1)) / 2
-    scale = mixture.scale[1:]
-    return means * scale + mixture.center[1:], covariances * scale[:, None] * scale
-
-
-def _standardize(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return samples (M·N, 1 + O) of time and outputs, standardized, with their center and scale (1 + O,)."""
-    data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
-    center, deviation = data.mean(axis=0), data.std(axis=0)
-    # The standard deviation of a constant output is only a rounding error.
-    moves = deviation > 1e-12 * np.abs(data).max(axis=0)
-    scale = np.where(moves, deviation, 1.0)
-    return (data - center) / scale, center, scale
-
-
-def _fit(data: np.ndarray, phase: np.ndarray, components: int, seed: int) -> GaussianMixture:
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.mixture import GaussianMixture
-
-    label = np.minimum((phase * components).astype(int), components - 1)
-    parts = [data[label == c] for c in range(components)]
-    floor = 10 * _REGULARIZATION * np.eye(data.shape[1])
-    mixture = GaussianMixture(
-        components,
-        reg_covar=_REGULARIZATION,
-        max_iter=300,
-        random_state=seed,
-        weights_init=np.full(components, 1 / components),
-        means_init=np.array([part.mean(axis=0) for part in parts]),
-        precisions_init=np.array([np.linalg.inv(np.cov(part.T) + floor) for part in parts]),
-    )
-    with warnings.catch_warnings():
-        # EM that starts near its optimum is accurate enough long before scikit-learn's tolerance is met.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        return mixture.fit(data)

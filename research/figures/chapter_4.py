@@ -10,7 +10,7 @@ from matplotlib.patches import Ellipse, Rectangle
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import rms_gains
-from guiderail.models.primitives.reference import fit_mixture
+from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout

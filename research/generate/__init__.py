@@ -4,8 +4,11 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+import numpy as np
+
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.primitives import Demonstrations
 
 
 def _objects(name: str, dimensions: str) -> Callable[..., None]:
@@ -30,12 +33,30 @@ def _session(name: str) -> Callable[..., None]:
     return record
 
 
+def _mixtures(*folder: Path) -> None:
+    mixture = import_module("guiderail.models.primitives.mixture")
+    connector, passage = (
+        import_module(f"guiderail.diagrams.tasks.{name}.task") for name in ("bnc_connector", "narrow_passage")
+    )
+    arrays: dict[str, np.ndarray] = {}
+    for path, components in [
+        (passage.demonstrations.PATH, passage.COMPONENTS),
+        *((path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()),
+    ]:
+        demonstrations = Demonstrations.load(path).resampled()
+        arguments = demonstrations.times[0], np.stack(demonstrations.outputs), components, 0
+        fitted, key = mixture.fit_new_mixture(*arguments), mixture.digest(*arguments)
+        arrays |= {f"{key}/{name}": getattr(fitted, name) for name in mixture.FIELDS}
+    np.savez(Path(*(folder or [mixture.STORED_PATH.parent]), mixture.STORED_PATH.name), **arrays)
+
+
 # Functions that write the files into a folder; without an argument, into the folder of the package.
 GENERATORS: dict[str, Callable[..., None]] = {
     "connector-demonstrations": _session("INSERT_SESSION"),
     "connector-search-demonstrations": _session("SEARCH_SESSION"),
     "connector-firm-search-demonstrations": _session("FIRM_SEARCH_SESSION"),
     "passage-demonstrations": _passage,
+    "mixtures": _mixtures,
     "connector-objects": _objects("bnc_connector", "BncDimensions"),
     "clamp-objects": _objects("grid_clamp", "GridClampDimensions"),
 }

@@ -6,7 +6,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share, fit, motion_without_actions, share_within_spread
-from guiderail.models.primitives.reference import information_criteria
+from guiderail.models.primitives.mixture import information_criteria
 from oracles.handwriting import LETTERS, correlated, write
 
 

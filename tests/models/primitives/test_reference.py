@@ -3,7 +3,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory
-from guiderail.models.primitives.reference import Mixture, fit_mixture, interpolate_prior, regress
+from guiderail.models.primitives.reference import interpolate_prior
 
 
 def hourglass(num=9, n=120, seed=0):
@@ -23,23 +23,6 @@ def test_regression_recovers_mean_and_deviation(components):
     wide, narrow = reference.standard_deviations[[10, 60], 0]
     assert wide > 4 * narrow
     assert wide == pytest.approx(outputs[:, 10, 0].std(), rel=0.3)
-
-
-def test_regression_returns_the_moments_of_the_mixture():
-    """Compare with the moments of the joint density at a fixed time."""
-    weights, means = np.array([0.3, 0.7]), np.array([[-0.5, 1.0], [0.8, -0.4]])
-    covariances = np.array([[[0.4, 0.3], [0.3, 0.5]], [[0.2, -0.1], [-0.1, 0.3]]])
-    center, scale = np.array([2.0, 0.1]), np.array([0.5, 3.0])
-    at, y = np.array([1.2, 2.0, 2.5, 5.0]), np.linspace(-30, 30, 20001)
-    regressed = regress(Mixture(weights, means, covariances, center, scale), at)
-    for t, mean, covariance in zip(at, *regressed, strict=True):
-        joint = (np.stack([np.full_like(y, t), y], axis=1) - center) / scale
-        apart = joint[:, None] - means
-        exponent = np.einsum("ncj,cjk,nck->nc", apart, np.linalg.inv(covariances), apart)
-        density = (np.exp(-exponent / 2) / np.sqrt(np.linalg.det(covariances)) * weights).sum(axis=1)
-        density /= density.sum()
-        assert mean[0] == pytest.approx(density @ y, rel=1e-9)
-        assert covariance[0, 0] == pytest.approx(density @ (y - mean[0]) ** 2, rel=1e-9)
 
 
 def test_reference_is_deterministic_for_a_seed():
@@ -153,31 +136,6 @@ def test_resampled_reference_is_interpolated_over_its_clock(times):
     expected = np.minimum(2.0 * (resampled.times - times[0]), means[-1])
     np.testing.assert_allclose(resampled.means[:, 0], expected, atol=1e-12)
     np.testing.assert_allclose(resampled.covariances[:, 0, 0], 1.0 + expected, atol=1e-12)
-
-
-def test_regression_extrapolates_the_most_likely_component():
-    """If every density underflows, the mean continues along the line of one component."""
-    times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
-    mixture = fit_mixture(times, outputs, components=20, seed=0)
-    far = np.array([-300.0, 300.0, 400.0])
-    means, covariances = regress(mixture, far)
-    assert np.isfinite(means).all()
-    assert (covariances[:, 0, 0] > 0).all()
-    assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
-
-
-def test_components_are_limited_to_half_the_steps():
-    times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
-    assert len(fit_mixture(times, outputs, components=6, seed=0).weights) == 6
-    with pytest.raises(InputError, match="components"):
-        fit_mixture(times, outputs, components=7, seed=0)
-
-
-def test_fit_mixture_selects_the_better_number_of_components():
-    """Four steps allow one or two components; two separate levels need two."""
-    rng = np.random.default_rng(0)
-    outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
-    assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2
 
 
 @pytest.mark.parametrize("height", [0.3, 0.5, 1.0, 0.1])

@@ -1,0 +1,84 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from guiderail.diagrams.tasks.bnc_connector import task as connector
+from guiderail.diagrams.tasks.narrow_passage import task as passage
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.mixture import FIELDS, Mixture, digest, fit_mixture, fit_new_mixture, regress
+
+PACKAGED = [(path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()]
+PACKAGED.append((passage.demonstrations.PATH, passage.COMPONENTS))
+
+
+@pytest.mark.parametrize(("path", "components"), PACKAGED, ids=lambda one: getattr(one, "stem", None))
+def test_stored_mixtures_are_those_of_the_packaged_demonstrations(path, components):
+    demonstrations = Demonstrations.load(path).resampled()
+    arguments = demonstrations.times[0], np.stack(demonstrations.outputs), components, 0
+    stored, fitted = fit_mixture(*arguments), fit_new_mixture(*arguments)
+    assert fit_mixture(*arguments) is stored
+    for name in FIELDS:
+        np.testing.assert_allclose(getattr(stored, name), getattr(fitted, name), rtol=1e-6, atol=1e-9)
+
+
+def test_a_digest_names_all_arguments():
+    times, outputs = np.arange(4.0), np.zeros((2, 4, 3))
+    others = [(times + 1, outputs, 2, 0), (times, outputs + 1, 2, 0), (times, outputs, 1, 0), (times, outputs, 2, 1)]
+    others.append((times, outputs.reshape(3, 4, 2), 2, 0))
+    assert len({digest(*one) for one in [(times, outputs, 2, 0), *others]}) == 6
+
+
+def test_packaged_demonstrations_need_no_scikit_learn():
+    """Importing it takes 0.5 s and 80 MiB of every training process."""
+    program = (
+        "import sys; from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory as connector; "
+        "from guiderail.diagrams.tasks.narrow_passage.task import reference_trajectory as passage; "
+        "connector('insert'), connector('search'), connector('firm_search'), passage(); "
+        "sys.exit('sklearn' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
+def test_regression_returns_the_moments_of_the_mixture():
+    """Compare with the moments of the joint density at a fixed time."""
+    weights, means = np.array([0.3, 0.7]), np.array([[-0.5, 1.0], [0.8, -0.4]])
+    covariances = np.array([[[0.4, 0.3], [0.3, 0.5]], [[0.2, -0.1], [-0.1, 0.3]]])
+    center, scale = np.array([2.0, 0.1]), np.array([0.5, 3.0])
+    at, y = np.array([1.2, 2.0, 2.5, 5.0]), np.linspace(-30, 30, 20001)
+    regressed = regress(Mixture(weights, means, covariances, center, scale), at)
+    for t, mean, covariance in zip(at, *regressed, strict=True):
+        joint = (np.stack([np.full_like(y, t), y], axis=1) - center) / scale
+        apart = joint[:, None] - means
+        exponent = np.einsum("ncj,cjk,nck->nc", apart, np.linalg.inv(covariances), apart)
+        density = (np.exp(-exponent / 2) / np.sqrt(np.linalg.det(covariances)) * weights).sum(axis=1)
+        density /= density.sum()
+        assert mean[0] == pytest.approx(density @ y, rel=1e-9)
+        assert covariance[0, 0] == pytest.approx(density @ (y - mean[0]) ** 2, rel=1e-9)
+
+
+def test_regression_extrapolates_the_most_likely_component():
+    """If every density underflows, the mean continues along the line of one component."""
+    times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
+    mixture = fit_mixture(times, outputs, components=20, seed=0)
+    far = np.array([-300.0, 300.0, 400.0])
+    means, covariances = regress(mixture, far)
+    assert np.isfinite(means).all()
+    assert (covariances[:, 0, 0] > 0).all()
+    assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
+
+
+def test_components_are_limited_to_half_the_steps():
+    times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
+    assert len(fit_mixture(times, outputs, components=6, seed=0).weights) == 6
+    with pytest.raises(InputError, match="components"):
+        fit_mixture(times, outputs, components=7, seed=0)
+
+
+def test_fit_mixture_selects_the_better_number_of_components():
+    """Four steps allow one or two components; two separate levels need two."""
+    rng = np.random.default_rng(0)
+    outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
+    assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2
