@@ -12,7 +12,7 @@ from guiderail.models.common.transforms import pose_to_transform, transform_to_p
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.template_frames import TemplateFrames, state_number
+from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class ActiveConstraintProjector(LeafSystem):
@@ -117,7 +117,7 @@ class ActiveConstraintProjector(LeafSystem):
         return max(self._template.violation(one, X_WE, frames) for one in states)
 
     def _state(self, context: Context) -> int | None:
-        return state_number(self._state_port, context, len(self._template.states))
+        return declare.state_number(self._state_port, context, len(self._template.states))
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the command (6,) and, as the seventh number, the fallback flag."""

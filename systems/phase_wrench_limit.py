@@ -7,7 +7,6 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, approach_bound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.template_frames import state_number
 
 
 class PhaseWrenchLimit(LeafSystem):
@@ -67,7 +66,7 @@ class PhaseWrenchLimit(LeafSystem):
 
     def _limit(self, context: Context) -> np.ndarray:
         """Return the limit of the state at the port, (8,)."""
-        state = state_number(self._state_port, context, len(self._limits))
+        state = declare.state_number(self._state_port, context, len(self._limits))
         return self._limits.min(axis=0) if state is None else self._limits[state]
 
     def _present(self, context: Context) -> np.ndarray:

@@ -10,7 +10,7 @@ from guiderail.models.common.transforms import pose_to_transform, transform_to_p
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
-from guiderail.systems.support.template_frames import TemplateFrames, state_number
+from guiderail.systems.support.template_frames import TemplateFrames
 
 
 class SctInputMapping(LeafSystem):
@@ -65,7 +65,7 @@ class SctInputMapping(LeafSystem):
 
     def _requested_pose(self, context: Context) -> np.ndarray:
         action = self._action_port.Eval(context)
-        state = state_number(self._state_port, context, len(self._template.states))
+        state = declare.state_number(self._state_port, context, len(self._template.states))
         if state is None or not np.isfinite(action).all():
             return np.full(6, np.nan)
         X_WE = pose_to_transform(self._pose_port.Eval(context))

@@ -40,7 +40,6 @@ from guiderail.models.primitives.reference import pass_through
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor
-from guiderail.systems.image_observation import ImageObservation
 from guiderail.systems.reward_system import RewardSystem
 
 
@@ -257,6 +256,8 @@ class Loop:
         image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
         if isinstance(observed, Camera):
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
+        from guiderail.systems.image_observation import ImageObservation  # most environments have no image
+
         space, state = self.add_terms(task, observed, "state_observation")
         both = ImageObservation(width, height, state.size())
         add_system(self.builder, "observation", both, image=image, state=state)

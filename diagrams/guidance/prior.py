@@ -15,7 +15,6 @@ from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
-from guiderail.models.templates.template import check_template
 
 if TYPE_CHECKING:
     from guiderail.models.control.keep_out import KeepOut
@@ -200,6 +199,8 @@ class PlacedTemplate:
     max_tracking_error: float = np.inf
 
     def __post_init__(self) -> None:
+        from guiderail.models.templates.template import check_template  # a task without a template does not need it
+
         check_template(self.template, self.frames)
 
     def constrained(self, by_default: bool) -> bool:

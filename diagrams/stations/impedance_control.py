@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
@@ -15,13 +17,15 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
-from guiderail.models.templates import SharedControlTemplate
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.energy_tank import EnergyTank
 from guiderail.systems.impedance_monitor import ImpedanceMonitor
 from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
+
+if TYPE_CHECKING:
+    from guiderail.models.templates import SharedControlTemplate
 
 TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
 # Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. A joint's damping increases with its inertia, so

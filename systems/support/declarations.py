@@ -343,3 +343,9 @@ def output_getter(name: str, description: str) -> Callable[[System], OutputPort]
 
     getter.__name__, getter.__doc__ = f"get_{name}_output_port", f"Return the port of the {description}."
     return getter
+
+
+def state_number(port: InputPort, context: Context, count: int) -> int | None:
+    """Return the number of a template's state at a port (1,), or None if it is not one of `count` states."""
+    number = float(port.Eval(context)[0])
+    return int(number) if 0.0 <= number < count and number.is_integer() else None

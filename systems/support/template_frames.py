@@ -1,21 +1,15 @@
-"""State of a template at an input port, and poses of its objects as numeric parameters of a system."""
+"""Poses of a template's objects as numeric parameters of a system."""
 
 from collections.abc import Mapping
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import BasicVector, Context, DependencyTicket, InputPort, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
-
-
-def state_number(port: InputPort, context: Context, count: int) -> int | None:
-    """Return the number of a template's state at a port (1,), or None if it is not one of `count` states."""
-    number = float(port.Eval(context)[0])
-    return int(number) if 0.0 <= number < count and number.is_integer() else None
 
 
 class TemplateFrames:
