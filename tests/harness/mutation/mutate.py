@@ -46,7 +46,7 @@ TEMPLATES = ["tests/models/templates"]
 TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
-    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "demonstrations")},
+    **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
     "models/templates/constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/geometry.py": TEMPLATES,
@@ -55,6 +55,7 @@ TARGETS = {
     "models/control/joint_status.py": ["tests/models/control/test_joint_status.py"],
     "models/control/message_sequence.py": ["tests/models/control/test_message_sequence.py"],
     "models/control/state_estimator.py": ["tests/models/control/test_state_estimator.py"],
+    "diagrams/hardware/driver_guard.py": ["tests/diagrams/hardware/test_driver_guard.py"],
     "diagrams/hardware/monitor.py": ["tests/diagrams/hardware/test_monitor.py"],
     **{
         f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
