@@ -42,14 +42,14 @@ def brief(value: Any) -> str:
 
 
 @contextmanager
-def naming_failures(action: str) -> Iterator[None]:
+def naming_failures(action: str, *passed: type[Exception]) -> Iterator[None]:
     """Turn any error of a user's code into an `InputError`: the action that failed, the file, the line and the error.
 
-    An `InputError` is raised unchanged.
+    An `InputError` and an error of the types `passed` are raised unchanged.
     """
     try:
         yield
-    except InputError:
+    except (InputError, *passed):
         raise
     except (Exception, SystemExit) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]

@@ -24,11 +24,11 @@ from guiderail.tools.hardware.connection import Log, RobotConnection
 from guiderail.tools.hardware.executor import record_size
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import robot_session
-from guiderail.tools.learning.learner import LEARNERS, described_observation, learner_arguments
+from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, with_defaults
-from guiderail.tools.learning.trainer import restore_checkpoint, write_checkpoint
+from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
 
 EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
 NICENESS = 5  # niceness of the training process, so that the control loop meets its deadlines
@@ -138,7 +138,7 @@ def _train(
             learner.write(step_log_file(folder.steps, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
 
     def save_policy() -> None:
-        acting.policy({"task": config.task, **described_observation(env)}).save(folder.path, write=write_atomically)
+        learned_policy(config, acting, env).save(folder.path, write=write_atomically)
 
     def save_learned() -> None:
         if learner.known:

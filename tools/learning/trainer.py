@@ -40,6 +40,9 @@ if TYPE_CHECKING:
 # episode, large ones less often. The first and the last checkpoint are always written.
 MAX_SAVING_FRACTION = 0.03
 
+# Errors of `Learner.restore` that mean that the state does not fit the learner.
+_UNFIT = (LookupError, TypeError, ValueError, OverflowError, RuntimeError)
+
 Demonstrator = Callable[[gymnasium.Env], PolicyFn]
 
 
@@ -232,21 +235,27 @@ def _train(
     learner.finish()
     remove_step_logs(folder.steps, len(rows))  # of episodes that actors simulated ahead of an early end
     learning_log.record(rows, learner.metrics, is_finished=True)
+    learned_policy(config, learner, env).save(folder.path, write=write_atomically)
+    return rows
+
+
+def learned_policy(config: RunConfig, learner: Learner, env: Any) -> Policy:
+    """Return the policy of a learner; raise an `InputError` if `Learner.policy` fails or returns no `Policy`."""
     try:
-        policy = learner.policy({"task": config.task, **described_observation(env)})
+        with _naming_failures(config, f"{type(learner).__name__}.policy", ValueError):
+            policy = learner.policy({"task": config.task, **described_observation(env)})
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{type(learner).__name__}.policy failed: {error}") from error
     if not isinstance(policy, Policy):
         raise InputError(f"{type(learner).__name__}.policy must return a Policy, not {brief(policy)}")
-    policy.save(folder.path, write=write_atomically)
-    return rows
+    return policy
 
 
-def _naming_failures(config: RunConfig, action: str) -> AbstractContextManager[None]:
+def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -> AbstractContextManager[None]:
     """Return `naming_failures` for a learner of a user, and a context without effect for one of this package."""
-    return nullcontext() if LEARNERS.is_packaged(config.learner.algorithm) else naming_failures(action)
+    return nullcontext() if LEARNERS.is_packaged(config.learner.algorithm) else naming_failures(action, *passed)
 
 
 def _has_diverged(learner: Learner) -> bool:
@@ -305,9 +314,10 @@ def write_checkpoint(
 
     Raises:
         InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold and
-            does not change.
+            does not change; or if `Learner.state` of a user's learner fails.
     """
-    state = learner.state()
+    with _naming_failures(config, f"{type(learner).__name__}.state"):
+        state = learner.state()
     if not (isinstance(state, tuple) and len(state) == 2 and all(isinstance(part, Mapping) for part in state)):
         raise InputError(f"{type(learner).__name__}.state must return two dictionaries, not {brief(state)}")
     arrays, values = state
@@ -374,12 +384,13 @@ def restore_checkpoint(
             raise InputError(
                 f"{table} is not the table of its checkpoint: restore it, or remove it to have it written again"
             )
-        learner.restore(arrays, values["learner"])
+        with _naming_failures(config, f"{type(learner).__name__}.restore", *_UNFIT):
+            learner.restore(arrays, values["learner"])
         env.unwrapped.np_random.bit_generator.state = values["environment"]
     except InputError:
         raise
     # The digest matches, so the content is complete but of another learner.
-    except (LookupError, TypeError, ValueError, OverflowError, RuntimeError) as error:
+    except _UNFIT as error:
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error

@@ -21,6 +21,7 @@ from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.learning import actors, trainer
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.off_policy import SacLearner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, train, with_defaults
 from guiderail.tools.learning.trainer import run_training
@@ -567,3 +568,28 @@ def test_train_refuses_numbers_that_are_not_whole(name, wrong, trained_config):
 def test_train_names_the_argument_that_was_meant(options, message, trained_config):
     with pytest.raises(InputError, match=message):
         trained_config(**options)
+
+
+@pytest.mark.parametrize(("method", "number"), [("state", 2), ("policy", 5), ("restore", 2)])
+def test_failure_of_a_users_learner_is_named(method, number, bead_config, tmp_path, monkeypatch):
+    class Own(SacLearner):
+        pass
+
+    def fail(self, *arguments):
+        if method != "state" or self.episodes == 3:
+            raise AttributeError("no weights")
+        return SacLearner.state(self)
+
+    monkeypatch.setitem(LEARNERS._entries, "own", Own)
+    monkeypatch.setattr(trainer, "MAX_SAVING_FRACTION", 1.0)
+    folder = RunFolder(tmp_path / "run")
+    config = replace(bead_config, learner=replace(bead_config.learner, algorithm="own"), episodes=5)
+    if method == "restore":
+        run_training(folder, replace(config, episodes=2))
+    with monkeypatch.context() as patch:
+        patch.setattr(Own, method, fail)
+        with pytest.raises(InputError, match=rf"Own\.{method} failed: test_trainer\.py, line \d+: AttributeError: no"):
+            run_training(folder, config, resume=method == "restore")
+    assert len(folder.episodes()) == number
+    assert len(run_training(folder, config, resume=True)) == 5
+    assert (folder.path / "policy.json").is_file()
