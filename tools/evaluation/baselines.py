@@ -13,7 +13,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.policies import ENDINGS
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn
@@ -95,7 +95,8 @@ class BaselinePolicy(Callback):
     def on_episode_start(self) -> None:
         """Make the policy of the next episode."""
         self._episode += 1
-        self._act = self._factory(np.random.default_rng([self._seed, self._episode]), self._size)
+        with naming_failures(f"the baseline policy {getattr(self._factory, '__name__', brief(self._factory))}"):
+            self._act = self._factory(np.random.default_rng([self._seed, self._episode]), self._size)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """Return an action (A,) in [−1, 1]."""

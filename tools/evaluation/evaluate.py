@@ -14,7 +14,7 @@ import pandas as pd
 
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.common.transforms import POSE_NAMES, POSE_SIZE
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
@@ -36,8 +36,10 @@ from guiderail.tools.evaluation.evaluation import (
 )
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
+from guiderail.tools.evaluation.policies import as_policy
 from guiderail.tools.evaluation.rollout import (
     HELD_OUT_SEED,
+    Callback,
     EpisodeProgress,
     PolicyFn,
     check_seed,
@@ -98,20 +100,28 @@ def evaluate_policies(
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
 
     Raises:
-        InputError: If `episodes`, `seed` or `processes` is out of range.
+        InputError: If `episodes`, `seed` or `processes` is out of range, or a policy raises an exception.
         KilledError: If a process is killed.
     """
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
+    policies = {name: act if callable(act) else as_policy(act) for name, act in policies.items()}
     names = list(policies)
     first = seed - HELD_OUT_SEED if first_number is None else first_number
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
-        act, index = policies[names[number // episodes]], number % episodes
+        name, index = names[number // episodes], number % episodes
+        act, what = policies[name], "the policy" if name == POLICY else f"the baseline policy {name!r}"
         if (start := getattr(act, "start_episode", None)) is not None:
             start((first + index) % 2**32)
-        row = rollout(env, act, index=index, seed=seed + index, held_out=True, options=options)
+
+        def named_act(observation: np.ndarray) -> np.ndarray:
+            with naming_failures(what):
+                return act(observation)
+
+        callbacks = (act,) if isinstance(act, Callback) else ()
+        row = rollout(env, named_act, *callbacks, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 
     results = forked_map(run, len(names) * episodes, processes)
@@ -158,9 +168,11 @@ def evaluate_run(
     """
     with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
-        if skips_incompatible and not is_compatible(make_policy, env):
-            return pd.DataFrame()
-        return evaluate_policy(env, make_policy(env), **how)
+        with naming_failures(f"making the policy {how.get('label', '')}".rstrip()):
+            if skips_incompatible and not is_compatible(make_policy, env):
+                return pd.DataFrame()
+            policy = make_policy(env)
+        return evaluate_policy(env, policy, **how)
 
 
 def evaluate_once(
@@ -326,9 +338,12 @@ def evaluate(
             if (file := files[name]) is not None and (rows := read_complete(file, episodes)) is not None
         }
         missing = {name: make for name, make in others.items() if name not in stored}
-        skipped = [name for name, make in missing.items() if not is_compatible(make, evaluation_env)]
         policies = {POLICY: subject.make_policy(evaluation_env)}
-        policies |= {name: make(evaluation_env) for name, make in missing.items() if name not in skipped}
+        for name, make in missing.items():
+            with naming_failures(f"the baseline policy {name!r}"):
+                if is_compatible(make, evaluation_env):
+                    policies[name] = make(evaluation_env)
+        skipped = [name for name in missing if name not in policies]
         labels = {
             name: f"series {number} of {1 + len(others)}: {LABELS.get(name, name)}"
             for number, name in enumerate((POLICY, *others), start=1)

@@ -154,6 +154,31 @@ def test_evaluate_refuses_a_baseline_that_cannot_name_a_file(bead_run, name):
         evaluate(bead_run, episodes=1, baselines={name: zero_policy})
 
 
+def fails(*arguments):
+    raise KeyError("gain")
+
+
+def fails_late(observation):
+    return np.zeros(2) if observation.min() == observation.max() else fails()
+
+
+@pytest.mark.parametrize(
+    ("make_policy", "name", "stored"),
+    [
+        (fails, "'mine'", 0),
+        (lambda env: fails, "'mine'", 0),
+        (lambda env: fails_late, "'mine'", 1),
+        (partial(BaselinePolicy, fails), "fails", 1),
+        (partial(BaselinePolicy, lambda rng, size: fails_late), "'mine'", 1),
+    ],
+)
+def test_failure_of_a_given_baseline_is_named(make_policy, name, stored, bead_run):
+    message = rf"the baseline policy {name} failed: test_evaluate\.py, line \d+: KeyError: 'gain'"
+    with pytest.raises(InputError, match=message):
+        evaluate(bead_run, episodes=2, baselines={"zero": zero_policy, "mine": make_policy}, processes=1)
+    assert len(list(bead_run.glob("baselines/zero-*.csv"))) == stored
+
+
 def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
     folder = RunFolder(bead_run)
     evaluate(bead_run, episodes=2, baselines=["constant"])
