@@ -42,7 +42,9 @@ class RunConfig:
     environment: dict[str, Any]  # arguments of gymnasium.make
     learner: SkipValidation[LearnerConfig]  # all settings, an instance of the learner's `Config`
     preset: str | None  # preset that the learner's settings were derived from
-    episodes: Annotated[int, Field(ge=1, le=MAX_EPISODES, strict=True)]  # total number of episodes
+    # Planned number of episodes, with which --resume and a repeated run end at the same episode; `stop_after_successes`
+    # may end training earlier. The number of finished episodes is that of the rows of `episodes.csv`.
+    episodes: Annotated[int, Field(ge=1, le=MAX_EPISODES, strict=True)]
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of all random numbers
     versions: dict[str, str] = field(default_factory=dict)  # versions of the packages that the result depends on
     imports: tuple[str, ...] = ()  # modules, files or task folders that register the task, the learner, …

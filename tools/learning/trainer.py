@@ -185,7 +185,7 @@ def _train(
         supervised.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
         env, config = supervised.env, supervised.config
     folder.write_config(config)
-    if resume and len(rows) < config.episodes:
+    if resume and len(rows) < config.episodes and not _ends_with_successes(rows, config.learner.stop_after_successes):
         folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
 
     step_log = StepLog(env, folder.steps)

@@ -198,8 +198,10 @@ def test_run_ends_after_successes_in_a_row_also_if_it_is_resumed(num_envs, bead_
         run_training(stopped, config, report=stop)
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
+    monkeypatch.delattr(RunFolder, "remove_policy")  # the policy of a run that has ended is never missing
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
+    assert stopped.config().episodes == config.episodes
 
 
 def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypatch):
@@ -581,7 +583,7 @@ def test_failure_of_a_users_learner_is_named(method, number, bead_config, tmp_pa
         return SacLearner.state(self)
 
     monkeypatch.setitem(LEARNERS._entries, "own", Own)
-    monkeypatch.setattr(trainer, "MAX_SAVING_FRACTION", 1.0)
+    monkeypatch.setattr(trainer, "MAX_SAVING_FRACTION", 1e9)
     folder = RunFolder(tmp_path / "run")
     config = replace(bead_config, learner=replace(bead_config.learner, algorithm="own"), episodes=5)
     if method == "restore":
