@@ -6,6 +6,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -142,7 +143,19 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
 
 
 class Command(typer.core.TyperCommand):
-    """Command with a help text that expands `{name}` to the choices that exist when the help is printed."""
+    """Command with a help text that expands `{name}` to the choices that exist when the help is printed.
+
+    It refuses an empty argument: as a path it would be the current folder.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the arguments; raise an `InputError` before if one is empty."""
+        for before, word in pairwise(["", *args]):
+            option = before if word == "" else word.removesuffix("=") if re.fullmatch("--[^=]+=", word) else None
+            if option is not None:
+                name = option if option.startswith("--") else "an argument"
+                raise InputError(f"{name} is empty: give a value, or leave it out")
+        return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Expand the choices, then format the options."""

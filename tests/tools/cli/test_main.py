@@ -158,6 +158,18 @@ def trained(bead_run):
         (["demo", "--seed", "-1", "--out", "new"], "a seed is a whole number"),
         (["deploy", "new", "--sim", "--robot-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["list", "metrix"], "did you mean metrics?"),
+        *(
+            ([*words, ""], f"{words[-1]} is empty: give a value, or leave it out")
+            for words in (
+                ["train", "NarrowPassage", "--out"],
+                ["evaluate", "new", "--save"],
+                ["create-task", "plug.stl", "socket.stl", "--out"],
+                ["study", CONNECTOR, "--out"],
+                ["demo", "--out"],
+            )
+        ),
+        (["report", "run", "", "--out", "page.html"], "an argument is empty: give a value"),
+        (["train", "NarrowPassage", "--out="], "--out is empty: give a value, or leave it out"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else None,
 )
