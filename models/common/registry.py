@@ -2,6 +2,7 @@
 
 import ast
 import difflib
+import logging
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -16,6 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar, overload
 from guiderail.models.common.errors import InputError, brief, naming_failures
 
 Entry = TypeVar("Entry")
+_LOGGER = logging.getLogger(__name__)
 _NO_VALUE: Any = object()  # default of `register`, because None is refused like any other value
 
 
@@ -24,7 +26,8 @@ class Registry(Generic[Entry]):
 
     Getting an entry imports its module; listing the names imports no module if `decorator` is given. `register`, as a
     decorator or a call, adds an entry: in a module of `package`, which is found without being imported; in an installed
-    package with an entry point of the group `entry_points`; or in any other file that is imported.
+    package with an entry point of the group `entry_points`; or in any other file that is imported. An entry point with
+    the name of an entry of `package` is ignored, with a warning: an installed package cannot replace or break it.
 
     Args:
         noun: Kind of the entries for messages, such as "task".
@@ -97,7 +100,13 @@ class Registry(Generic[Entry]):
             import_module(self._declarations[name].module)
         if name in self._points and name not in self._loaded:
             for point in self._points[name]:
-                self._load(point)
+                if self.is_packaged(name):
+                    _LOGGER.warning(
+                        "the %s %r of %s is ignored, because guiderail has one of this name: rename or uninstall it",
+                        self.noun, name, _package_of(point),
+                    )  # fmt: skip
+                else:
+                    self._load(point)
             self._loaded.add(name)
         if name not in self._entries:
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
@@ -106,7 +115,6 @@ class Registry(Generic[Entry]):
     def _load(self, point: metadata.EntryPoint) -> None:
         """Load an entry point; raise an InputError if that fails, or if another object is registered by its name."""
         name = point.name
-        package = f"the installed package {point.dist.name if point.dist else '?'}"
         try:
             with naming_failures(f"importing {point.value}"):
                 value = point.load()
@@ -117,7 +125,7 @@ class Registry(Generic[Entry]):
             if not is_same and _origin(value) != self._origins[name]:
                 raise InputError(f"there is another {self.noun} {name!r}, from {place}: rename one, or uninstall it")
         except InputError as error:
-            raise InputError(f"the {self.noun} {name!r} of {package} cannot be used: {error}") from error
+            raise InputError(f"the {self.noun} {name!r} of {_package_of(point)} cannot be used: {error}") from error
 
     def names(self) -> list[str]:
         """Return the names of all entries, sorted."""
@@ -176,9 +184,12 @@ class Registry(Generic[Entry]):
             if file.stem != "__init__"
         }
         if self._decorator is None:
+            declared: dict[str, _Declaration] = {}
             for module in files:
+                before = set(self._entries)
                 import_module(module)
-            return {}
+                declared |= {name: _Declaration(module, {}) for name in set(self._entries) - before}
+            return declared
         return {
             name: _Declaration(module, values)
             for module, file in files.items()
@@ -231,6 +242,10 @@ def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str
     if near:
         return f"did you mean {lower[near[0]]}?"
     return (f"choose one of {', '.join(known)}" if known else "none is registered") + otherwise
+
+
+def _package_of(point: metadata.EntryPoint) -> str:
+    return f"the installed package {point.dist.name if point.dist else '?'}"
 
 
 def _folders(package: str) -> list[Path]:

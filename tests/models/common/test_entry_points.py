@@ -76,6 +76,27 @@ def test_entry_point_with_the_name_of_another_entry_is_refused(install):
         registry.get("cone")
 
 
+@pytest.mark.parametrize("decorator", ["register_shape", None])
+def test_built_in_is_kept_when_an_entry_point_has_its_name(decorator, install, tmp_path, caplog):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "cones.py").write_text(
+        "import lab_shapes\n\nregister_shape = lab_shapes.REGISTRY.register\n"
+        "@register_shape('cone')\ndef Cone():\n    pass\n"
+    )
+    install("lab_broken", "raise RuntimeError\n", cone="Cone")
+    registry = shapes(package="own", decorator=decorator)
+    sys.modules["lab_shapes"] = type(sys)("lab_shapes")
+    sys.modules["lab_shapes"].REGISTRY = registry
+    for _ in range(2):
+        assert registry.get("cone").__module__ == "own.cones"
+    assert registry.broken == {}
+    assert registry.usable() == ["cone"]
+    assert [record.getMessage() for record in caplog.records] == [
+        "the shape 'cone' of the installed package lab_broken is ignored, because guiderail has one of this name: "
+        "rename or uninstall it"
+    ]
+
+
 def test_module_of_an_entry_point_may_register_its_object_itself(install):
     source = "import lab_shapes\n\n\n@lab_shapes.REGISTRY.register('cone')\ndef Cone():\n    pass\n"
     install("lab_one", source, cone="Cone")
