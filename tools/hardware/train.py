@@ -27,7 +27,7 @@ from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, with_defaults
+from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, warn_of_unfinished_source, with_defaults
 from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
 
 EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
@@ -82,6 +82,7 @@ def train_on_robot(
     else:
         folder.refuse_existing()
         config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
+        warn_of_unfinished_source(config)
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
     if config.learner.stop_after_successes:

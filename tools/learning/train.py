@@ -235,6 +235,8 @@ def start_or_resume(
             shown,
             shown,
         )
+    if not resume:
+        warn_of_unfinished_source(config)
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
     demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
@@ -248,6 +250,18 @@ def start_or_resume(
         return Run(out)
     _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
     return Run(out, draw_pictures(out))
+
+
+def warn_of_unfinished_source(config: RunConfig) -> None:
+    """Warn if the run that the learner's setting `init_from` names is unfinished; its checkpoint is used then."""
+    name = getattr(config.learner, "init_from", "")
+    source = RunFolder(name)
+    if name and source.checkpoint.is_file() and not (source.path / "policy.json").is_file():
+        _LOGGER.warning(
+            "the run %s that init_from names is unfinished: training starts from its checkpoint of %d episodes",
+            source.path,
+            source.num_saved_episodes(),
+        )
 
 
 def configure(

@@ -549,6 +549,17 @@ def test_train_takes_whole_numbers_of_numpy(trained_config):
     assert config == trained_config(episodes=2, seed=3)
 
 
+def test_train_warns_when_its_source_is_unfinished(bead_config, tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr("guiderail.tools.learning.trainer.run_training", lambda *arguments, **named: None)
+    source = RunFolder(tmp_path / "source")
+    run_training(source, replace(bead_config, episodes=2))
+    for _ in range(2):
+        train("Bead", out=tmp_path / "run", settings={"init_from": str(source.path)}, pictures=False)
+        assert (not caplog.records) is (source.path / "policy.json").is_file()
+        source.remove_policy()
+    assert f"{source.path} that init_from names is unfinished: training starts from its checkpoint of 2" in caplog.text
+
+
 @pytest.mark.parametrize("wrong", [1.5, "3", True])
 @pytest.mark.parametrize("name", ["episodes", "seed"])
 def test_train_refuses_numbers_that_are_not_whole(name, wrong, trained_config):
