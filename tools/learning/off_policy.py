@@ -257,7 +257,10 @@ class OffPolicyLearner(Learner):
             return self.explore(observation) if extended is None else extended
         with torch.no_grad():
             tensor = self.model.policy.obs_to_tensor(observation)[0]
-            return self.actor()._predict(tensor, deterministic=True)[0].cpu().numpy()
+            action = self.actor()._predict(tensor, deterministic=True)[0].cpu().numpy()
+        space: Any = self.model.action_space
+        is_unit = (space.low == -1).all() and (space.high == 1).all()  # unscaling would change the last bit
+        return action if is_unit else self.model.policy.unscale_action(action)
 
     def _follows_base_motion(self) -> bool:
         """Return True if the next action is zero, so that the base motion has no residual (Policy Decorator).

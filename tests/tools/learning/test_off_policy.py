@@ -253,7 +253,9 @@ def test_constant_episodes_repeat_one_action(config):
     assert len(np.unique(actions[3], axis=0)) == 4
 
 
-def test_greedy_episodes_act_as_the_exported_policy(config):
+@pytest.mark.parametrize("bounds", [(-1, 1), (-2, 2), (0, 3)])
+def test_greedy_episodes_act_as_the_exported_policy(bounds, config, monkeypatch):
+    monkeypatch.setattr(SpacesOnlyEnv, "action_space", spaces.Box(*bounds, (2,)))
     learner = make(replace(config, constant_episodes=0, greedy_episode_fraction=0.5))
     learn_from_random_transitions(learner, 20)
     action_dims, greedy = actions_of(learner, 2)
