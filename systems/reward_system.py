@@ -50,15 +50,17 @@ class RewardSystem(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If there is no term, a name is not allowed, a signal's size is below 1 or differs between terms, or
-            the parameters of a function are not named like its signals. At evaluation, if a term is not one finite
-            number, or the sum of the terms is not finite.
+        InputError: If `terms` is no sequence of reward terms, there is no term, a name is not allowed, a signal's size
+            is below 1 or differs between terms, or the parameters of a function are not named like its signals. At
+            evaluation, if a term is not one finite number, or the sum of the terms is not finite.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
         super().__init__()
-        names = [term.name for term in terms]
-        self._terms, self._of_task = tuple(terms), f" of {task_name}" if task_name else ""
+        self._of_task = f" of {task_name}" if task_name else ""
+        if not (isinstance(terms, Sequence) and all(isinstance(term, RewardTerm) for term in terms)):
+            raise InputError(f"a reward{self._of_task} needs a list of reward terms, not {brief(terms)}")
+        names, self._terms = [term.name for term in terms], tuple(terms)
         are_words = all(isinstance(name, str) and name not in ("", "reward") for name in names)
         if not names or not are_words or len(set(names)) < len(names):
             raise InputError(

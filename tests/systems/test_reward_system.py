@@ -65,6 +65,8 @@ def test_each_term_is_evaluated_once_for_all_ports():
     "terms",
     [
         [],
+        None,
+        [3],
         [RewardTerm("reward", {"u": 1}, lambda u: 0.0)],
         [RewardTerm("", {"u": 1}, lambda u: 0.0)],
         [RewardTerm("a", {"u": 1}, lambda u: 0.0), RewardTerm("a", {"u": 1}, lambda u: 0.0)],
