@@ -184,12 +184,9 @@ class Registry(Generic[Entry]):
             if file.stem != "__init__"
         }
         if self._decorator is None:
-            declared: dict[str, _Declaration] = {}
-            for module in files:
-                before = set(self._entries)
-                import_module(module)
-                declared |= {name: _Declaration(module, {}) for name in set(self._entries) - before}
-            return declared
+            values = {id(value): module for module in files for value in vars(import_module(module)).values()}
+            entries = self._entries.items()
+            return {name: _Declaration(values[id(entry)], {}) for name, entry in entries if id(entry) in values}
         return {
             name: _Declaration(module, values)
             for module, file in files.items()

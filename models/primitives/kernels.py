@@ -24,7 +24,9 @@ class Kernel(Protocol):
         ...
 
 
-KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", entry_points="guiderail.kernels", check=check_callable)
+KERNELS: Registry[Callable[..., Kernel]] = Registry(
+    "kernel", package=__package__, decorator="register_kernel", entry_points="guiderail.kernels", check=check_callable
+)
 """Registry of kernels; their names are the values of an environment's option `kernel`.
 
 An entry is called with `length_scale=` and its own further parameters, all of them numbers, and returns a kernel.
