@@ -38,6 +38,7 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives.kernels import KERNELS
+from guiderail.models.robots.robot import ROBOTS
 
 logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO
 
@@ -216,15 +217,16 @@ def _build(task: Task, render_mode: str | None) -> _Built:
 def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams; None if the diagram is not shared.
 
-    Tasks, guidance, stations and kernels of other packages may read files at each construction, and no key has the
-    content of these files. The files of this package's tasks are in the key: those that options name, and a folder's.
+    Tasks, guidance, stations, kernels and robots of other packages may read files at each construction (a robot's model
+    names meshes and further models), and no key has the content of these files. The files of this package's tasks are in the key: those that options name, and a folder's.
     """
     config, options = task.config, task.config.options
     builders = [type(task), config.guidance_kind.build, config.station_kind.build]
     if "kernel" in options:
         builders.append(KERNELS.get(options["kernel"]))
     # Not sharing costs 20 to 230 ms and 1 to 15 MB at each construction, with the shipped stations.
-    if not all(map(_is_packaged, builders)):
+    is_own_robot = "robot" in options and not ROBOTS.is_packaged(options["robot"])
+    if is_own_robot or not all(map(_is_packaged, builders)):
         return None
     try:
         kinds = config.guidance_kind, config.station_kind, _base_policy_key(options.get("base_policy"))

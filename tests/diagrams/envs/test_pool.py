@@ -2,6 +2,7 @@
 
 import gc
 import pickle
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects import grid_clamp
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.kernels import KERNELS, SquaredExponential, register_kernel
+from guiderail.models.robots.robot import ROBOTS, find_robot
 from guiderail.models.templates import load_template
 
 GRID_CLAMP = Path(grid_clamp.__file__).parent / "grid_clamp.yaml"
@@ -132,6 +134,29 @@ def test_demonstrations_are_new_when_the_file_changed(tmp_path):
         Demonstrations(times, [one + np.outer(height, [0, 0, 1, 0, 0, 0]) for one in outputs]).save(file)
         commands.append(last_command("BncConnector", 0.0, 1, guidance="kgrl", demonstrations=str(file))[0])
     assert commands == pytest.approx([0.0, 1e-3], abs=2e-4)
+
+
+def test_own_robot_is_new_when_its_model_changed(tmp_path, monkeypatch):
+    arm, masses = find_robot("iiwa14"), []
+    monkeypatch.setitem(ROBOTS._entries, "mine", replace(arm, name="mine", model=tmp_path / "mine.urdf"))
+    monkeypatch.setitem(ROBOTS._origins, "mine", ("", ""))
+    for mass in (1.5, 2.5):
+        link = f'<mass value="{mass}"/>'
+        (tmp_path / "mine.urdf").write_text(re.sub('<mass value="[^"]*"/>', link, arm.model.read_text(), count=1))
+        env = make_env("BncConnector", station="arm", robot="mine", guidance="safe_residual")
+        plant = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("plant")
+        masses.append(plant.GetBodyByName("iiwa_link_0").default_mass())
+        env.close()
+    assert masses == [1.5, 2.5]
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", "panda"])
+def test_diagram_of_a_packaged_robot_is_reused(robot):
+    env = make_env("BncConnector", station="arm", robot=robot, guidance="safe_residual")
+    env.close()
+    again = make_env("BncConnector", station="arm", robot=robot, guidance="safe_residual")
+    assert again.task.diagram is env.task.diagram
+    again.close()
 
 
 def test_two_environments_never_share_a_diagram():
