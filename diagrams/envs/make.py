@@ -218,7 +218,8 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams; None if the diagram is not shared.
 
     Tasks, guidance, stations, kernels and robots of other packages may read files at each construction (a robot's model
-    names meshes and further models), and no key has the content of these files. The files of this package's tasks are in the key: those that options name, and a folder's.
+    names meshes and further models), and no key has the content of these files. The files of this package's tasks are
+    in the key: those that options name, and a folder's.
     """
     config, options = task.config, task.config.options
     builders = [type(task), config.guidance_kind.build, config.station_kind.build]

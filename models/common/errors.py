@@ -47,9 +47,10 @@ def naming_failures(action: str, *passed: type[Exception]) -> Iterator[None]:
 
     An `InputError` and an error of the types `passed` are raised unchanged.
     """
+    unchanged: tuple[type[Exception], ...] = (InputError, *passed)
     try:
         yield
-    except (InputError, *passed):
+    except unchanged:
         raise
     except (Exception, SystemExit) as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
