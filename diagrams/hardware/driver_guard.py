@@ -33,15 +33,14 @@ class DriverGuard:
 
     def __init__(self, driver: Driver):
         self._driver = driver
-        self.read_error = self.command_error = ""
         self.num_failed_commands = 0
-        self._has_failed_to_receive = self._has_failed_command = False
-        self._is_failing = self._has_recovered = False  # the last command failed; the first one after it succeeded
+        self.forget_errors()
 
     def forget_errors(self) -> None:
         """Clear the errors, before the driver is used again."""
         self.read_error = self.command_error = ""
-        self._has_failed_to_receive = self._has_failed_command = self._is_failing = self._has_recovered = False
+        self._has_failed_to_receive = self._has_failed_command = False
+        self._is_failing = self._has_recovered = False  # the last command failed; the first one after it succeeded
 
     @property
     def error(self) -> str:
