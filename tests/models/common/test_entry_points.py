@@ -22,10 +22,10 @@ def install(tmp_path, monkeypatch):
         lines = [f"{name} = {package}:{value}" for name, value in points.items()]
         (information / "entry_points.txt").write_text("\n".join(["[shapes]", *lines, ""]))
 
-    before = set(sys.modules)
     yield install
-    for module in set(sys.modules) - before:
-        del sys.modules[module]
+    for name, module in list(sys.modules.items()):  # no others: modules of this package stay registered
+        if (getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
+            del sys.modules[name]
 
 
 def shapes(**arguments):
