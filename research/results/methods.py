@@ -175,17 +175,30 @@ def is_guided(row: Row) -> bool:
 
 
 def knowledge(section: Section, tables: Path) -> list[str]:
-    """Return a sentence that names the demonstrated episodes of the learned methods, if there are any."""
+    """Return sentences about the demonstrated episodes of the learned methods, if there are any.
+
+    They name the number of these episodes and the methods with which none of them succeeded.
+    """
     methods: dict[int, list[str]] = {}  # names by number of demonstrated episodes
+    failed = []
     for row in section.rows:
-        if _is_trained(last_rows(tables, row)):
-            methods.setdefault(demonstrated_episodes(row), []).append(row.name)
+        seeds = last_rows(tables, row)
+        if _is_trained(seeds):
+            methods.setdefault(number := demonstrated_episodes(row), []).append(row.name)
+            if number and not seeds.get("training_ended_in_success", pd.Series([1])).any():
+                failed.append(row.name)
+    sentences = []
+    if failed:
+        sentences = [
+            "The scripted policy acts through the guidance of each method. No training episode succeeded, not even a "
+            f"demonstrated one: {'; '.join(failed)}."
+        ]
     if len(methods) < 2:
-        return [f"Demonstrated episodes of every learned method: {number}." for number in methods if number]
+        return [f"Demonstrated episodes of every learned method: {number}." for number in methods if number] + sentences
     counts = sorted(filter(None, methods), reverse=True)
     parts = [f"{number} demonstrated episodes: {', '.join(methods[number])}" for number in counts]
     parts += ["none: the other methods"] if 0 in methods else []
-    return [f"**The methods do not have equal knowledge.** {'; '.join(parts)}."]
+    return [f"**The methods do not have equal knowledge.** {'; '.join(parts)}.", *sentences]
 
 
 def demonstrated_episodes(row: Row) -> int:
@@ -279,7 +292,8 @@ def _success(seeds: pd.DataFrame) -> str:
     rates = 100 * seeds["success_rate"].astype(float)
     span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
     is_single = len(seeds) == 1 and _is_trained(seeds)
-    mean = f"{rates.mean():.{int(99.5 <= rates.mean() < 100)}f}"  # 99.6 is not written as 100
+    is_exact = 99.5 <= rates.mean() < 100 or 0 < rates.mean() < 10  # 99.6 is not written as 100
+    mean = f"{rates.mean():.1f}".removesuffix(".0") if is_exact else f"{rates.mean():.0f}"
     return f"{mean}{' (one seed)' if is_single else span}"
 
 

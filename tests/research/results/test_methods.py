@@ -126,7 +126,10 @@ def test_methods_of_unequal_knowledge_are_marked():
     assert "; 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other methods." in sentence
     assert "10 demonstrated episodes: RL-SCT by behavior cloning, RL-SCT by RLPD, RL-SCT by DroQ; 3" in sentence
     assert knowledge(SECTIONS["BncConnector"][0], TABLES) == []
-    assert knowledge(SECTIONS["NarrowPassage"][0], TABLES) == ["Demonstrated episodes of every learned method: 10."]
+    number, failed = knowledge(SECTIONS["NarrowPassage"][0], TABLES)
+    assert number == "Demonstrated episodes of every learned method: 10."
+    barriers = "residual RL, control barrier function; residual RL, tangent space"
+    assert failed.endswith(f"not even a demonstrated one: safe residual RL; {barriers}.")
 
 
 def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
