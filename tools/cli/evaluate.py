@@ -56,9 +56,10 @@ def evaluate(
 
     With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX or TorchScript file, or
     module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
-    on initial conditions that training never samples. The demonstration alone, random actions and the scripted policy
-    of the task run on the same episodes: if they succeed as well, the task is too easy to show learning. The row
-    evaluation_scope of the table states what the result is valid for, and the last line is the result in one sentence.
+    on initial conditions from random numbers that training never uses. The demonstration alone, random actions and the
+    scripted policy of the task run on the same episodes: if they succeed as well, the task is too easy to show
+    learning. The row evaluation_scope of the table states what the result is valid for, and the last line is the
+    result in one sentence.
     """
     if quick and episodes is not None:
         raise InputError("--quick sets the number of episodes: leave --episodes out")
