@@ -130,10 +130,11 @@ def write_pages(tables: Path, pages: Path) -> list[Path]:
 def _page_head(title: str) -> str:
     return (
         f"# {title}\n\nWritten by `python -m research.results` from the tables in `research/results`. All results are "
-        "simulated.\nHeld-out episodes use random numbers that training never uses. The ranges of starts and offsets are "
-        "those of\ntraining; only on the narrow passage at the standard difficulty the start varies in held-out episodes "
-        "and not in\ntraining. If a run has one hidden offset, held-out episodes have the same offset. A training episode "
-        "is stopped by\na collision (a force above the limit, or an obstacle of the narrow passage) or a spill.\n"
+        "simulated.\nHeld-out episodes use random numbers that training never uses. The ranges of starts and offsets "
+        "are those of\ntraining; only on the narrow passage at the standard difficulty the start varies in held-out "
+        "episodes and not in\ntraining. If a run has one hidden offset, held-out episodes have the same offset. A "
+        "training episode is stopped by\na collision (a force above the limit, or an obstacle of the narrow passage) "
+        "or a spill.\n"
     )
 
 
