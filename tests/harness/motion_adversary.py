@@ -1,8 +1,8 @@
 """Adversary against shapes, speed and acceleration: `python tests/harness/motion_adversary.py [STEPS [SEED]]`.
 
-Spherical obstacles are placed at sampled positions in the narrow passage. Actions push against an obstacle at full
-deflection or change at random. No command, fallbacks included, and no straight line between two commands may enter an
-obstacle. This is checked by formulas that share no code with the constraints.
+Spherical obstacles are placed at sampled positions in the narrow passage. Full actions push against the
+obstacle, or actions change at random. No command, fallbacks included, and no straight line between two commands may
+enter an obstacle. This is checked by formulas that share no code with the constraints.
 """
 
 import sys
@@ -37,7 +37,7 @@ states:
     starts_at_m: 1.0
     ends_at_m: 0.0
 """
-EPISODES = 5  # with one obstacle
+EPISODES = 5  # number of episodes with each obstacle
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Result:
         touching: Number of commands within a tenth of a millimeter of the obstacle.
         fallbacks: Number of steps with a fallback.
         nearest: Smallest distance of a command from the obstacle [m].
-        nearest_between: Smallest distance of a straight line between two commands from the obstacle [m].
+        nearest_between: Smallest distance between the obstacle and a straight line from one command to the next [m].
         speed: Largest speed along an axis [m/s].
         acceleration: Largest acceleration along an axis [m/s²].
         outside: Largest violation of the linear constraints [m].
@@ -102,10 +102,10 @@ def attack(steps: int, seed: int = 0) -> dict[str, Result]:
 
 
 def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius: float, result: Result) -> None:
-    """Execute episodes of KGRL, or sKGRL with a smooth kind, around one obstacle at a sampled place of the motion."""
+    """Execute episodes around one obstacle near the motion, with sKGRL if `kind` is smooth, otherwise with KGRL."""
     reference, history = config.reference, 4 if kind == "command, smooth" else 0
     step = int(rng.integers(30, reference.num_steps - 30))
-    # To the side of the mean; if commands are constrained, the obstacle may also be exactly in the way.
+    # The obstacle is to the side of the mean. If commands are constrained, its center may also be on the mean.
     aside = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5 if kind == "reference" else 0.0, 1.5, 2) * radius
     sphere = Sphere(reference.means[step] + aside, radius)
     if sphere.distance(reference.means[0]) < 0.1:
@@ -158,7 +158,7 @@ def attack_template(rng: np.random.Generator, radius: float, result: Result, per
 
 
 def is_violated(kind: str, result: Result) -> bool:
-    """Return True if a command, or the way to one, was in the obstacle, or a limit was exceeded."""
+    """Return True if a command, or the straight line to it, was in the obstacle, or a limit was exceeded."""
     speed, acceleration = LIMITS.get(kind, (np.inf, np.inf))
     return (
         min(result.nearest, result.nearest_between) < 0.0

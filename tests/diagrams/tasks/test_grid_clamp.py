@@ -1,4 +1,4 @@
-"""The grid-clamp task as a policy meets it."""
+"""Environment GridClamp: scripted policies, constraints, rewards, observation and options."""
 
 import gymnasium
 import numpy as np
@@ -24,14 +24,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
-NEW_RUN = {"new_run": True}  # every episode is a run of its own
+NEW_RUN = {"new_run": True}  # the hidden offsets are sampled again in every episode
 
 GUIDANCE = ("sct", "residual", "none")
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def play(env, policy, *, seed=None, options=None):
-    """Runs an episode; returns the last step's info, the return, and the rewards' terms summed."""
+    """Run an episode; return the last info, the return, and the sum of each reward term."""
     observation, _ = env.reset(seed=seed, options=options)
     total, finished, info = 0.0, False, {}
     terms = dict.fromkeys(env.task.reward_terms, 0.0)
@@ -70,24 +70,24 @@ def test_straight_descent_inserts_without_offsets(env_without_offsets, seed):
     assert env_without_offsets.trace.statistics()["peak_force"] <= 10.0
     assert total == pytest.approx(sum(terms.values()))
     assert terms["terminal_reward"] == 50.0
-    # What it came down is what it is paid for, 300 a meter, from 15 to 18 mm.
+    # The reward is 300 per meter of descent, and the start height is 15 to 18 mm.
     assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
 def test_aligned_reward_pays_approach_and_costs_collisions():
-    """Two millimeters off, straight down onto the table, until it is too much."""
+    """A straight descent at an offset of 2 mm presses on the table until the force limit ends the episode."""
     env = make_env("GridClamp", reward="aligned", difficulty="hard", bounded_force=False)
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert info["termination"] == "collision"
     assert terms["collision_cost"] == -25.0
     _, _, sideways = play(env, lambda _: np.array([-0.3, 0.0, 0.3]), seed=0, options={"offset": (2.0 * MM, 0.0)})
     assert sideways["collision_cost"] == 0.0
-    # The cuboid ends 4 mm off the holes' place: from 2 mm on one side to 2 mm on the other nothing is gained.
+    # The cuboid ends at 4 mm, so the clamp moves from 2 mm on one side of the hole to 2 mm on the other side.
     assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
 
 
 def test_straight_descent_mostly_fails_with_offsets(env):
-    """Pushed with 12 N for the whole 10 s."""
+    """The clamp is pressed on the table with at most 12 N until the time limit of 10 s."""
     rows = evaluate_policy(env, straight_descent, episodes=1, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 0
     assert rows["peak_force"].max() < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
@@ -101,7 +101,7 @@ def test_search_inserts_where_the_descent_fails(env):
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
 def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
-    """Corner actions, kept for a while: they reach every corner of the cuboid and the surface of the table."""
+    """Repeated corner actions reach every corner of the cuboid and the surface of the table."""
     env = make_env("GridClamp", guidance=guidance)
     size = env.action_space.shape
     rng = np.random.default_rng(3)
@@ -122,7 +122,7 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert np.abs(commanded[:, 3:]).max() <= 1e-9
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
-    if guidance != "residual":  # its command descends whatever is in the way
+    if guidance != "residual":  # its command descends even if the clamp is blocked
         assert env.trace.statistics()["peak_force"] < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
@@ -133,8 +133,8 @@ def test_without_the_cuboid_a_push_is_a_collision():
     assert info["contact_force"] > COLLISION_FORCE
 
 
-def test_force_costs_unless_it_is_left_out(env_without_offsets):
-    """The same episode, with and without: the difference is the cost of force."""
+def test_reward_without_force_cost_differs_by_the_cost(env_without_offsets):
+    """The returns of the same episode with both rewards differ by the force cost."""
     without = make_env("GridClamp", fixture_offset="none", reward="no_force")
     _, with_cost, terms = play(env_without_offsets, lambda _: DOWN, seed=1)
     _, without_cost, _ = play(without, lambda _: DOWN, seed=1)
@@ -143,7 +143,7 @@ def test_force_costs_unless_it_is_left_out(env_without_offsets):
 
 
 def test_an_observation_is_position_and_force(env):
-    """Pressed on the table next to the holes: the height of the pegs, and the force that bears them."""
+    """The clamp is pressed on the table next to the holes, with the pegs' tips at the table's surface."""
     env.reset(seed=0, options={"offset": (0.0025, 0.001)})
     for _ in range(8):
         observation, _, _, _, info = env.step(DOWN)
@@ -164,14 +164,14 @@ def test_the_same_seed_is_the_same_episode_bit_for_bit(env):
         np.testing.assert_array_equal(first, second)
 
 
-def test_checkers_are_content():
+def test_environment_passes_the_checkers_of_gymnasium_and_sb3():
     check_env(make_env("GridClamp", action_repeat=25), skip_render_check=True)
     check_env_of_sb3(make_env("GridClamp", action_repeat=25), skip_render_check=True)
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_the_arm_inserts_too(arm, seed):
-    """At 12 mm/s: an arm that descends faster is pulled sideways by more than a chamfer leads back."""
+def test_arm_inserts_without_offsets(arm, seed):
+    """The descent is 12 mm/s; in a faster one the arm deviates sideways by more than the chamfer corrects."""
     info, _, _ = play(arm, lambda _: 0.3 * DOWN, seed=seed)
     assert info["is_success"]
     assert arm.trace.statistics()["peak_force"] <= 10.0
@@ -187,13 +187,13 @@ class TestUncertainty:
         )
         assert (tables == tables[0]).all()
         assert 1.8 * MM <= np.linalg.norm(tables[0]) <= 2.2 * MM
-        # Pick-ups at one place lie within its repeatability; sorted along the jaws, six places show.
+        # Grasp offsets of one place differ by its repeatability alone, so at most five gaps between places are larger.
         gaps = np.diff(np.sort(grasps[:, 0]))
         assert 0.8 * MM < np.ptp(grasps[:, 0]) < 2.4 * MM
         assert (gaps > 0.2 * MM).sum() <= 5
 
     @pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
-    def test_the_cuboid_reaches_wherever_the_hole_is(self, kind):
+    def test_cuboid_contains_every_sampled_hole(self, kind):
         fixture_offset, rng = GridClampUncertainty(kind), np.random.default_rng(1)
         draws = [fixture_offset.draw(rng, InsertionReset(new_run=True)) for _ in range(500)]
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
@@ -218,6 +218,6 @@ class TestUncertainty:
         {"action_repeat": 0},
     ],
 )
-def test_refuses_what_makes_no_sense(wrong):
+def test_invalid_options_are_refused(wrong):
     with pytest.raises(InputError):
         make_env("GridClamp", **wrong)

@@ -1,4 +1,4 @@
-"""The narrow passage half as wide, between two obstacles that may not be touched."""
+"""NarrowPassage at `hard`: half the gap width, and two obstacles whose contact ends the episode."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def env(request):
     return make_env("NarrowPassage", difficulty="hard", guidance=request.param)
 
 
-def test_the_rule_passes_and_the_demonstrations_do_not(env):
+def test_scripted_policy_succeeds_and_demonstration_collides(env):
     row = rollout(env, scripted_slalom, seed=0, held_out=True)
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
@@ -25,42 +25,42 @@ def test_the_rule_passes_and_the_demonstrations_do_not(env):
     assert row["termination"] == "collision"
 
 
-def test_no_constant_side_is_right(env):
+def test_constant_action_collides_on_both_sides(env):
     for side in (-1.0, 1.0):
         row = rollout(env, constant_policy(env, np.array([side, 0.0])), seed=1)
         assert row["termination"] == "collision"
 
 
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
-def test_no_action_leads_out_of_the_constraints(env, name):
+def test_commands_satisfy_the_constraints_under_any_action(env, name):
     for seed in range(2):
         row = rollout(env, BASELINES[name](np.random.default_rng(seed), 2), seed=seed)
         assert row["max_commanded_violation"] <= 1e-9
 
 
-def test_sides_alternate_are_drawn_and_are_seen(env):
-    usual, sides = NarrowPassageOptions(**HARD).workcell().obstacles, []
+def test_obstacle_sides_are_opposite_sampled_and_observed(env):
+    nominal, sides = NarrowPassageOptions(**HARD).workcell().obstacles, []
     starts = []
     for seed in range(8):
         observation, info = env.reset(seed=seed)
-        beside = (info["obstacles"] - usual) / HARD["obstacle_beside"]
-        np.testing.assert_allclose(observation[1:], beside.ravel(), atol=1e-6)
-        np.testing.assert_allclose(np.abs(beside), [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
-        assert beside[0, 0] == pytest.approx(-beside[1, 0])
-        sides.append(np.sign(beside[0, 0]))
+        offsets = (info["obstacles"] - nominal) / HARD["obstacle_beside"]
+        np.testing.assert_allclose(observation[1:], offsets.ravel(), atol=1e-6)
+        np.testing.assert_allclose(np.abs(offsets), [[1.0, 0.0], [1.0, 0.0]], atol=1e-9)
+        assert offsets[0, 0] == pytest.approx(-offsets[1, 0])
+        sides.append(np.sign(offsets[0, 0]))
         starts.append(info["start"])
     assert set(sides) == {-1.0, 1.0}
     assert 0.01 < np.std(starts, axis=0).min() < 0.1
 
 
 @pytest.mark.parametrize("options", [{"start_deviation": 0.03}, HARD])
-def test_held_out_starts_are_other_starts(options):
+def test_held_out_start_differs_from_training_start(options):
     env = make_env("NarrowPassage", **options)
     starts = [env.reset(seed=5, options={"held_out": flag})[1]["start"] for flag in (False, True)]
     assert (starts[0] != starts[1]).all()
 
 
-def test_the_obstacles_are_drawn_where_they_are(env):
+def test_bodies_of_the_plant_are_at_the_sampled_obstacles(env):
     _, info = env.reset(seed=2)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
@@ -78,7 +78,7 @@ def test_standard_geometry_is_unchanged():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"gap_width": 0.0}, "gap_width must be at least 0.02"),
         ({"obstacle_radius": 1.0}, "obstacle_radius must be at most 0.1"),
@@ -87,7 +87,7 @@ def test_standard_geometry_is_unchanged():
         ({"obstacles_end": "maybe"}, "obstacles_end cannot be 'maybe'"),
     ],
 )
-def test_refuses_numbers_out_of_range(arguments, said):
-    with pytest.raises(InputError, match=said) as error:
+def test_options_out_of_range_are_refused(arguments, message):
+    with pytest.raises(InputError, match=message) as error:
         make_env("NarrowPassage", **arguments)
     assert "\n" not in str(error.value)

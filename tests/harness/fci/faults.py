@@ -2,9 +2,9 @@
 
     python tests/harness/fci/faults.py --instants 5
 
-The kinds are those of `injections/kinds.py` that change statuses. Left out are those that this protocol does not have:
+The kinds are those of `injections/kinds.py` that change statuses. Kinds that this protocol does not have are left out:
 libfranka decodes messages, has one robot on a connection, and has neither other commanders nor safety monitors. The
-requirements are those of `injections/campaign.py`. The exit code is 1 if one is not met.
+requirements are those of `injections/campaign.py`. The exit code is 1 if a requirement is not met.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ STATUS_KINDS = [kind for kind in KINDS if kind.where in ("sensor", "network") an
 
 
 class FaultyDriver(FciDriver):
-    """Driver whose statuses have a fault.
+    """Driver that applies a fault to the statuses it reads.
 
     Attributes:
-        fault: The fault, or None.
+        fault: Applied fault; None for unchanged statuses.
         has_effect: True if the fault has changed a status by more than the sensitivity.
         speed: True speed of the fastest joint [rad/s].
     """
@@ -75,7 +75,7 @@ class FaultyDriver(FciDriver):
 
 
 def encode(status: JointStatus) -> bytes:
-    """Return a status as the message that the faults change."""
+    """Return a status as an iiwa status message, which a fault changes."""
     message = lcmt_iiwa_status()
     message.utime, message.num_joints = round(status.time / MICROSECOND), len(status.positions)
     for name in lcmt_iiwa_status.__slots__[2:]:
@@ -94,14 +94,11 @@ class Campaign:
         self.run, self.steps = SimulatedRun(FaultyDriver), 0
         self.driver: FaultyDriver = self.run.station.driver
 
-    def step(self, phase: float | None = None) -> None:
-        """Advance by a status period; with `phase`, move the desired pose along the motion, scaled by it."""
-        if phase is not None:
-            angle = 2.0 * np.pi * FREQUENCY * PERIOD * self.steps
-            self.run.pose = CENTER + phase * AMPLITUDE * np.sin(
-                angle + np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0])
-            )
-            self.steps += 1
+    def step(self) -> None:
+        """Move the desired pose along the motion, and advance by a status period."""
+        angle = 2.0 * np.pi * FREQUENCY * PERIOD * self.steps
+        self.run.pose = CENTER + AMPLITUDE * np.sin(angle + np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0]))
+        self.steps += 1
         self.run.station.get_desired_pose_input_port().FixValue(self.run.context, self.run.pose)
         self.run.clock.advance(self.run.simulator, self.run.station, 1)
 
@@ -111,21 +108,21 @@ class Campaign:
         return self.run["arm_state"][0] in (ArmState.DAMPING, ArmState.OFF)
 
     def move(self, seconds: float) -> float:
-        """Return the largest speed of a motion without a fault [rad/s]."""
+        """Move without a fault for `seconds` [s]; return the largest speed of a joint [rad/s]."""
         speed = 0.0
         for _ in range(round(seconds / PERIOD)):
-            self.step(phase=1.0)
+            self.step()
             speed = max(speed, self.driver.speed)
         assert not self.is_stopped, self.run.describe()
         return speed
 
     def inject(self, kind: Kind, rng: np.random.Generator) -> str:
-        """Inject a fault, continue the motion and print the result; return the failed requirements."""
+        """Inject a fault during the motion and print the result; return the failed requirements, "" if none failed."""
         reference = self.move(1.0 + float(rng.uniform(0.0, 0.5)))  # a whole period
         self.driver.begin(kind, rng)
         elapsed, detected, late, fastest, steps = 0.0, np.nan, 0.0, 0.0, 0
         while elapsed < DURATION - 1e-9 and steps < MAX_STEPS:
-            self.step(phase=1.0)
+            self.step()
             steps += 1
             elapsed += PERIOD * self.driver.has_effect
             detected = elapsed if np.isnan(detected) and self.is_stopped else detected

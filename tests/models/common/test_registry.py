@@ -1,4 +1,4 @@
-"""Registries refuse unknown and duplicate names with a sentence."""
+"""Registries refuse unknown and duplicate names, and read declarations without an import."""
 
 import sys
 from dataclasses import dataclass
@@ -55,7 +55,7 @@ class _Kind:
 
 
 def _from(file):
-    """Return a function that is defined in the file of that path."""
+    """Return a function whose source file is `file`."""
     module = {"__file__": str(file)}
     exec("def build():\n    pass", module)
     return module["build"]

@@ -37,13 +37,13 @@ def dense(problem, step, horizon, at, actions):
 
 
 def spread(rng, first, horizon, most=4):
-    """Draw different steps of a window, in any order, with distances suited to a kernel of a second's width."""
+    """Sample steps of a window in any order, at least 12 apart: closer ones may make the kernel matrix singular."""
     places = np.arange(first, first + horizon + 1, 12)
     return rng.permutation(places)[: rng.integers(1, most + 1)]
 
 
 def check(problem, found, expected, constraints):
-    """The window equals the dense one at the same multipliers and satisfies the KKT conditions."""
+    """Check that the window equals the dense one with the same multipliers and satisfies the KKT conditions."""
     scale = np.abs(problem.primitive.reference.means).max(axis=0)
     G, c = constraints
     assert found.multipliers.shape == c.shape
@@ -187,7 +187,7 @@ def test_window_past_the_end_is_the_last_one():
 
 
 @pytest.mark.parametrize(
-    ("at", "actions", "said"),
+    ("at", "actions", "message"),
     [
         ([9], [[1.0, 1.0]], "among 10 … 25"),
         ([26], [[1.0, 1.0]], "among 10 … 25"),
@@ -204,8 +204,8 @@ def test_window_past_the_end_is_the_last_one():
         (np.arange(10, 25), np.ones((15, 2)), "cannot separate them"),
     ],
 )
-def test_modified_window_refuses_invalid_actions(at, actions, said):
-    with pytest.raises(InputError, match=said):
+def test_modified_window_refuses_invalid_actions(at, actions, message):
+    with pytest.raises(InputError, match=message):
         plain().modified_window(10, at, actions)
 
 

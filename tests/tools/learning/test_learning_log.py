@@ -71,7 +71,7 @@ def test_tensorboard_log_is_written(bead_config, tmp_path):
 
 
 def test_wandb_logs_the_values_of_each_episode(tmp_path, monkeypatch):
-    """A stand-in for the package records what would be sent."""
+    """A replacement of the package records the logged values."""
     sent, runs = [], []
 
     class Run:
@@ -104,7 +104,7 @@ def test_wandb_is_refused_without_its_package(monkeypatch):
         check_log_formats("wandb")
 
 
-def test_metrics_of_a_training_after_the_last_episode_get_an_entry(tmp_path):
+def test_log_has_an_entry_for_training_after_the_last_episode(tmp_path):
     log, rows = LearningLog(tmp_path, "csv"), [{"episode": 0, "steps": 10, "return": 1.5}]
     log.record(rows, dict)
     log.record(rows, lambda: {"train/loss": 0.5}, is_finished=True)
