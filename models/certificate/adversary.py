@@ -2,7 +2,7 @@
 
 A third of the sequences are the signs of impulse responses, which reach a bound exactly if no constraint is active. A
 third are actions of ±1 that change sign periodically or at random. A third are variations of one of the worst sequences
-so far, which a variation with a larger value replaces.
+so far. A sequence with a larger value replaces the worst one.
 """
 
 from dataclasses import dataclass, field
@@ -19,22 +19,23 @@ DWELLS = (1, 1, 2, 3, 5, 10, 20, 50, 100)  # steps between two changes of sign
 class AttackResult:
     """Worst values that an adversary reached.
 
-    The rows of `excess` and `residue` are the largest value at one step, and the largest sum over a sequence.
+    The first row of `excess` and of `residue` is the largest value at one step, the second the largest sum over a
+    sequence.
     """
 
     # Largest value of each quantity at every step (N, O): distance from the motion without actions, speed and
     # acceleration in the outputs' units per s and s².
     largest: dict[str, np.ndarray]
-    lower: np.ndarray  # least commands (N, O)
-    upper: np.ndarray  # greatest commands (N, O)
-    excess: np.ndarray  # (2, A), excess over ±1 of the actions that are equivalent to corrected commands
-    # (2, O), difference between corrected commands and the commands of the equivalent actions, in outputs that no
-    # action moves.
+    lower: np.ndarray  # smallest commands (N, O)
+    upper: np.ndarray  # largest commands (N, O)
+    excess: np.ndarray  # (2, A), excess over ±1 of actions that give the corrected commands without a correction
+    # (2, O), difference between the corrected commands and the commands of these actions, in outputs that no action
+    # moves.
     residue: np.ndarray
     steps: int = 0  # number of executed steps
     corrected: int = 0  # number of steps with a correction
-    # Worst value with its actions (N, A) and start (O,), by quantity, output (for "excess": action) and kind of step:
-    # True for the steps at which a constraint can be active, False for the others.
+    # Worst value, its actions (N, A) and its start (O,). The key is the quantity, the index of the output (for
+    # "excess" of the action), and True for steps at which a constraint can be active, False for the others.
     worst: dict[tuple[str, int, bool], tuple[float, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
@@ -43,8 +44,8 @@ class Adversary:
 
     Args:
         loop: Loop to attack.
-        can_be_corrected: Mask (N,) of the steps at which a constraint can be active; the worst values at these steps
-            and at the others are searched for separately.
+        can_be_corrected: Mask (N,) of the steps at which a constraint can be active. These steps and the others have
+            separate worst values.
         seed: Seed of all random numbers.
         attacks_budgets: If True, only sequences with the largest excess or residue are varied.
     """
@@ -197,6 +198,6 @@ class Adversary:
 
 
 def _accumulate(largest_and_total: np.ndarray, values: np.ndarray) -> None:
-    """Update the largest values and the totals, (2, n), by the values (n,) of one step."""
+    """Update the rows of (2, n), the largest values and the totals, by the values (n,) of one step."""
     np.maximum(largest_and_total[0], values, out=largest_and_total[0])
     largest_and_total[1] += values

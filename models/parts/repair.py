@@ -18,7 +18,7 @@ from guiderail.models.common.isolation import IsolatedError, run_isolated
 from guiderail.models.objects.sdf import area_vectors
 from guiderail.models.parts.solids import boundary_of, measure_distance, tetrahedralize, to_arrays, to_manifold
 
-MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger one would close a real hole [m]
+MAX_MOVED = 1e-4  # largest motion of a surface by a repair; a larger motion may close an intended hole [m]
 _ENVELOPE = 2e-5  # largest deviation that fTetWild is allowed [m]
 _CPU_SECONDS = 60
 _ATTEMPTS = 3  # fTetWild is not deterministic, and may leave tetrahedra outside the part: the best attempt is used
@@ -32,7 +32,7 @@ class Repair:
     # Number of open edges of the mesh (`find_open_edges`), at least 1 if the surface was changed.
     closed_edges: int = 0
     moved: float = 0.0  # largest distance of a point of the new surface from the old surface [m]
-    left_out: float = 0.0  # largest distance of old faces that bound no volume from the new surface [m]
+    left_out: float = 0.0  # largest distance from the new surface to an old face that bounds no volume [m]
     cavities: int = 0  # number of filled closed cavities
     inverted: int = 0  # number of bodies whose faces pointed inwards
 
@@ -56,7 +56,7 @@ def close_surface(
 ) -> tuple[list[tuple[np.ndarray, np.ndarray]], Repair]:
     """Return the bodies of a mesh as closed surfaces with outward faces, and the repair.
 
-    Triangles of no area must not be removed before: they close T-junctions.
+    Do not remove triangles of zero area beforehand: they close T-junctions.
 
     Args:
         name: Name of the file, for error messages.
@@ -64,8 +64,8 @@ def close_surface(
         triangles: Triangles (T, 3).
 
     Raises:
-        InputError: If the mesh encloses no volume, or cannot be closed without moving its surface by more than
-            `MAX_MOVED`.
+        InputError: If the mesh encloses no volume, cannot be closed without moving its surface by more than
+            `MAX_MOVED`, or needs an extra that is not installed.
     """
     edges = find_open_edges(triangles)
     open_edges, where = len(edges), vertices[edges].reshape(-1, 3).mean(axis=0) if len(edges) else np.zeros(3)
@@ -114,7 +114,7 @@ def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
 def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
     """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh.
 
-    `gaps` describes the gaps, for messages.
+    `gaps` is the beginning of the error messages, a description of the gaps.
 
     Raises:
         InputError: If the software for the repair is not installed, or no attempt gives a solid.
@@ -164,7 +164,7 @@ def _outward_bodies(solid: Any) -> tuple[list[tuple[np.ndarray, np.ndarray]], in
 
 _FLAT = 1e-6  # largest distance of a flat face's vertices from its plane, due to rounding in text files [m]
 _MAX_PLANES = 100  # largest number of planes that are tried
-_AREA = 1e-6  # relative difference of areas that counts as rounding
+_AREA = 1e-6  # largest relative difference of areas due to rounding
 
 
 def find_open_edges(triangles: np.ndarray) -> np.ndarray:
@@ -214,7 +214,10 @@ def _count_edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
-    """Return triangles without the loose ones: all three edges are open, and would be closed without the triangle."""
+    """Return triangles (T, 3) without the loose ones.
+
+    A triangle is loose if its three edges are open and removing the triangle closes them.
+    """
     while True:
         _, balance, number, used = _count_edges(triangles)
         signs = np.sign(np.roll(triangles, -1, axis=1) - triangles)
@@ -231,7 +234,7 @@ def _without_loose_triangles(triangles: np.ndarray) -> np.ndarray:
 
 
 def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> list[tuple[np.ndarray, float]]:
-    """Return normal (3,) and distance from the origin [m] of each plane of a triangle at the edges, largest first."""
+    """Return the planes of triangles at `edges`, largest triangle first: normal (3,), distance from the origin [m]."""
     at_edge = np.isin(triangles, edges).sum(axis=1) >= 2
     near = triangles[at_edge]
     normals = area_vectors(vertices, near)
@@ -249,7 +252,7 @@ def _planes(vertices: np.ndarray, triangles: np.ndarray, edges: np.ndarray) -> l
 
 
 def _fill(vertices: np.ndarray, rest: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray | None:
-    """Return triangles (T, 3) with a given normal that fill the open edges of `rest` in a plane; None if none can."""
+    """Return triangles (T, 3) with a given normal that close the open edges of `rest` in a plane, or None."""
     edges, balance, _, _ = _count_edges(rest)
     in_plane = (np.abs(vertices @ normal - distance) < _FLAT)[edges].all(axis=1)
     edges, balance = edges[in_plane & (balance != 0)], balance[in_plane & (balance != 0)]
@@ -277,7 +280,7 @@ def _areas(polygons: np.ndarray) -> np.ndarray:
 
 
 def _loops(edges: np.ndarray) -> list[list[int]] | None:
-    """Join directed edges (E, 2) to closed loops, lists of distinct vertices; return None if a path remains open."""
+    """Join directed edges (E, 2) into closed loops of distinct vertices; return None if a path remains open."""
     following = defaultdict(list)
     for start, end in edges.tolist():
         following[start].append(end)

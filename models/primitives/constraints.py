@@ -27,8 +27,7 @@ class LinearConstraints:
 
     Raises:
         InputError: If shapes do not match or have no output or no step, a number is not finite, a bound divided by its
-            row's norm is not finite, or no output satisfies all constraints of a step. A contradiction beyond rounding
-            counts, however small.
+            row's norm is not finite, or no output satisfies all constraints of a step, up to rounding.
 
     Attributes:
         G, c: Rows of unit norm (or zero) and their bounds [unit of the output], read-only; a row whose norm is one up
@@ -112,8 +111,8 @@ class LinearConstraints:
         """Check that the constraints fit a reference trajectory.
 
         Raises:
-            InputError: If it has another number of outputs, or the constraints differ from step to step and it has
-                another number of steps.
+            InputError: If the trajectory has another number of outputs, or another number of steps while the
+                constraints differ from step to step.
         """
         if self.num_outputs != num_outputs:
             raise InputError(f"constraints are on {self.num_outputs} outputs, the reference has {num_outputs}")
@@ -144,11 +143,11 @@ class LinearConstraints:
     def nearest(self, output: np.ndarray, step: int = 0) -> np.ndarray:
         """Compute the output (O,) nearest to `output` (O,) within the constraints of a step.
 
-        If the solver does not find it, the result is the first allowed point on the straight line from `output` to a
-        point inside the constraints, so that there is a result for every finite output.
+        If the solver fails, the result is the first allowed point on the straight line from `output` to a point inside
+        the constraints. Every finite output therefore has a result.
 
         Raises:
-            InputError: If `output` is not O numbers.
+            InputError: If `output` does not have the shape (O,).
             UnsolvableError: If `output` is not finite.
         """
         output = as_numbers(output, "an output")
@@ -177,7 +176,7 @@ class LinearConstraints:
 
     def _normalize(self) -> None:
         """Divide every row and its bound by the row's norm; rows of unit norm up to rounding keep their digits."""
-        # Scaled by the largest entry first: the squares of very large or small entries leave the range of doubles.
+        # Rows are first divided by their largest entry, because squares of extreme entries overflow or underflow.
         largest = np.abs(self.G).max(axis=-1, initial=0.0)
         scale = np.where(largest > 0.0, largest, 1.0)
         with np.errstate(over="ignore"):
@@ -218,7 +217,7 @@ class LinearConstraints:
 
 
 def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the centers (n, O) of boxes; an output with one bound or none gets its allowed value nearest to zero."""
+    """Return the centers (n, O) of boxes; of an output without two finite bounds, the allowed value nearest to zero."""
     lower = np.where(G > 0.0, c[..., None], -np.inf).max(axis=1, initial=-np.inf)
     upper = np.where(G < 0.0, -c[..., None], np.inf).min(axis=1, initial=np.inf)
     both = np.isfinite(lower) & np.isfinite(upper)
@@ -227,7 +226,7 @@ def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
 
 
 def _max_margin_point(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the point (O,) that maximizes the smallest margin G y − c, up to max |c|, or 1 if c = 0."""
+    """Return the point (O,) that maximizes the smallest margin G y − c, capped at max |c| (at 1 if c = 0)."""
     from scipy.optimize import linprog  # imported here because it takes half a second
 
     outputs = G.shape[1]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
-    The input is the reference's clock, so that every matrix depends on the step alone. Each step is factored at its
+    The kernel's input is the reference's time, so every matrix depends on the step alone. Each step is factored at its
     first use. A prediction takes two small matrix products; a QP is solved only if the result violates a constraint.
 
     Args:
@@ -50,11 +50,11 @@ class LcNsKmp:
         constraints: Constraints G y ≥ c at every future point; none by default.
         solver: "daqp", "piqp" or "osqp".
         cache_bytes: Memory limit of the factored steps [bytes]; beyond it, the steps factored first are dropped.
-        max_deviation: `deviation` above which a motion is refused if it also misses by `MAX_MISS` (`check_deviation`).
+        max_deviation: Largest accepted `deviation`, unless the motion is within `MAX_MISS` (`check_deviation`).
 
     Raises:
         InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
-            length, or by `check_kernel`, `check_deviation` or `check_constraints`.
+            length, or `check_kernel`, `check_deviation` or `check_constraints` raises it.
 
     Warns:
         UserWarning: If `deviation` exceeds one.
@@ -123,7 +123,7 @@ class LcNsKmp:
 
     @property
     def num_steps(self) -> int:
-        """Number of steps N; a later step repeats step N−1, so that the motion holds its end."""
+        """Number of steps N; later steps repeat step N−1, so the motion stays at its end."""
         return self.reference.num_steps
 
     def predict(
@@ -133,7 +133,7 @@ class LcNsKmp:
 
         Args:
             step: Step n ≥ 0; past the end, the last step.
-            null_space_action: ξ̂ (O,), in the output's units times a gain (see `gains`); zero by default.
+            null_space_action: ξ̂ (O,), in the outputs' units times a gain (see the module `gains`); zero by default.
             history: Outputs at step−P … step−1, oldest first, (P, O); None if P = 0.
 
         Raises:
@@ -210,8 +210,8 @@ class LcNsKmp:
             history_inputs: Inputs of the history, (P,) or (P, I); None if P = 0.
 
         Raises:
-            InputError: As `predict`, if shapes do not match, the window is empty, a covariance is not symmetric or not
-                positive definite, or the constraints differ from step to step, which requires a clock.
+            InputError: As `predict`; also if shapes do not match, the window is empty, a covariance is not symmetric
+                and positive definite, or the constraints differ from step to step and therefore need a clock.
             UnsolvableError: As `predict`.
         """
         if self.constraints.num_steps is not None:
@@ -247,7 +247,8 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`, if shapes do not match, or a covariance is not symmetric and positive definite.
+            InputError: As `predict`; also if shapes do not match, or a covariance is not symmetric and positive
+                definite.
             UnsolvableError: As `predict`.
         """
         step = self._checked_step(step)
@@ -275,7 +276,7 @@ class LcNsKmp:
         """Compute the window at a step under null-space actions at several of its points (equations 4.17 and 4.18).
 
         With one action at `step` itself this is the window of `predict` (equation 4.21). Between the points, actions
-        are interpolated by the kernel's function of minimum norm that passes through all of them.
+        are interpolated by the function through all of them that has the smallest norm in the kernel's Hilbert space.
 
         Args:
             step: Executed point n ≥ 0; past the end, the last step.
@@ -284,7 +285,7 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`, if `at` holds a step twice or one outside of the window, or if its steps are so
+            InputError: As `predict`; also if `at` has a step twice or a step outside of the window, or its steps are so
                 close that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
@@ -296,8 +297,8 @@ class LcNsKmp:
     ) -> Modification:
         """Compute the whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
 
-        This solves one problem 4.5 over all N steps, whereas `predict` solves one for each window: the result is smooth
-        over the whole motion, and within the constraints everywhere. The problem is factored at the first call.
+        This solves problem 4.5 once, over all N steps; `predict` solves it for each window. The result is smooth over
+        the whole motion and within the constraints at every step. The problem is factored at the first call.
 
         Args:
             at: Different steps (J,) from 0 … N−1, in any order; none for the motion without actions.
@@ -354,9 +355,9 @@ class LcNsKmp:
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
 
     def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the map (m, PO+O) from [history, ξ̂] to the constrained directions, and their two bounds (m,).
+        """Return the map (m, PO+O) from [history, ξ̂] to the constrained directions, and their lower and upper bounds.
 
-        A window whose directions are within the bounds needs no correction.
+        A window whose directions are within their bounds (m,) needs no correction.
         """
         factor = self._factor(step)
         return factor.constraint_map, factor.lower, factor.upper
@@ -420,7 +421,7 @@ class LcNsKmp:
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _checked_step(self, step: int) -> int:
-        """Return a step, the last one for a step past the end; raise an `InputError` unless it is a whole number."""
+        """Return a step, clipped to the last one; raise an `InputError` unless it is a whole number from 0 on."""
         if (number := step if type(step) is int else as_whole(step, "a step")) < 0:
             raise InputError(f"step counts from 0, not {step}")
         return min(number, self.num_steps - 1)
@@ -461,7 +462,7 @@ class LcNsKmp:
         if self._shared_features is not None:
             return self._shared_features
         can_share = self.kernel.stationary and self.reference.uniform
-        # Shared features are those of step 0 to the last bit: a result must not depend on the order of calls.
+        # Shared features are always computed at step 0, because results must not depend on the order of calls.
         past, future = self._inputs(0 if can_share else step, self.horizon)
         features = window_features(self.kernel, past, future, self._history_noise)
         if can_share:
@@ -485,7 +486,7 @@ def get_shared_primitive(
         reference: As in `LcNsKmp`.
         constraints: As in `LcNsKmp`.
         kernel: As in `LcNsKmp`; kernels that compare equal share a primitive.
-        arguments: Further arguments of `LcNsKmp`, numbers and names.
+        arguments: Further arguments of `LcNsKmp`, numbers or strings.
 
     Raises:
         InputError: As `LcNsKmp`.

@@ -1,4 +1,4 @@
-"""Input mappings: from the few inputs of a user or a policy to displacements (thesis, equations 2.19 and 2.20)."""
+"""Input mappings from the few inputs of a user or a policy to displacements (thesis, equations 2.19 and 2.20)."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ TOOL = "tool"
 
 
 class InputMapping(StatePart, ABC):
-    """One mapping of map_q (equation 2.19), for some of the inputs.
+    """Displacement by some of the inputs, a part of the mapping map_q of a state q (equation 2.19).
 
     A displacement ΔH is a RigidTransform. Its translation is added to p_WE. Its rotation, about the end effector's
     origin and expressed in the world, is applied to R_WE from the left.
@@ -25,11 +25,11 @@ class InputMapping(StatePart, ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """Return ΔH of one period [s]; `inputs` (n,) are all inputs of the template, each in [−1, 1]."""
+        """Return ΔH during `period_s` [s]; `inputs` (n,) are all inputs of the template, each in [−1, 1]."""
 
     @property
     def used_inputs(self) -> tuple[int, ...]:
-        """Numbers of the inputs that the mapping uses; by default the field `inputs`."""
+        """Indices of the inputs that the mapping uses; by default the field `inputs`."""
         return self.inputs
 
 
@@ -39,7 +39,7 @@ def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarra
 
 
 def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) -> None:
-    require(len(inputs) == len(axes) > 0, f"{len(inputs)} inputs need as many axes, and at least one, not {len(axes)}.")
+    require(len(inputs) == len(axes) > 0, f"give one axis per input, at least one, not {len(axes)} for {len(inputs)}.")
     for axis in axes:
         require_three(axis, "an axis")
         require(np.any(axis), "an axis must not be all zero.")
@@ -54,11 +54,11 @@ def _require_object(frame: str) -> None:
 class Translation(InputMapping):
     """Translation of the end effector along one axis of a frame for each input.
 
-    A full input commands `speed_m_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    An input of 1 commands the speed `speed_m_per_s` times the length of its axis.
     """
 
-    inputs: tuple[int, ...]  # numbers of the inputs, from 0
-    speed_m_per_s: float  # speed at full input
+    inputs: tuple[int, ...]  # indices of the inputs, from 0
+    speed_m_per_s: float  # speed at an input of 1
     frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
@@ -77,11 +77,11 @@ class Translation(InputMapping):
 class Rotation(InputMapping):
     """Rotation of the end effector about one axis of a frame for each input.
 
-    A full input commands `speed_rad_per_s` times the length of its axis: an axis of length 2 doubles the speed.
+    An input of 1 commands the speed `speed_rad_per_s` times the length of its axis.
     """
 
-    inputs: tuple[int, ...]  # numbers of the inputs, from 0
-    speed_rad_per_s: float  # speed at full input
+    inputs: tuple[int, ...]  # indices of the inputs, from 0
+    speed_rad_per_s: float  # speed at an input of 1
     frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
@@ -106,8 +106,8 @@ class TiltTowards(InputMapping):
     is the speed of the tilt, as a fraction of full speed.
     """
 
-    inputs: tuple[int, ...]  # numbers of two inputs, from 0
-    speed_rad_per_s: float  # speed at full input
+    inputs: tuple[int, ...]  # indices of two inputs, from 0
+    speed_rad_per_s: float  # speed at an input of 1
     frame: str  # frame to tilt towards: that of an object, or `world`
 
     def __post_init__(self) -> None:
@@ -169,7 +169,7 @@ class Scaled(ScaledMapping):
 class Uneven(ScaledMapping):
     """Another mapping with different factors for positive and negative inputs.
 
-    A zero input still commands no motion, but random inputs drift in the faster direction on average. With equal
+    Random inputs move the end effector in the faster direction on average; a zero input commands no motion. With equal
     factors, random exploration would move away from a goal as often as towards it.
     """
 
