@@ -12,7 +12,7 @@ class GripperCommand(LeafSystem):
     """Desired state of gripper joints: the last finite desired positions, with zero velocity.
 
     Desired positions are clipped to the joint limits. If a position is not finite, or the port is not connected, the
-    previous desired position applies, after an initialization the initial opening.
+    previous desired position applies. After an initialization, the previous desired position is `opening`.
 
     .. pydrake_system::
 

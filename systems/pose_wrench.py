@@ -14,8 +14,8 @@ class PoseWrench(LeafSystem):
         f = τ_xyz,  [ez, Rz(a) ey, Rz(a) Ry(b) ex]ᵀ t = τ_abc
 
     with force f, torque t and generalized forces τ (see `wrench_of_generalized_force`). On a gantry the joint positions
-    are the pose of the tool, so the generalized contact forces of the plant are the wrench of the environment, without
-    the tool's weight and inertia.
+    are the tool's pose coordinates. The plant's generalized contact forces therefore give the wrench of the environment
+    on the tool, without the tool's weight and inertia.
 
     .. pydrake_system::
 

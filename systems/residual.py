@@ -1,4 +1,4 @@
-"""Sum of a reference and a residual, for residual learning."""
+"""Sum of a reference and a residual, for residual RL."""
 
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem

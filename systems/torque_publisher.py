@@ -10,10 +10,10 @@ from guiderail.systems.support.declarations import check_period, input_getter
 
 
 class TorquePublisher(LeafSystem):
-    """Publish joint torques once per period while enabled; otherwise no message is sent, not even zeros.
+    """Publish joint torques once per period while ``is_sending`` is 1; otherwise no message is sent, not even zeros.
 
-    While ``is_holding`` is 1, `hold` is called once per period instead; if it returns False, the driver cannot hold the
-    arm, and torques are published as usual.
+    While ``is_holding`` is 1, `hold` is called once per period instead. If it returns False, torques are published as
+    usual.
 
     .. pydrake_system::
 
@@ -30,7 +30,7 @@ class TorquePublisher(LeafSystem):
         write: Function that sends torques (n,) [Nm] at a time [s], such as `DriverGuard.write`.
         num_joints: Number n of joints, at least 1.
         period: Publishing period [s], positive.
-        hold: Function that makes the driver hold the arm, such as `DriverGuard.hold`.
+        hold: Function that makes the driver hold the arm, such as `DriverGuard.hold`; it returns False if it fails.
 
     Raises:
         InputError: If an argument is out of range.
@@ -56,7 +56,7 @@ class TorquePublisher(LeafSystem):
 
     get_torque_input_port = input_getter("torque", "torques, (n,) [Nm]")
     get_is_sending_input_port = input_getter("is_sending", "enable flag, (1,); no message is sent while it is 0")
-    get_is_holding_input_port = input_getter("is_holding", "flag that the driver holds the arm, (1,)")
+    get_is_holding_input_port = input_getter("is_holding", "hold flag, (1,); 1 while the driver has to hold the arm")
 
     def _publish(self, context: Context) -> None:
         if self._is_holding_port.Eval(context)[0] > 0.0 and self._hold() is not False:

@@ -191,5 +191,5 @@ def kgrl_base_policy(prior: PriorKnowledge) -> Diagram:
     options=BasePolicyOptions,
 )
 def residual_base_policy(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning around a base policy, without constraints."""
+    """Build residual RL around a base policy, without constraints."""
     return ResidualBasePolicyGuidance(prior) if prior.options["base_policy"] else ResidualGuidance(prior)

@@ -67,7 +67,7 @@ class PrimitiveConfig:
         isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
             outputs of a group. Default: one group.
         solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
-        keep_out: Walls that safe residual learning stops at, if the task provides any.
+        keep_out: Walls that safe residual RL stops at, if the task provides any.
         progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
         wrench_size: W, size of a measured wrench.
 

@@ -1,4 +1,4 @@
-"""Residual learning (thesis, section 4.4.1): actions are added to a motion, with constant gains."""
+"""Residual RL (thesis, section 4.4.1): actions are added to a motion, with constant gains."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from guiderail.systems.safety_filter import SafetyFilter
 
 
 class ResidualDescent(Guidance):
-    """Residual learning without demonstrations: p̂_t = p_t + Δp_t, where p_t is a straight descent.
+    """Residual RL without demonstrations: p̂_t = p_t + Δp_t, where p_t is a straight descent.
 
     ``action`` is (3,); the command also respects the template's speed limits. In addition to the ports of all guidance
     there are ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
@@ -67,7 +67,7 @@ class ResidualDescent(Guidance):
 
 
 class ResidualGuidance(PrimitiveGuidance):
-    """Residual learning with demonstrations: p̂_t = p_t^kmp + Δp_t.
+    """Residual RL with demonstrations: p̂_t = p_t^kmp + Δp_t.
 
     Shapes among the motion constraints are not enforced; limits of speed, acceleration and joints are refused.
     """
@@ -118,7 +118,7 @@ class ResidualGuidance(PrimitiveGuidance):
     displaces=True,
 )
 def residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning with demonstrations, or with a scripted approach and active constraints."""
+    """Build residual RL with demonstrations, or with a scripted approach and active constraints."""
     return ResidualGuidance(prior) if prior.demonstrations is not None else ResidualDescent(prior)
 
 
@@ -131,7 +131,7 @@ def residual(prior: PriorKnowledge) -> Diagram:
     displaces=True,
 )
 def safe_residual(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning with a filter that projects the command and stops it at walls; see `SafetyFilter`."""
+    """Build residual RL with a filter that projects the command and stops it at walls; see `SafetyFilter`."""
     return ResidualGuidance(prior, lambda config, keep_out: SafetyFilter(keep_out, config.control_period))
 
 
@@ -145,7 +145,7 @@ def safe_residual(prior: PriorKnowledge) -> Diagram:
     options=BarrierOptions,
 )
 def residual_cbf(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning with a control barrier function on the command; see `BarrierFilter`."""
+    """Build residual RL with a control barrier function on the command; see `BarrierFilter`."""
     decay = prior.options["barrier_decay"]
     return ResidualGuidance(
         prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, decay), config.control_period)
@@ -162,7 +162,7 @@ def residual_cbf(prior: PriorKnowledge) -> Diagram:
     options=TangentOptions,
 )
 def residual_tangent(prior: PriorKnowledge) -> Diagram:
-    """Build residual learning in the tangent space of the constraints; see `TangentSpaceFilter`."""
+    """Build residual RL in the tangent space of the constraints; see `TangentSpaceFilter`."""
 
     def make_filter(config: PrimitiveConfig, keep_out: KeepOut) -> CommandFilter:
         width = prior.options["slack_width"] * float(config.residual_gains().max())

@@ -326,7 +326,7 @@ class DemonstratedInsertion(InsertionTask):
         """Return the bounds of every commanded pose."""
 
     def keep_out(self) -> KeepOut:
-        """Return no walls: safe residual learning is limited by the constraints alone."""
+        """Return no walls: safe residual RL is limited by the constraints alone."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:

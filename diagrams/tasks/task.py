@@ -106,7 +106,7 @@ class Task(ABC):
             statistic if the task declares no signal. An episode that a `TerminationTerm` ends as a collision is counted
             only if the signal is above its limit too.
         statistics: Statistics of a table of episodes that only this task has; a study may name them.
-        isotropic_groups: Groups of outputs with the same unit, as indices; in residual learning, an action of 1
+        isotropic_groups: Groups of outputs with the same unit, as indices; in residual RL, an action of 1
             displaces each output of a group by the same amount. None: one group of all outputs.
         pushable: True if `DiagramEnv.push` may displace the robot.
         time_unit: Time of which every control period is a whole multiple [s]; default: that of the station.
@@ -198,7 +198,7 @@ class Task(ABC):
         raise NotImplementedError
 
     def keep_out(self) -> KeepOut:
-        """Return the walls at which safe residual learning stops the robot."""
+        """Return the walls at which safe residual RL stops the robot."""
         raise NotImplementedError
 
     def template(self) -> PlacedTemplate:

@@ -15,11 +15,12 @@ def main(arguments: list[str]) -> int:
         "action_fuzzing",
         "Send random actions to a task and check the simulation, the commands and the task's limits. The exit code is "
         "1 if the simulation failed, a number was NaN or infinite, a prediction failed, a command of constrained "
-        "guidance violated the constraints (recomputed from the commands), or a limit of the task was exceeded.",
+        "guidance violated the constraints, the reported violation differs from the recomputed one, or a limit of the "
+        "task was exceeded.",
         "BncConnector --episodes 1000 --out fuzzing.csv",
     )
     parser.add_argument("task", metavar="TASK", help=f"{', '.join(CAMPAIGNS)}, {ALL}, or another task or task folder")
-    parser.add_argument("--episodes", type=int, help="number of episodes, of one task (default: 1000)")
+    parser.add_argument("--episodes", type=int, help="number of episodes; one task only (default: 1000)")
     parser.add_argument("--steps", type=int, help="number of control steps, instead of --episodes")
     parser.add_argument("--seed", type=int, default=0, help="seed of the first episode (default: 0)")
     parser.add_argument(

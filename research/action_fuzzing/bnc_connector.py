@@ -1,6 +1,6 @@
 """Fuzzing of the connector: random, repeated and saturated actions in x and y, and in all six outputs.
 
-Residual learning and the demonstrations alone are not constrained: their episodes test only the simulation.
+Residual RL and the demonstrations alone are not constrained: their episodes test only the simulation.
 """
 
 from __future__ import annotations

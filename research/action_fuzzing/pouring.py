@@ -19,7 +19,7 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 class EarlyTilt(EnvCallback):
-    """Callback that adds the largest commanded tilt in the template's first state, which keeps the thermos upright."""
+    """Callback: largest commanded tilt in the template's first state, which keeps the thermos upright."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `early_tilt` [rad] over all control steps; 0 if the template was never in its first state."""
@@ -39,12 +39,12 @@ PolicyMaker = Callable[[np.random.Generator], PolicyFn]
 
 
 def noisy_pour(rng: np.random.Generator, spread: float = 1.5) -> PolicyFn:
-    """Return the scripted policy with noise that is larger than its inputs."""
+    """Return the scripted policy with Gaussian noise of standard deviation `spread`; its own inputs are at most 1."""
     return lambda observation: np.clip(scripted_pour(observation) + spread * rng.normal(size=3), -1.0, 1.0)
 
 
 def random_walk(rng: np.random.Generator) -> PolicyFn:
-    """Return a policy of inputs ±1, resampled with a probability of 0.1 per action: they reach the whole workspace."""
+    """Return a policy of inputs ±1 that are resampled with probability 0.1, so that it reaches the whole workspace."""
     action = np.sign(rng.normal(size=3))
 
     def act(observation: np.ndarray) -> np.ndarray:

@@ -40,8 +40,8 @@ def grid_clamp() -> Campaign:
 def narrow_passage() -> Campaign:
     """Return the campaign: KGRL and sKGRL, at two action repeats, must satisfy the constraint and touch no wall.
 
-    Safe residual learning may stop before walls. Residual learning and the demonstrations alone are not constrained:
-    their episodes test only the simulation.
+    Safe residual RL may stop before walls. Residual RL and the demonstrations alone are not constrained: their episodes
+    test only the simulation.
     """
     cases = [
         Case(
@@ -62,9 +62,9 @@ def narrow_passage() -> Campaign:
 def campaign_of(task: str) -> Campaign:
     """Return a campaign of every guidance of a task, with the default options.
 
-    The violation of a task's constraints is recomputed. The violation of a template is the one that the guidance
-    reports, because the poses of its objects are unknown. Waiting, or stopping before a wall, is a failure of KGRL and
-    sKGRL only.
+    The violation of a task's constraints is recomputed. That of a template's constraints is only reported by the
+    guidance, because the poses of the template's objects are unknown. A fallback (waiting, or stopping before a wall)
+    is a failure with KGRL and sKGRL only.
 
     Args:
         task: Name of the task.

@@ -36,8 +36,8 @@ def reproduce(
         out: Folder of pictures, tables and runs. Finished runs in it are reused, also by other figures.
 
     Returns:
-        `figure`, `picture`, `table`, the figure's own results, and the result in the thesis. They are also
-        written as JSON next to the table, with the command and the duration, for `python -m research.results`.
+        `figure`, `picture`, `table`, the figure's own results, and the result in the thesis. A JSON file next to the
+        table has the same entries, the command and the duration, for `python -m research.results`.
 
     Raises:
         InputError: For an unknown figure or a number out of range.
@@ -71,6 +71,6 @@ def figure_command(number: str) -> str:
 
 
 def find_figure(number: str) -> Callable[..., dict[str, Any]]:
-    """Return the function that makes a figure."""
+    """Return the function that makes a figure; `number` is a key of `FIGURES`."""
     chapter = number.removeprefix("table ").split(".")[0]
     return getattr(import_module(f"research.figures.chapter_{chapter}"), FIGURES[number])

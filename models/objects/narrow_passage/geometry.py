@@ -50,7 +50,7 @@ class PassageGeometry:
         return LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-self.zone_x]))
 
     def keep_out(self, margin: float = 0.02) -> KeepOut:
-        """Return the keep-out region of safe residual learning, `margin` [m] before walls and zone (section 4.4.1).
+        """Return the keep-out region of safe residual RL, `margin` [m] before walls and zone (section 4.4.1).
 
         Raises:
             InputError: If the margin is negative or not finite.

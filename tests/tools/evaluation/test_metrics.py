@@ -87,7 +87,7 @@ def test_every_metric_has_a_unique_name_and_a_description():
 
 
 def test_row_agrees_with_the_trace():
-    """Residual learning, which does not avoid walls, collides."""
+    """Residual RL, which does not avoid walls, collides."""
     env = make_environment("NarrowPassage", {"guidance": "residual"})
     random = np.random.default_rng(0)
     row = rollout(env, lambda observation: random.uniform(-1, 1, 2), Paths(env), seed=0)
