@@ -19,7 +19,7 @@ _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf
 
 MAX_FILE_SIZE = 200_000_000  # largest CSV file [bytes]
 _MAX_HEADER = 100_000  # largest number of characters of a header
-_MAX_LIST = 1_000  # largest mean length of the lists of numbers in the rows of a Parquet file
+_MAX_LIST = 1_000  # number of list elements that count as one row of a Parquet file
 MAX_ROWS = 20_000_000  # largest number of rows of Parquet files that are read together
 
 Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]
@@ -55,7 +55,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def read_columns(path: Path) -> list[str]:
-    """Return the names in the first line of a CSV file; none if that line is empty, or is neither CSV nor UTF-8.
+    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8.
 
     Raises:
         InputError: If the file cannot be read.
@@ -81,7 +81,7 @@ def _parse_column(cells: Sequence[str]) -> pd.Series:
 
 
 def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
-    """Check the sizes that the footers of Parquet files claim, before anything is allocated for their rows.
+    """Check the numbers of rows in the footers of Parquet files, before memory is allocated for the rows.
 
     Raises:
         InputError: If a file is not a readable Parquet file, or all files together have more than `max_rows` rows. Long

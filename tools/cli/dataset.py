@@ -125,7 +125,7 @@ def create_task(
     out: Annotated[Path, option("Folder of the task; it must not exist.")],
     unit: Annotated[str | None, option("Unit of .stl, .obj and .ply meshes: mm, cm, m or inch.")] = None,
     plug_pose: Annotated[
-        str, option(f"{POSE}: motion of the plug's mesh to the assembled pose [unit of the socket, degrees].")
+        str, option(f"{POSE}: transform of the plug's mesh to the assembled pose [unit of the socket, degrees].")
     ] = "0,0,0,0,0,0",
     axis: Annotated[str, option("Direction in which the plug is removed: +x, -x, +y, -y, +z or -z.")] = "+z",
     center: Annotated[
@@ -133,13 +133,13 @@ def create_task(
     ] = None,
     turn: Annotated[
         float,
-        option("Rotation of the plug at the bottom [degrees], counterclockwise from outside; its mesh includes it."),
+        option("Rotation at the bottom [degrees], counterclockwise from outside; the mesh shows the plug after it."),
     ] = 0.0,
     pitch: Annotated[
         float, option("Advance of a screw per full turn during --turn [mm], positive if it is right-handed.")
     ] = 0.0,
     search_turn: Annotated[
-        float, option("Largest unknown turn of the socket [degrees]; if positive, actions turn the plug, too.")
+        float, option("Largest unknown turn of the socket [degrees]; above 0, actions also turn the plug.")
     ] = 0.0,
     shrink: Annotated[float, option("Distance by which the plug's surface is moved inwards [mm].")] = 0.0,
     force_limit: Annotated[float, option("Contact force that ends an episode as a collision [N].")] = COLLISION_FORCE,
@@ -148,7 +148,7 @@ def create_task(
         list[Path] | None, option("Drake model directives (.dmd.yaml) of the surroundings; repeatable.")
     ] = None,
     hard_episodes: Annotated[
-        int, option("Episodes of each baseline policy per setting to calibrate difficulty=hard; 0: no calibration.")
+        int, option("Episodes per baseline policy and setting that calibrate difficulty=hard; 0: no calibration.")
     ] = 10,
     as_json: cli.Json = False,
 ) -> None:

@@ -18,7 +18,7 @@ def evaluate(
     subject: cli.Subject,
     episodes: Annotated[int | None, option("Number of held-out episodes.  [default: 100]")] = None,
     quick: Annotated[
-        bool, option(f"Evaluate {QUICK} episodes: a fifth of the default, with a wider interval.", "--quick")
+        bool, option(f"Evaluate {QUICK} episodes instead of 100; the confidence interval is wider.", "--quick")
     ] = False,
     seed: cli.Seed = SEED,
     task: cli.PolicyTask = None,
@@ -150,8 +150,8 @@ def robustness(
 ) -> None:
     """Evaluate policies under friction, stiffness, sensor, command and timing errors.
 
-    One quantity is changed at a time; one table and one picture compare all runs. Evaluated episodes are stored: the
-    same command resumes an interrupted evaluation, and for an additional run only its own episodes are evaluated.
+    One quantity is changed at a time. One table and one picture compare all runs. Evaluated episodes are stored, so the
+    same command resumes an interrupted evaluation, and an additional run needs only its own episodes.
     """
     from guiderail.tools.evaluation.robustness import robustness as evaluate_robustness
     from guiderail.tools.evaluation.robustness import values_below
@@ -186,7 +186,7 @@ def robustness(
 def certify(
     subject: Annotated[
         str,
-        argument("Folder of a run; or with --out pretrained:NAME ({pretrained}) or a task: {tasks}.", "RUN or TASK"),
+        argument("Folder of a run. With --out also pretrained:NAME ({pretrained}) or a task: {tasks}.", "RUN or TASK"),
     ],
     env: cli.Env = None,
     out: Annotated[Path | None, option("Folder to write.  [default: certificate in the run]")] = None,
@@ -199,7 +199,7 @@ def certify(
     ] = None,
     attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
     verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,
-    key: Annotated[Path | None, option("Key that signs the certificate or, with --verify, checks it.")] = None,
+    key: Annotated[Path | None, option("Key that signs the certificate or, with --verify, has signed it.")] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -207,7 +207,7 @@ def certify(
     """Compute bounds on all commands of a skill, for any action, and check them with an independent program.
 
     The certificate lists its assumptions. It can be checked on any machine: python checker.py FOLDER needs NumPy alone.
-    An attack shows how tight the bounds are: the table compares them with the worst commands an adversary found.
+    With --attack, a table compares the bounds with the worst commands that an adversary finds.
     """
     from guiderail.tools.certify import certify_skill, verify_certificate
 

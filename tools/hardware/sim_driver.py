@@ -35,7 +35,7 @@ START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
 # Difference of the initial pose from the start pose, for tasks other than the default [m], [rad].
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])
-PLANT_STEPS_PER_STATUS = 5  # in real time; steps at 1 kHz, like a real arm's own control loop (in lockstep: 1)
+PLANT_STEPS_PER_STATUS = 5  # in real time: 1 kHz, as a real arm's control loop (in lockstep it is 1)
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
@@ -58,8 +58,8 @@ def run_sim_driver(
         url: LCM URL of the driver's bus, LCM's default if empty; with "fci" the address to listen on, 127.0.0.1 if
             empty.
         seconds: Simulated time to run [s].
-        command_timeout: Longest wait of the iiwa in lockstep for the acknowledgement of a status [s of wall clock
-            time]; ten times as long for the first.
+        command_timeout: Longest time that the iiwa in lockstep waits for the acknowledgement of a status [s of wall
+            clock time]; for the first status it waits ten times as long.
         task: Name of an insertion task.
         rate: Rate of the robot's clock relative to the wall clock, in (0, 1]. With None, the iiwa waits for an
             acknowledgement of each status instead (lockstep), and the Franka has the rate 1.
@@ -76,8 +76,8 @@ def run_sim_driver(
         False if the iiwa in lockstep stopped because acknowledgements stopped arriving; otherwise True.
 
     Raises:
-        InputError: If the task is no insertion, there is no such simulated driver, an argument is out of range, or the
-            scenario is invalid or refused.
+        InputError: If the task is not an insertion task, there is no such simulated driver, an argument is out of
+            range, or the scenario is invalid or refused.
     """
     for name, value in {"--seconds": seconds, "--command-timeout": command_timeout}.items():
         if not 0.0 < value < np.inf:
@@ -201,9 +201,9 @@ class PartRandomizer:
         task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """Sample the offsets of the parts by the options of a reset in simulation, send them, and return them by name.
+        """Sample the offsets of the parts with the options of a simulated reset, send them, and return them by name.
 
-        An offset is (x, y) [m], after which a task may have angles [rad].
+        An offset is (x, y) [m]; some tasks append angles [rad].
 
         Raises:
             InputError: If the task has no such option, or a value is out of range.

@@ -142,10 +142,10 @@ class MeshcatSupervisor(Supervisor):
             time.sleep(0.1)
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
-        """Show an episode of `env` with all sliders at zero; of earlier clicks, only a stop counts.
+        """Show an episode of `env` with all sliders at zero; earlier clicks are dropped, except a stop.
 
         Raises:
-            InputError: If an action has more numbers than there are pairs of keys.
+            InputError: If an action has more numbers than there are sliders with keys.
         """
         base = cast(Any, env.unwrapped)
         self._add_sliders(base)
@@ -177,7 +177,7 @@ class MeshcatSupervisor(Supervisor):
         size = int(base.action_space.shape[0])
         if size > len(KEY_PAIRS):
             raise InputError(
-                f"an action of {size} numbers can't be pushed by {len(KEY_PAIRS)} sliders: give fewer action_dims"
+                f"an action of {size} numbers needs more than the {len(KEY_PAIRS)} sliders: give fewer action_dims"
             )
         for number in range(size):
             self.panel.add_slider(f"push {number + 1}", Slider(LIMIT, STEP, KEY_PAIRS[number]))

@@ -22,11 +22,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import beyond_defaults
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_once, evaluate_trained
-from guiderail.tools.evaluation.evaluation import (
-    BASELINES_FOLDER,
-    POLICY,
-    stored_episodes,
-)
+from guiderail.tools.evaluation.evaluation import BASELINES_FOLDER, POLICY, stored_episodes
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.step_log import read_step_log
@@ -39,7 +35,7 @@ from guiderail.tools.visualization.style import color, label
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
 STUDY_COLUMNS = ("method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate")
-MAX_COUNT = 1e12  # number of episodes from which a study's table is damaged
+MAX_COUNT = 1e12  # largest number of episodes; a study's table with a larger one is refused
 REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
     "fallback_steps",
@@ -52,7 +48,7 @@ STEP_LOG_COLUMNS = (
 
 
 def _extremes(rows: pd.DataFrame, prefix: str, force: str) -> dict[str, Any]:
-    """Return the number and the maximum of commanded and of measured violations, and the peak force.
+    """Return the numbers and maxima of commanded and measured violations, and the peak force.
 
     The columns of violations begin with `prefix`, and `force` is the column of forces.
     """
@@ -141,8 +137,8 @@ class ReportData:
 def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
-    Each run that is given itself, or is in a folder without a study's table, is evaluated on `episodes` held-out
-    episodes, together with baseline policies. If `episodes` is 0, only stored evaluations are read.
+    A run is evaluated on `episodes` held-out episodes, together with baseline policies, if its own folder is given or
+    if the given folder has runs but no study's table. If `episodes` is 0, only stored evaluations are read.
 
     Raises:
         InputError: If no folder is given, a folder contains neither a run nor a study's table, no run has a finished
@@ -205,7 +201,7 @@ def _episodes(folder: RunFolder) -> pd.DataFrame:
 def _study_tables(folder: Path) -> list[pd.DataFrame]:
     """Return the tables of a study, with a row for each method, seed, checkpoint and evaluation set.
 
-    Rows of a partial study's table that are also in the table of the whole study are left out, and so are other files.
+    Rows of a partial study's table that are also in the table of the whole study are left out. Other files are ignored.
 
     Raises:
         InputError: If a table of a study is damaged.
@@ -237,10 +233,10 @@ def _source(folder: Path, study: str) -> str:
 
 
 def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
-    """Return the possible names of the study of which a table is a part; none if its name is that of a whole study.
+    """Return the possible names of the study of which the table `name` is a part; none if no suffix matches.
 
-    The table of a partial study is named after the study, then all its methods, its seeds or both, joined by dashes
-    (`Study.subset_name`). A method's own seeds are not part of the name, so the seeds are those of some method.
+    The name of a partial study's table is the study's name, then all methods of the table, its seeds, or both, joined
+    by dashes (`Study.subset_name`). The seeds in the name are those of a method that declares no seeds of its own.
     """
     seeds = {
         str(method): [*dict.fromkeys(map(str, rows["seed"]))] for method, rows in table.groupby("method", sort=False)
@@ -269,7 +265,7 @@ def _success_counts(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
 
 
 def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
-    """Return the counts of a run's held-out episodes; evaluate it first unless exactly `episodes` are stored."""
+    """Return the counts of a run's held-out episodes; if `episodes` is not 0, evaluate them unless they are stored."""
     if episodes:
         environment = run.config.environment
         evaluate_trained(RunFolder(run.path), run.config, episodes)
@@ -310,7 +306,7 @@ def _name_methods(runs: list[Run]) -> None:
 
 
 def _name_sources(runs: Sequence[Run], settings: Sequence[dict[str, Any]]) -> None:
-    """Replace `init_from` by a path relative to the run's folder, with {seed} in place of the run's own seed."""
+    """Replace `init_from` by a path relative to the folder of the runs, with {seed} in place of the run's own seed."""
     paths = {
         number: os.path.relpath(one["init_from"], run.path.resolve().parent)
         for number, (run, one) in enumerate(zip(runs, settings, strict=True))

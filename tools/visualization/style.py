@@ -17,12 +17,12 @@ from guiderail.tools.files import check_picture, write_atomically
 
 
 def label(guidance: str) -> str:
-    """Return the label of a guidance in a legend."""
+    """Return the label of a guidance in a legend; an unknown guidance is its own label."""
     return GUIDANCE.get(guidance).label if guidance in GUIDANCE.names() else guidance
 
 
 def color(guidance: str) -> str:
-    """Return the color of a guidance."""
+    """Return the color of a guidance; brown for an unknown one."""
     return GUIDANCE.get(guidance).color if guidance in GUIDANCE.names() else "#8c564b"
 
 
