@@ -113,8 +113,7 @@ class LcNsKmp:
         self._no_action = np.zeros(self.num_outputs)
         if self.history:
             self._features(0)  # raises an InputError if the history's variance is too small
-        strength = self.lambda_, self.beta
-        self.deviation = check_deviation(reference, self.kernel, *strength, self.horizon, max_deviation)
+        self.deviation = check_deviation(reference, self.kernel, self.lambda_, self.beta, self.horizon, max_deviation)
 
     @property
     def num_outputs(self) -> int:

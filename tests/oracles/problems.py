@@ -19,9 +19,11 @@ class Problem:
     def solve(self):
         return self.primitive.predict(self.step, self.action, self.history)
 
-    def dense(self, precision=Extended) -> DenseWindow:
+    def dense(self, precision=Extended, *, step=None, horizon=None, actions=None, at=None) -> DenseWindow:
+        """Return the dense window of this problem, or of another step, horizon or actions (J, O) at steps (J,)."""
         p = self.primitive
-        n, P, H, N = self.step, p.history, p.horizon, p.num_steps
+        n, H = self.step if step is None else step, p.horizon if horizon is None else horizon
+        P, N = p.history, p.num_steps
         dt = p.reference.times[1] - p.reference.times[0]
         held = np.minimum(np.arange(n, n + H + 1), N - 1)
         inputs = p.reference.times[0] + dt * np.arange(n - P, n + H + 1)
@@ -30,8 +32,8 @@ class Problem:
             past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
             means, covariances = np.vstack([self.history, means]), np.concatenate([past, covariances])
         return DenseWindow(
-            squared_exponential, self.length_scale, inputs, means, covariances, P, p.lambda_, p.beta, self.action,
-            precision,
+            squared_exponential, self.length_scale, inputs, means, covariances, P, p.lambda_, p.beta,
+            self.action if at is None else actions, precision, None if at is None else P + np.asarray(at) - n,
         )  # fmt: skip
 
     def constraints(self):

@@ -130,7 +130,6 @@ class MeshcatSupervisor(Supervisor):
         meshcat = open_meshcat()[0] if meshcat is None else meshcat
         self.panel = MeshcatPanel(meshcat, {}, {**LABEL_KEYS, RELEASE: RELEASE_KEY})
         self._log = log
-        self._view: View | None = None
         self._has_camera = self._is_stop_pending = False
 
     def wait(self) -> None:
@@ -150,11 +149,11 @@ class MeshcatSupervisor(Supervisor):
         base = cast(Any, env.unwrapped)
         self._add_sliders(base)
         if base.task.query is not None:
-            self._view = View(base.task.query, self.panel.meshcat)
+            view = View(base.task.query, self.panel.meshcat)
             if not self._has_camera and base.task.declaration is not None:
                 set_camera(self.panel.meshcat, base.task.declaration)
                 self._has_camera = True  # set once, because the supervisor may move the camera
-            base.simulator.set_monitor(self._view.follow)
+            base.simulator.set_monitor(view.follow)
             base.simulator.set_target_realtime_rate(1.0)
         self.panel.reset()
         self._is_stop_pending = self.label() == "stop"

@@ -14,26 +14,9 @@ from guiderail.models.primitives import (
     UnsolvableError,
 )
 from guiderail.models.primitives.qp import SOLVERS
-from oracles.dense import DenseWindow, squared_exponential
 from oracles.problems import random_problem
 
 SEEDS = st.integers(0, 2**32 - 1)
-
-
-def dense(problem, step, horizon, at, actions):
-    """Return the dense window from `step` on, with actions at the steps `at`."""
-    p = problem.primitive
-    P, dt = p.history, p.reference.times[1] - p.reference.times[0]
-    held = np.minimum(np.arange(step, step + horizon + 1), p.num_steps - 1)
-    inputs = p.reference.times[0] + dt * np.arange(step - P, step + horizon + 1)
-    means, covariances = p.reference.means[held], p.reference.covariances[held]
-    if P:
-        past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
-        means, covariances = np.vstack([problem.history, means]), np.concatenate([past, covariances])
-    return DenseWindow(
-        squared_exponential, problem.length_scale, inputs, means, covariances, P, p.lambda_, p.beta, actions,
-        at=P + np.asarray(at) - step,
-    )  # fmt: skip
 
 
 def spread(rng, first, horizon, most=4):
@@ -65,7 +48,7 @@ def test_modified_window_matches_equation_4_18(seed):
     actions = np.outer(rng.standard_normal(len(at)), problem.action)
     result = p.modified_window(problem.step, at, actions, problem.history)
     np.testing.assert_array_equal(result.steps, problem.step + np.arange(p.horizon + 1))
-    check(problem, result, dense(problem, problem.step, p.horizon, at, actions), problem.constraints())
+    check(problem, result, problem.dense(actions=actions, at=at), problem.constraints())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -79,7 +62,7 @@ def test_modified_trajectory_is_one_problem_over_all_steps(seed):
     result = p.modified_trajectory(at, actions, problem.history)
     np.testing.assert_array_equal(result.steps, np.arange(p.num_steps))
     constraints = p.constraints.window(np.arange(p.num_steps))
-    check(problem, result, dense(problem, 0, last, at, actions), constraints)
+    check(problem, result, problem.dense(step=0, horizon=last, actions=actions, at=at), constraints)
 
 
 @given(SEEDS)
