@@ -35,7 +35,7 @@ START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
 # Difference of the initial pose from the start pose, for tasks other than the default [m], [rad].
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])
-PLANT_STEPS_PER_STATUS = 5  # in real time: 1 kHz, as a real arm's control loop (in lockstep it is 1)
+PLANT_STEPS_PER_STATUS = 5  # in real time, for 1 kHz, the rate of a real arm's control loop; 1 in lockstep
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
