@@ -46,14 +46,19 @@ def reference_of_file(
             f"{path} has {demonstrations.num_outputs} outputs: an insertion needs the six of a pose, "
             "[x y z Rz Ry Rx] in the target frame"
         )
-    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
-    num_steps = round(duration / CONTROL_PERIOD) + 1
+    num_steps = control_steps(demonstrations)
     fitted = ReferenceTrajectory.from_demonstrations(
         demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), **fit
     )
     times = CONTROL_PERIOD * np.arange(num_steps)
     _REFERENCES[key] = ReferenceTrajectory(times, fitted.means, fitted.covariances)
     return _REFERENCES[key]
+
+
+def control_steps(demonstrations: Demonstrations) -> int:
+    """Return the number of control steps of the demonstrations' mean duration."""
+    duration = float(np.mean([t[-1] - t[0] for t in demonstrations.times]))
+    return round(duration / CONTROL_PERIOD) + 1
 
 
 # Cache, because a fit takes seconds. Keys have a file's digest, not its path, because `create-task` moves files.

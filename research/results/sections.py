@@ -218,6 +218,23 @@ SECTIONS: dict[str, list[Section]] = {
             guided=("RL-SCT",),
         ),
         Section(
+            "Grid clamp, hard, force not bounded",
+            [
+                Row("RL-SCT, 3 demonstration episodes", "peers_grid_clamp_hard_unbounded", "sct"),
+                Row("RL-SCT", "peers_grid_clamp_hard_unbounded", "sct_alone"),
+                Row("residual RL", "peers_grid_clamp_hard_unbounded", "residual"),
+                Row("residual RL, 400 episodes", "peers_grid_clamp_hard_unbounded", "residual_400"),
+                Row("CrossQ", "peers_grid_clamp_hard_unbounded", "crossq"),
+                Row("Policy Decorator", "peers_grid_clamp_hard_unbounded", "policy_decorator"),
+                Row("Policy Decorator, 400 episodes", "peers_grid_clamp_hard_unbounded", "policy_decorator_400"),
+                Row("DroQ", "peers_grid_clamp_hard_unbounded", "droq"),
+                Row("RL of 6D velocities", "peers_grid_clamp_hard_unbounded", "none"),
+                Row("straight down", "peers_grid_clamp_hard_unbounded", "straight"),
+                *_baselines("peers_grid_clamp_hard_unbounded", _NOT_CONSTANT[1:], names=_NAMES_NOT_CONSTANT[1:]),
+            ],
+            guided=("RL-SCT, 3 demonstration episodes",),
+        ),
+        Section(
             "Grid clamp",
             [
                 Row("RL-SCT", "grid_clamp", "sct"),

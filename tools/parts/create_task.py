@@ -379,7 +379,7 @@ def _write_task(
     """Write demonstrations, task file and preview page; return `measured` with the results of the demonstrations."""
     from guiderail.diagrams.tasks.part.file import write_task_file
     from guiderail.tools.parts.difficulty import calibrate
-    from guiderail.tools.parts.trial import demonstrate, write_preview
+    from guiderail.tools.parts.trial import demonstrate, num_components, write_preview
 
     duration = float(file.motion.plan_search()[0][-1])
     factor = max(measured["real_time_factor"], 0.01)  # rounding may make it 0
@@ -400,7 +400,9 @@ def _write_task(
         log(f"{unchecked} of {NUM_DEMONSTRATIONS} demonstrations are not checked: the others took too much CPU time")
     measured["demonstrations_seated"] = f"{succeeded} of {checked}" + (f", {unchecked} unchecked" if unchecked else "")
     measured["total_s"] = _seconds_since(start)
-    file = file.model_copy(update={"measured": measured})
+    # With the number in the file, no training has to search for it again, which takes seconds.
+    fitted = file.demonstrations.model_copy(update={"components": num_components(folder, file)})
+    file = file.model_copy(update={"measured": measured, "demonstrations": fitted})
     write_task_file(folder, file)
     if hard_episodes:
         mesh = TriangleMesh.from_obj(folder / file.plug.visual)

@@ -18,6 +18,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.tasks.offsets import control_steps
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.part.file import PartModel, PartTaskFile
 from guiderail.diagrams.tasks.part.task import PLUG, SOCKET, write_workcell
@@ -31,6 +32,7 @@ from guiderail.models.parts.drake_check import piece_text
 from guiderail.models.parts.preparation import CUT_SECONDS, ContactSurface, cut_bodies
 from guiderail.models.parts.solids import SurfaceLocator
 from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
 
@@ -272,6 +274,13 @@ def demonstrate(folder: Path, file: PartTaskFile) -> tuple[int, int]:
         checked += is_checked
     Demonstrations([times] * len(chosen), chosen, POSE_NAMES).save(folder / file.demonstrations.file)
     return seated, checked
+
+
+def num_components(folder: Path, file: PartTaskFile) -> int:
+    """Return the number of components of the demonstrations' mixture, by the Bayesian information criterion."""
+    recorded = Demonstrations.load(folder / file.demonstrations.file)
+    resampled = recorded.resampled(control_steps(recorded))
+    return len(fit_mixture(resampled.times[0], np.stack(resampled.outputs), components=None, seed=0).weights)
 
 
 def _seats(folder: Path, file: PartTaskFile, times: np.ndarray, motion: np.ndarray, socket: np.ndarray) -> bool:

@@ -426,6 +426,15 @@ def test_arguments_of_wrong_types_are_refused_and_paths_may_be_text(given, messa
         create_task(**(paths | {"socket": str(tmp_path / "b.stl"), "unit": "mm"} | given))
 
 
+def test_task_file_has_the_number_of_components_that_the_criterion_selects(folder):
+    from guiderail.diagrams.tasks.part.file import read_task_file
+
+    stored = read_task_file(folder).demonstrations
+    searched = stored.model_copy(update={"components": None}).reference(folder)
+    assert stored.components > 1
+    np.testing.assert_array_equal(stored.reference(folder).covariances, searched.covariances)
+
+
 @pytest.mark.parametrize(("seats", "expected"), [(True, (4, 4)), (False, (0, 2))])
 def test_demonstrations_that_are_not_checked_in_time_are_not_counted(seats, expected, folder, tmp_path, monkeypatch):
     from guiderail.diagrams.tasks.part.file import read_task_file
@@ -452,6 +461,7 @@ def test_unchecked_demonstrations_are_not_reported_as_failed(counts, stored, sen
     from guiderail.tools.parts import trial
 
     monkeypatch.setattr(trial, "demonstrate", lambda folder, file: counts)
+    monkeypatch.setattr(trial, "num_components", lambda folder, file: 3)
     monkeypatch.setattr(trial, "write_preview", lambda *arguments: None)
     file, choice, logged = read_task_file(folder), SimpleNamespace(aligned=None), []
     refusal = pytest.raises(InputError, match="none of the 3 checked demonstrations seats the plug")
