@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
 from queue import SimpleQueue
@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 import torch
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
@@ -263,10 +263,16 @@ def _serve(
 
         import_modules(imports)
     learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)
+    is_packaged = LEARNERS.is_packaged(given[0].algorithm)  # failures of a user's learner are one sentence
     while (message := requests.get()) != ("end",):
         name, *arguments = message
         try:
-            if (answer := _HANDLERS[name](learner, *arguments)) is not _NO_ANSWER:
+            with nullcontext() if is_packaged else naming_failures(f"{type(learner).__name__} in the training process"):
+                answer = _HANDLERS[name](learner, *arguments)
+        except InputError as error:
+            answer = error
+        try:
+            if answer is not _NO_ANSWER:
                 pipe.send(answer)
         except (BrokenPipeError, ConnectionError):
             return
@@ -285,13 +291,10 @@ _NO_ANSWER = object()
 
 def _learn(
     learner: OffPolicyLearner, transitions: list[Transition], records_metrics: bool
-) -> tuple[Weights, Mapping[str, float]] | InputError:
+) -> tuple[Weights, Mapping[str, float]]:
     learner.records_metrics = records_metrics
-    try:
-        for transition in transitions:
-            learner.on_step(transition)
-    except InputError as error:
-        return error
+    for transition in transitions:
+        learner.on_step(transition)
     return copy_weights(learner), learner.metrics()
 
 
@@ -304,10 +307,7 @@ def _restore(learner: OffPolicyLearner, arrays: Mapping[str, np.ndarray], values
 
 
 def _write(learner: OffPolicyLearner, path: Path, table: pa.Table) -> object:
-    try:
-        write_step_log(path, table)
-    except InputError as error:
-        return error
+    write_step_log(path, table)
     return _NO_ANSWER
 
 

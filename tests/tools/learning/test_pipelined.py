@@ -1,5 +1,7 @@
 """Learning in a second process."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pyarrow as pa
@@ -13,8 +15,8 @@ from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 
 
-def make_learner(**more):
-    """Return a pipelined learner with two actions, and its acting learner."""
+def make_learner(algorithm="sac", **more):
+    """Return a pipelined learner with two actions, and its acting learner; `algorithm` learns in the second process."""
     space = gymnasium.Env()
     space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
     space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -22,7 +24,8 @@ def make_learner(**more):
     preset = resolve_preset("tqc_contact", "sac", small)
     named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, space, **named)
-    return PipelinedLearner(acting, ((preset, space), named), waits=True, **more), acting
+    arguments = ((replace(preset, algorithm=algorithm), space), named)
+    return PipelinedLearner(acting, arguments, waits=True, **more), acting
 
 
 def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
@@ -33,7 +36,8 @@ def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr("os.replace", fail)
-        assert isinstance(_write(None, file, rows), InputError)
+        with pytest.raises(InputError):
+            _write(None, file, rows)
     assert list(tmp_path.rglob("*.parquet")) == []
     _write(None, file, rows)
     assert len(read_step_log(file.parent)) == 9
@@ -45,6 +49,22 @@ def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
     learner.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
     with pytest.raises(InputError, match="cannot be written"):
         learner.finish()
+
+
+def test_failures_of_a_users_learner_in_the_second_process_are_one_sentence(forkserver, tmp_path):
+    module = tmp_path / "lab_learner.py"
+    module.write_text(
+        "from guiderail.tools.learning.learner import register_learner\n"
+        "from guiderail.tools.learning.off_policy import SacLearner\n"
+        '@register_learner("lab")\n'
+        "class Lab(SacLearner):\n"
+        "    def state(self):\n"
+        "        raise OSError('no space')\n"
+    )
+    learner, _ = make_learner("lab", imports=(str(module),))
+    with pytest.raises(InputError, match=r"Lab in the training process failed: lab_learner\.py, line 6: OSError: no"):
+        learner.state()
+    learner.close()
 
 
 def test_pipelined_learner_learns_episodes_two_later(forkserver):
