@@ -166,7 +166,8 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
         raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
     merged = {
-        "station": stations[0],
+        # The first of the package: a registration by another package must not change an environment.
+        "station": min(stations, key=lambda station: not STATIONS.is_packaged(station)),
         "reward": task.rewards[0],
         "observation": task.observations[0],
         **task.defaults,

@@ -141,8 +141,12 @@ def possible_guidance(provided: Collection[str]) -> list[str]:
 
 
 def default_guidance(possible: Collection[str]) -> str:
-    """Return the first kind of guidance in `possible` that does not ignore actions; the first one if all do."""
-    return next((name for name in possible if not GUIDANCE.get(name).ignores_actions), next(iter(possible)))
+    """Return the first kind of guidance in `possible` that does not ignore actions; the first one if all do.
+
+    The package's own kinds precede those that are registered by other packages.
+    """
+    names = sorted(possible, key=lambda name: not GUIDANCE.is_packaged(name))
+    return next((name for name in names if not GUIDANCE.get(name).ignores_actions), names[0])
 
 
 def check_guidance(name: str, provided: Collection[str], task: str = "this task") -> GuidanceKind:

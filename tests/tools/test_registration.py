@@ -4,7 +4,8 @@ import pytest
 from pydantic.dataclasses import dataclass
 
 import guiderail
-from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.guidance.registry import GUIDANCE, default_guidance, register_guidance
 from guiderail.diagrams.hardware.driver import DRIVERS, Driver, register_driver
 from guiderail.diagrams.stations.registry import STATIONS, register_station
 from guiderail.diagrams.tasks.registry import TASKS, register_task
@@ -73,10 +74,9 @@ def test_registration_refuses_what_cannot_be_used(register, sentence):
 @pytest.fixture
 def restored():
     """Remove the entries that a test registers."""
-    before = [(registry, set(registry._entries)) for registry in (STATIONS, ENGINES)]
     yield
-    for registry, names in before:
-        for name in set(registry._entries) - names:
+    for registry in (STATIONS, ENGINES, GUIDANCE):
+        for name in {"a", "mine"} & set(registry._entries):
             del registry._entries[name], registry._origins[name]
 
 
@@ -92,3 +92,11 @@ def test_study_refuses_an_engine_that_is_none():
     register_engine("mine", build)
     with pytest.raises(InputError, match="the engine 'mine' must be an Engine, not None"):
         make_engine("mine")
+
+
+@pytest.mark.usefixtures("restored")
+def test_registration_does_not_change_the_defaults():
+    add_station()
+    register_guidance("a")(build)
+    assert EnvConfig.resolve("NarrowPassage", {}).station == "plane"
+    assert default_guidance(["a", "kgrl", "none"]) == "kgrl"
