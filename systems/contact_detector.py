@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_multibody import check_bodies
 
 ZERO, ONE = np.zeros(1), np.ones(1)  # the values of flags; converting lists takes longer than the check of a contact
 
@@ -38,18 +39,21 @@ class ContactDetector(LeafSystem):
 
     Args:
         plant: Finalized plant.
-        bodies: Bodies that must not touch `obstacles`.
-        obstacles: Obstacles; no body may be in both sets.
+        bodies: Bodies of the plant that must not touch `obstacles`, at least one.
+        obstacles: Obstacles, at least one; no body may be in both sets.
         period: Plant step [s], positive.
 
     Raises:
-        InputError: If the period is not positive, or a body is in both sets.
+        InputError: If the period is not positive, the plant is not finalized, a set is empty or has a body of another
+            plant, or a body is in both sets.
     """
 
     def __init__(
         self, plant: MultibodyPlant, bodies: Sequence[RigidBody], obstacles: Sequence[RigidBody], period: float
     ):
         super().__init__()
+        check_bodies(plant, "bodies", bodies)
+        check_bodies(plant, "obstacles", obstacles)
         indices, others = ({int(body.index()) for body in group} for group in (bodies, obstacles))
         if indices & others:
             raise InputError("a body can't collide with itself: bodies and obstacles overlap")

@@ -13,6 +13,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.sensor_disturbance import DRIFT_TIME
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.drake_multibody import check_bodies
 
 FRICTION_SPEED = 0.01  # joint speed at which friction has 76 % of its magnitude [rad/s]
 
@@ -66,8 +67,8 @@ class ExternalTorqueSensor(LeafSystem):
         period: Period of noise and drift [s], positive.
 
     Raises:
-        InputError: If the period, the noise or the drift is out of range or has the wrong shape. At an evaluation, if a
-            position is not finite.
+        InputError: If the period, the noise or the drift is out of range or has the wrong shape, the plant is not
+            finalized, or the body is the world or of another plant. At an evaluation, if a position is not finite.
     """
 
     def __init__(
@@ -75,6 +76,9 @@ class ExternalTorqueSensor(LeafSystem):
     ):
         super().__init__()
         check_period(period)
+        check_bodies(plant, "payload_body", [payload_body])
+        if payload_body.index() == plant.world_body().index():
+            raise InputError("payload_body is the world: give the body that carries the payload")
         n = plant.num_positions()
         self._noise, self._drift = np.array(noise, dtype=float), np.array(drift, dtype=float)
         for values in (self._noise, self._drift):

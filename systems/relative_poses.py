@@ -7,10 +7,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import transform_to_vector
+from guiderail.systems.support.drake_multibody import check_bodies, transform_to_vector
 
 
 class RelativePoses(LeafSystem):
@@ -35,13 +34,13 @@ class RelativePoses(LeafSystem):
         reference: Body R.
 
     Raises:
-        InputError: If there is no body.
+        InputError: If there is no body, the plant is not finalized, or a body is of another plant.
     """
 
     def __init__(self, plant: MultibodyPlant, bodies: Sequence[RigidBody], reference: RigidBody):
         super().__init__()
-        if not bodies:
-            raise InputError("relative poses need at least one body")
+        check_bodies(plant, "bodies", bodies)
+        check_bodies(plant, "reference", [reference])
         self._bodies = [int(body.index()) for body in bodies]
         self._reference = int(reference.index())
         self._body_poses_port = self.DeclareAbstractInputPort(

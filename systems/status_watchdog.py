@@ -12,7 +12,7 @@ from guiderail.models.control.joint_status import JointStatus, StatusLimits
 from guiderail.models.control.state_estimator import Estimate, EstimatorState, StateEstimator
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.drake_multibody import JointDynamics
+from guiderail.systems.support.drake_multibody import JointDynamics, check_plant
 
 
 class StatusWatchdog(LeafSystem):
@@ -58,6 +58,7 @@ class StatusWatchdog(LeafSystem):
         self, plant: MultibodyPlant, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float
     ):
         super().__init__()
+        check_plant(plant)
         self._estimator = StateEstimator(limits, torque_tolerance, period=period)
         self._dynamics, self._num_joints = JointDynamics(plant), plant.num_positions()
         n = self._num_joints

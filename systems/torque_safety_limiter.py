@@ -11,6 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import STATUS_FAULTS, Fault, damping_torque
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_multibody import check_plant
 
 # Indices into the discrete state: [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
 # last change to DAMPING or OFF in s; blend factor from 0 to 1].
@@ -136,6 +137,7 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float, can_hold: bool = False):
         super().__init__()
+        check_plant(plant)
         num_joints = plant.num_positions()
         if len(limits.velocity) != num_joints:
             raise InputError(f"an arm of {num_joints} joints needs as many limits, not {len(limits.velocity)}")

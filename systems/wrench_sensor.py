@@ -5,13 +5,14 @@ from pydrake.common.value import Value
 from pydrake.math import RotationMatrix
 from pydrake.multibody.math import SpatialAcceleration, SpatialForce, SpatialVelocity
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame, Joint, RigidBody
+from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.wrench import external_wrench
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.drake_multibody import check_bodies, check_plant
 
 
 class WrenchSensor(LeafSystem):
@@ -40,14 +41,15 @@ class WrenchSensor(LeafSystem):
     Args:
         plant: Finalized plant, connected to this system.
         wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
-        tool: Bodies on the child side of the wrist, welded together.
-        center: Center of compliance P, fixed to the first body of `tool`.
+        tool: Bodies on the child side of the wrist: its child first, and all bodies welded to it.
+        center: Center of compliance P, fixed to a body of `tool`.
         R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
         period: Sampling period [s], positive; ideally the plant's time step.
         time_constant: Time constant τ of the filter [s], not negative; 0 disables it.
 
     Raises:
-        InputError: If an argument is out of range, or the first body of `tool` is not the child of the wrist.
+        InputError: If an argument is out of range, of another type or plant, the first body of `tool` is not the child
+            of the wrist, `center` is not fixed to a body of it, or a body that is welded to it is missing.
     """
 
     def __init__(
@@ -63,8 +65,21 @@ class WrenchSensor(LeafSystem):
         super().__init__()
         if not 0.0 <= time_constant < np.inf:
             raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
-        if not tool or wrist.child_body().index() != tool[0].index():
+        check_bodies(plant, "tool", tool)
+        check_plant(plant, center=center)
+        if not isinstance(R_WAxes, RotationMatrix):
+            raise InputError(f"R_WAxes is a RotationMatrix, not {brief(R_WAxes)}")
+        if not isinstance(wrist, Joint) or wrist.GetParentPlant() is not plant:
+            raise InputError(f"a wrist is a joint of the plant, not {brief(wrist)}")
+        if wrist.child_body().index() != tool[0].index():
             raise InputError(f"the first body of a wrench sensor's tool must be the child of {wrist.name()}")
+        indices = {int(body.index()) for body in tool}
+        if int(center.body().index()) not in indices:
+            raise InputError(f"the center {center.name()} must be fixed to a body of a wrench sensor's tool")
+        missing = _welded_beyond(plant, wrist) - indices
+        if missing:
+            names = ", ".join(plant.get_body(BodyIndex(index)).name() for index in sorted(missing))
+            raise InputError(f"a wrench sensor's tool has all bodies that are welded to it: add {names}")
         nominal = plant.CreateDefaultContext()
         self._wrist = int(wrist.index())
         self._tool = int(tool[0].index())
@@ -127,6 +142,20 @@ class WrenchSensor(LeafSystem):
         )
         at_center = (self._tool_to_center @ torque_force).reshape(2, 3)
         return (at_center[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
+
+
+def _welded_beyond(plant: MultibodyPlant, wrist: Joint) -> set[int]:
+    """Return the indices of the child of the wrist and of all bodies that are welded to it on its side."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices() if index != wrist.index()]
+    welds = [
+        {int(joint.parent_body().index()), int(joint.child_body().index())}
+        for joint in joints
+        if isinstance(joint, WeldJoint)
+    ]
+    found = {int(wrist.child_body().index())}
+    while grown := set().union(*(weld for weld in welds if weld & found)) - found:
+        found |= grown
+    return found
 
 
 def _wrench_transform(R: np.ndarray, p: np.ndarray) -> np.ndarray:

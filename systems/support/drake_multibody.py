@@ -1,9 +1,11 @@
 """Conversion between poses and Drake's rigid transforms, and joint dynamics and limits of a plant."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import Frame
+from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context
 
 from guiderail.models.common.errors import InputError, brief
@@ -51,6 +53,22 @@ def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Fra
             raise InputError(f"{name} is the frame {frame.name()} of another plant: give a frame of this one")
     if fixed is not None and fixed.body() not in plant.GetBodiesWeldedTo(plant.world_body()):
         raise InputError(f"the target frame {fixed.name()} can move: give a frame that is fixed in the world")
+
+
+def check_bodies(plant: MultibodyPlant, what: str, bodies: Sequence[RigidBody]) -> None:
+    """Check a plant and a list of its bodies, the arguments of a system; `what` names the bodies.
+
+    Raises:
+        InputError: If `check_plant` refuses the plant, there is no body, or one is of another type or plant.
+    """
+    check_plant(plant)
+    if not isinstance(bodies, Sequence) or not bodies:
+        raise InputError(f"{what} is a list of at least one body of the plant, not {brief(bodies)}")
+    for body in bodies:
+        if not isinstance(body, RigidBody):
+            raise InputError(f"{what} has bodies of the plant, as plant.GetBodyByName returns, not {brief(body)}")
+        if body.GetParentPlant() is not plant:
+            raise InputError(f"{what} has the body {body.name()} of another plant: give a body of this one")
 
 
 def effort_limits(plant: MultibodyPlant) -> np.ndarray:

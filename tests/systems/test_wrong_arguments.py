@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
 
 from guiderail import systems
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
 from guiderail.models.templates import load_template
 
@@ -15,6 +16,8 @@ PERIOD = 0.02
 HOLE = {"hole": RigidTransform()}
 STIFFNESS = np.diag([600.0] * 3 + [25.0] * 3)
 LIMITS = np.array([20.0] * 3 + [2.0] * 3)
+ONES = (1.0,) * 6
+SAFETY = systems.SafetyLimits(ONES, ONES, ONES, decay_time=1.0)
 GAINS = systems.ImpedanceGains(STIFFNESS, LIMITS, posture=np.zeros(6))
 
 
@@ -27,9 +30,17 @@ def gantry(*, finalize=True):
         joint = plant.AddJoint(kind(f"joint{i}", parent.body_frame(), child.body_frame(), axis))
         plant.AddJointActuator(f"motor{i}", joint, 100.0)
         parent = child
+    hand = plant.AddRigidBody("hand", SpatialInertia.SolidSphereWithMass(0.1, 0.02))
+    plant.WeldFrames(parent.body_frame(), hand.body_frame())
     if finalize:
         plant.Finalize()
     return plant, parent
+
+
+def wrench_sensor(*, wrist=None, tool=None, center=None, axes=None):
+    axes = RotationMatrix() if axes is None else axes
+    tool = [TOOL, HAND] if tool is None else tool
+    return systems.WrenchSensor(PLANT, wrist or JOINT, tool, center or FRAME, axes, PERIOD, 0.1)
 
 
 def primitive(history=0):
@@ -73,6 +84,40 @@ def test_other_systems_check_plant_and_frames_too():
         systems.CartesianPositionController(PLANT, WORLD, OTHER_TOOL.body_frame(), posture=np.zeros(6))
     with pytest.raises(InputError, match="of another plant"):
         systems.JointTorqueWrench(PLANT, WORLD, OTHER_TOOL.body_frame(), period=PERIOD, time_constant=0.0)
+
+
+BODY, OTHER, RAW = PLANT.GetBodyByName("body0"), OTHER_TOOL, UNFINISHED_TOOL
+JOINT, HAND = PLANT.GetJointByName("joint5"), PLANT.GetBodyByName("hand")
+ZEROS = np.zeros(6)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: systems.ContactDetector(PLANT, [OTHER], [BODY], PERIOD), "the body body5 of another plant"),
+        (lambda: systems.ContactDetector(PLANT, [TOOL], [], PERIOD), "obstacles is a list of at least one body"),
+        (lambda: systems.ContactDetector(PLANT, TOOL, [BODY], PERIOD), "bodies is a list of at least one body"),
+        (lambda: systems.ContactDetector(UNFINISHED, [RAW], [RAW], PERIOD), "must be finalized"),
+        (lambda: systems.MeasuredPose(PLANT, OTHER, RigidTransform()), "the body body5 of another plant"),
+        (lambda: systems.MeasuredPose(PLANT, FRAME, RigidTransform()), "body has bodies of the plant"),
+        (lambda: systems.MeasuredPose(PLANT, TOOL, np.eye(4)), "X_WT is a RigidTransform"),
+        (lambda: systems.RelativePoses(PLANT, [FRAME], BODY), "bodies has bodies of the plant"),
+        (lambda: systems.RelativePoses(PLANT, [TOOL], OTHER), "reference has the body body5 of another plant"),
+        (lambda: systems.ExternalTorqueSensor(PLANT, OTHER, ZEROS, ZEROS, period=PERIOD), "of another plant"),
+        (lambda: systems.ExternalTorqueSensor(PLANT, WORLD.body(), ZEROS, ZEROS, period=PERIOD), "is the world"),
+        (lambda: systems.StatusWatchdog(UNFINISHED, StatusLimits(ONES), ONES, period=PERIOD), "must be finalized"),
+        (lambda: systems.TorqueSafetyLimiter(UNFINISHED, SAFETY, period=PERIOD), "must be finalized"),
+        (lambda: wrench_sensor(tool=[OTHER, HAND]), "tool has the body body5 of another plant"),
+        (lambda: wrench_sensor(tool=TOOL), "tool is a list of at least one body"),
+        (lambda: wrench_sensor(tool=[TOOL]), "welded to it: add hand"),
+        (lambda: wrench_sensor(wrist="joint5"), "a wrist is a joint of the plant, not 'joint5'"),
+        (lambda: wrench_sensor(center=WORLD), "the center world must be fixed to a body"),
+        (lambda: wrench_sensor(axes=RigidTransform()), "R_WAxes is a RotationMatrix"),
+    ],
+)
+def test_systems_refuse_wrong_bodies(build, message):
+    with pytest.raises(InputError, match=message):
+        build()
 
 
 @pytest.mark.parametrize("limits", [np.inf * LIMITS, "a", None])
