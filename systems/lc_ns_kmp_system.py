@@ -59,8 +59,8 @@ class LcNsKmpSystem(LeafSystem):
     Args:
         primitive: Primitive with O outputs and a history of P outputs.
         gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); None: ones.
-        period: Control period [s], positive. It must equal the period of the reference trajectory, otherwise the
-            motion is faster or slower than the demonstrations.
+        period: Control period [s], positive. It is not compared with the period of the reference trajectory: the
+            motion is faster or slower than the demonstrations if they differ (`ReferenceTrajectory.resampled`).
         shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
             (O,).
 
@@ -69,10 +69,10 @@ class LcNsKmpSystem(LeafSystem):
 
     Raises:
         InputError: If an argument has the wrong type, a gain has the wrong shape or is not finite, the period is not
-            positive or differs from that of the reference by more than 1 %, or the primitives in `shorter` do not have
-            different histories of 1 to P − 1 outputs and the constraints of `primitive`. At initialization, if
-            ``reference_window`` is connected and the primitives have different horizons. At an evaluation, if the
-            action, the history or the time is not finite, or no primitive has the selected history length.
+            positive, or the primitives in `shorter` do not have different histories of 1 to P − 1 outputs and the
+            constraints of `primitive`. At initialization, if ``reference_window`` is connected and the primitives
+            have different horizons. At an evaluation, if the action, the history or the time is not finite, or no
+            primitive has the selected history length.
     """
 
     def __init__(
