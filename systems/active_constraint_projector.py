@@ -7,6 +7,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import INSIDE, SharedControlTemplate
@@ -72,7 +73,7 @@ class ActiveConstraintProjector(LeafSystem):
         max_tracking_error: float = np.inf,
     ):
         super().__init__()
-        if not max_tracking_error > 0.0:
+        if not as_number(max_tracking_error, "max_tracking_error") > 0.0:
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
         self.frames = TemplateFrames(self, template, frames)

@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import norm
+from guiderail.models.common.arrays import as_number, as_numbers, norm
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
@@ -109,7 +109,7 @@ class CartesianPositionController(LeafSystem):
         num_joints = plant.num_positions()
         if num_joints < 6:
             raise InputError(f"a position controller needs an arm of at least six joints, not {num_joints}")
-        if not 0.0 <= posture_gain < np.inf:
+        if not 0.0 <= as_number(posture_gain, "posture_gain") < np.inf:
             raise InputError(
                 f"a position controller's posture gain must be finite and not negative, not {posture_gain}"
             )
@@ -121,7 +121,7 @@ class CartesianPositionController(LeafSystem):
             raise InputError(f"a position controller's posture must be finite joint positions, not {posture}")
         self._plant, self._target, self._tool_center = plant, target, tool_center
         self._period, self._speed_limits = period, speed_limits
-        self._posture, self._posture_gain = np.array(posture, dtype=float), posture_gain
+        self._posture, self._posture_gain = as_numbers(posture, "posture"), posture_gain
         self._position_limits = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
         self._velocity_limits = plant.GetVelocityLowerLimits(), plant.GetVelocityUpperLimits()
         self._parameters = DifferentialInverseKinematicsParameters(num_joints, num_joints)

@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
@@ -36,7 +37,7 @@ class CenterOfPressure(LeafSystem):
 
     def __init__(self, min_force: float):
         super().__init__()
-        if not 0.0 < min_force < np.inf:
+        if not 0.0 < as_number(min_force, "min_force") < np.inf:
             raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         self._center_of_pressure_port = declare.output(

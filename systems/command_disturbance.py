@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_whole
+from guiderail.models.common.arrays import as_number, as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -43,7 +43,7 @@ class CommandDisturbance(LeafSystem):
         size, delay = as_whole(size, "size of a command"), as_whole(delay, "delay of commands")
         if size < 1:
             raise InputError(f"a command has at least one number, not {size}")
-        if not 0.0 <= loss_probability < 1.0:
+        if not 0.0 <= as_number(loss_probability, "loss_probability") < 1.0:
             raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {loss_probability}")
         if delay < 0:
             raise InputError(f"the delay of commands is a number of periods from 0, not {delay}")

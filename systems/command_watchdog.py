@@ -2,6 +2,7 @@
 
 from pydrake.systems.framework import LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -43,6 +44,7 @@ class CommandWatchdog(LeafSystem):
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):
         super().__init__()
+        pose_size = as_whole(pose_size, "pose_size")
         if pose_size < 1:
             raise InputError(f"a pose has at least one coordinate, not {pose_size}")
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", pose_size)

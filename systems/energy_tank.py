@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.wrench import (
@@ -76,7 +76,7 @@ class EnergyTank(LeafSystem):
     ):
         super().__init__()
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
-        if not 0.0 < capacity < np.inf:
+        if not 0.0 < as_number(capacity, "capacity") < np.inf:
             raise InputError(f"an energy tank's capacity must be positive and finite, not {capacity} J")
         if not isinstance(bound, WrenchBound):
             raise InputError(f"an energy tank's bound must be a WrenchBound, not {brief(bound)}")

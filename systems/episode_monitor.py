@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, check_takes, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_takes, check_terms, output_getter
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
@@ -88,9 +88,10 @@ class EpisodeMonitor(LeafSystem):
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
         super().__init__()
+        self._of_task = f" of {task_name}" if task_name else ""
+        check_terms(terms, TerminationTerm, f"a monitor{self._of_task}")
         if not terms:
             raise InputError("a monitor needs at least one condition")
-        self._of_task = f" of {task_name}" if task_name else ""
         for term in terms:
             for function in filter(None, (term.condition, term.progress)):
                 check_takes(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")

@@ -80,7 +80,7 @@ class ExternalTorqueSensor(LeafSystem):
         if payload_body.index() == plant.world_body().index():
             raise InputError("payload_body is the world: give the body that carries the payload")
         n = plant.num_positions()
-        self._noise, self._drift = np.array(noise, dtype=float), np.array(drift, dtype=float)
+        self._noise, self._drift = as_numbers(noise, "noise"), as_numbers(drift, "drift")
         for values in (self._noise, self._drift):
             if values.shape != (n,) or not (np.isfinite(values) & (values >= 0.0)).all():
                 raise InputError(

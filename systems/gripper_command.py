@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -36,8 +37,8 @@ class GripperCommand(LeafSystem):
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float):
         super().__init__()
-        self._lower, self._upper = np.array(lower, dtype=float), np.array(upper, dtype=float)
-        opening = np.array(opening, dtype=float)
+        self._lower, self._upper = as_numbers(lower, "lower"), as_numbers(upper, "upper")
+        opening = as_numbers(opening, "opening")
         if not self._lower.shape == self._upper.shape == opening.shape or opening.ndim != 1:
             raise InputError("a gripper needs a lower limit, an upper limit and an opening for each of its joints")
         if not ((self._lower <= opening) & (opening <= self._upper)).all():

@@ -4,6 +4,7 @@ import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import MAX_SENDERS, Fault, Heartbeat
 from guiderail.systems.support import declarations as declare
@@ -42,7 +43,7 @@ class HeartbeatMonitor(LeafSystem):
 
     def __init__(self, *, period: float, timeout: float):
         super().__init__()
-        if not 0.0 < timeout < FORGET_TIME:
+        if not 0.0 < as_number(timeout, "timeout") < FORGET_TIME:
             raise InputError(f"the heartbeat timeout must be positive and less than {FORGET_TIME} s, not {timeout} s")
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())

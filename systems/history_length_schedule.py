@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_number, as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -55,11 +56,13 @@ class HistoryLengthSchedule(LeafSystem):
         super().__init__()
         if not len(lengths) or not all(length >= 1 and float(length).is_integer() for length in lengths):
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")
-        if not 0.0 <= release_threshold <= contact_threshold < np.inf:
+        contact_threshold = as_number(contact_threshold, "contact_threshold")
+        if not 0.0 <= as_number(release_threshold, "release_threshold") <= contact_threshold < np.inf:
             raise InputError(
                 f"contact must begin at a finite force and end at a force from 0 to that, not at {contact_threshold} N "
                 f"and {release_threshold} N"
             )
+        dwell_steps, wrench_size = as_whole(dwell_steps, "dwell_steps"), as_whole(wrench_size, "wrench_size")
         if dwell_steps < 1 or wrench_size < 1:
             raise InputError(f"dwell steps and wrench size must be at least 1, not {dwell_steps} and {wrench_size}")
         self._lengths = sorted({int(length) for length in lengths}, reverse=True)

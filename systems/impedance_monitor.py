@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.arrays import norm
+from guiderail.models.common.arrays import as_numbers, norm
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -39,7 +39,7 @@ class ImpedanceMonitor(LeafSystem):
 
     def __init__(self, limits: np.ndarray):
         super().__init__()
-        checked = np.array(limits, dtype=float)
+        checked = as_numbers(limits, "limits")
         if checked.shape != (6,) or not (checked > 0.0).all():
             raise InputError(f"an impedance monitor needs six positive limits, not {limits}")
         self._saturated = 0.999 * checked  # magnitudes from which a component counts as saturated

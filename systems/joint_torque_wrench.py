@@ -5,7 +5,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -63,8 +63,9 @@ class JointTorqueWrench(LeafSystem):
         damping: float = 1e-4,
     ):
         super().__init__()
-        if not 0.0 <= time_constant < np.inf or not 0.0 <= damping < np.inf:
+        if not all(0.0 <= as_number(value, "time_constant and damping") < np.inf for value in (time_constant, damping)):
             raise InputError("a wrench estimate's time constant and damping must be finite and not negative")
+        declare.check_period(period)
         check_plant(plant, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center = plant, target, tool_center

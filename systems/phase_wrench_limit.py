@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, approach_bound
 from guiderail.systems.support import declarations as declare
@@ -42,7 +43,8 @@ class PhaseWrenchLimit(LeafSystem):
 
     def __init__(self, limits: np.ndarray, max_rate: np.ndarray, *, period: float):
         super().__init__()
-        self._limits, rate = np.array(limits, dtype=float), np.array(max_rate, dtype=float)
+        declare.check_period(period)
+        self._limits, rate = as_numbers(limits, "limits"), as_numbers(max_rate, "max_rate")
         if self._limits.ndim != 2 or not len(self._limits) or self._limits.shape[1] != MAX_WRENCH_SIZE:
             raise InputError(f"the wrench limits of states are rows of {MAX_WRENCH_SIZE}, not {self._limits.shape}")
         if not ((self._limits >= 0.0) & (self._limits < np.inf)).all():

@@ -6,6 +6,7 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State, System
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 
@@ -62,14 +63,15 @@ class PolicySystem(LeafSystem):
         check_period(period)
         if not callable(policy):
             raise InputError(f"a policy is a function from an observation to an action, not {brief(policy)}")
+        action_size = as_whole(action_size, "action_size")
         if action_size < 1:
             raise InputError(f"a policy's action has at least one number, not {action_size}")
         self._policy = policy
         self._is_image = isinstance(observation, AbstractValue)
         if isinstance(observation, AbstractValue):
             self._observation_port = self.DeclareAbstractInputPort("observation", observation)
-        elif observation >= 1:
-            self._observation_port = self.DeclareVectorInputPort("observation", observation)
+        elif as_whole(observation, "the size of an observation") >= 1:
+            self._observation_port = self.DeclareVectorInputPort("observation", int(observation))
         else:
             raise InputError(f"a policy's observation has at least one number, not {observation}")
         self._action = self.DeclareDiscreteState(action_size)

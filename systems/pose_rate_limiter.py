@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_difference
 from guiderail.systems.support import declarations as declare
@@ -43,7 +43,8 @@ class PoseRateLimiter(LeafSystem):
 
     def __init__(self, *, period: float, speed: float = 0.25, angular_speed: float = 1.5):
         super().__init__()
-        if not 0.0 < speed < np.inf or not 0.0 < angular_speed < np.inf:
+        declare.check_period(period)
+        if not all(0.0 < as_number(limit, "a speed limit") < np.inf for limit in (speed, angular_speed)):
             raise InputError(f"the speed limits must be positive and finite, not {speed} m/s and {angular_speed} rad/s")
         self._step, self._angular_step = speed * period, angular_speed * period
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)

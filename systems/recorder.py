@@ -57,9 +57,9 @@ class Recorder(LeafSystem):
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
         super().__init__()
         num_samples = as_whole(num_samples, "num_samples of a recorder")
+        self._signals = SignalPorts(self, signals)
         if not signals or num_samples < 1:
             raise InputError("a recorder needs at least one signal, and room for one sample")
-        self._signals = SignalPorts(self, signals)
         self._sizes = {name: self._signals.port(name).size() for name in signals}
         self._width, self._num_samples, self._period = sum(self._sizes.values()), num_samples, period
         self._count = self.DeclareDiscreteState(1)

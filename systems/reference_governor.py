@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound, check_spring_damper, governed_error
@@ -49,7 +50,7 @@ class ReferenceGovernor(LeafSystem):
         super().__init__()
         check_period(step)
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "a reference governor")
-        if not 0.0 < mass < np.inf:
+        if not 0.0 < as_number(mass, "mass") < np.inf:
             raise InputError(f"the moving mass must be positive and finite, not {mass} kg")
         self._mass, self._step, self._bound = mass, step, bound
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", POSE_SIZE)

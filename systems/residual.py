@@ -3,6 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -34,7 +35,7 @@ class Residual(LeafSystem):
 
     def __init__(self, gain: np.ndarray):
         super().__init__()
-        self._gain = np.array(gain, dtype=float)
+        self._gain = as_numbers(gain, "gain")
         if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():
             raise InputError(f"a residual's gain is one finite number per output, not {gain}")
         self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, check_takes, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_takes, check_terms, output_getter
 
 
 @dataclass(frozen=True)
@@ -58,9 +58,8 @@ class RewardSystem(LeafSystem):
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
         super().__init__()
         self._of_task = f" of {task_name}" if task_name else ""
-        if not (isinstance(terms, Sequence) and all(isinstance(term, RewardTerm) for term in terms)):
-            raise InputError(f"a reward{self._of_task} needs a list of reward terms, not {brief(terms)}")
-        names, self._terms = [term.name for term in terms], tuple(terms)
+        check_terms(terms, RewardTerm, f"a reward{self._of_task}")
+        self._terms, names = tuple(terms), [term.name for term in terms]
         are_words = all(isinstance(name, str) and name not in ("", "reward") for name in names)
         if not names or not are_words or len(set(names)) < len(names):
             raise InputError(

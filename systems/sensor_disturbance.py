@@ -3,7 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -56,7 +56,7 @@ class SensorDisturbance(LeafSystem):
         configuration_size: int = 0,
     ):
         super().__init__()
-        self._noise = np.array(noise, dtype=float)
+        self._noise = as_numbers(noise, "noise")
         if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
             raise InputError(f"a sensor's noise is a standard deviation for each of its numbers, not {noise}")
         if not (is_whole(delay, 0) and is_whole(configuration_size, 0)):
@@ -66,8 +66,8 @@ class SensorDisturbance(LeafSystem):
             )
         delay, configuration_size = int(delay), int(configuration_size)
         size, self._delay = len(self._noise), delay
-        self._drift = np.zeros(size) if drift is None else np.array(drift, dtype=float)
-        self._resolution = np.zeros(size) if resolution is None else np.array(resolution, dtype=float)
+        self._drift = np.zeros(size) if drift is None else as_numbers(drift, "drift")
+        self._resolution = np.zeros(size) if resolution is None else as_numbers(resolution, "resolution")
         for name, values in (("drift", self._drift), ("resolution", self._resolution)):
             if not _are_magnitudes(values, (size,)):
                 raise InputError(f"a sensor's {name} is a number from 0 for each of its numbers, not {values}")

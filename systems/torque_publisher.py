@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
+from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.declarations import check_period, input_getter
 
@@ -46,6 +47,7 @@ class TorquePublisher(LeafSystem):
     ):
         super().__init__()
         check_period(period)
+        num_joints = as_whole(num_joints, "num_joints")
         if num_joints < 1:
             raise InputError(f"torques are sent to at least one joint, not {num_joints}")
         self._write, self._hold = write, hold

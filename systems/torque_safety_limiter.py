@@ -137,6 +137,7 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def __init__(self, plant: MultibodyPlant, limits: SafetyLimits, *, period: float, can_hold: bool = False):
         super().__init__()
+        declare.check_period(period)
         check_plant(plant)
         num_joints = plant.num_positions()
         if len(limits.velocity) != num_joints:

@@ -8,6 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.wrench import external_wrench
 from guiderail.systems.support import declarations as declare
@@ -63,7 +64,8 @@ class WrenchSensor(LeafSystem):
         time_constant: float,
     ):
         super().__init__()
-        if not 0.0 <= time_constant < np.inf:
+        declare.check_period(period)
+        if not 0.0 <= as_number(time_constant, "time_constant") < np.inf:
             raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
         check_bodies(plant, "tool", tool)
         check_plant(plant, center=center)

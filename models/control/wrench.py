@@ -12,7 +12,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from guiderail.models.common.arrays import cross, is_finite, norm
+from guiderail.models.common.arrays import as_numbers, cross, is_finite, norm
 from guiderail.models.common.errors import InputError, brief
 
 POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench, and vice versa
@@ -248,7 +248,7 @@ def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) 
     Raises:
         InputError: If a shape is wrong, a stiffness is not positive, a damping is negative, or one is not finite.
     """
-    K, D = np.array(stiffness, dtype=float), np.array(damping, dtype=float)
+    K, D = as_numbers(stiffness, "stiffness"), as_numbers(damping, "damping")
     if not K.shape == D.shape == (6,) or not ((K > 0.0) & (D >= 0.0) & np.isfinite(K) & np.isfinite(D)).all():
         raise InputError(f"{owner} needs six positive stiffnesses and six dampings, none negative, all finite")
     return K, D

@@ -40,9 +40,12 @@ class SignalPorts:
 
     def __init__(self, system: LeafSystem, *signals: Mapping[str, int]):
         sizes: dict[str, int] = {}
+        for mapping in signals:
+            if not isinstance(mapping, Mapping):
+                raise InputError(f"signals are sizes by name, such as {{'pose': 6}}, not {brief(mapping)}")
         for name, size in (item for mapping in signals for item in mapping.items()):
-            if not name:
-                raise InputError("a signal needs a name, not ''")
+            if not (isinstance(name, str) and name):
+                raise InputError(f"a signal needs a name, not {brief(name)}")
             size = as_whole(size, f"the size of signal '{name}'")
             if size < 1:
                 raise InputError(f"signal '{name}' needs a size of at least 1, not {size}")
@@ -77,6 +80,12 @@ def get_signal_input_port(self: Any, name: str) -> InputPort:
         InputError: If there is no such signal.
     """
     return self._signals.port(name)
+
+
+def check_terms(terms: Sequence[Any], kind: type, owner: str) -> None:
+    """Raise an `InputError` unless `terms` are a sequence of a `kind` of terms; `owner` has the terms."""
+    if not isinstance(terms, Sequence) or not all(isinstance(term, kind) for term in terms):
+        raise InputError(f"{owner} needs a list of {kind.__name__} objects, not {brief(terms)}")
 
 
 def check_takes(function: Callable[..., Any], names: Mapping[str, int], what: str) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 
@@ -31,7 +31,8 @@ class CommandValidity:
     """
 
     def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
-        if not 0.0 < timeout < np.inf:
+        declare.check_period(period)
+        if not 0.0 < as_number(timeout, "timeout") < np.inf:
             raise InputError(f"the timeout of commands must be positive and finite, not {timeout} s")
         self._desired_pose, self._command_time = desired_pose, command_time
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout

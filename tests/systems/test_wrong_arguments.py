@@ -37,10 +37,10 @@ def gantry(*, finalize=True):
     return plant, parent
 
 
-def wrench_sensor(*, wrist=None, tool=None, center=None, axes=None):
+def wrench_sensor(*, wrist=None, tool=None, center=None, axes=None, period=PERIOD, time_constant=0.1):
     axes = RotationMatrix() if axes is None else axes
     tool = [TOOL, HAND] if tool is None else tool
-    return systems.WrenchSensor(PLANT, wrist or JOINT, tool, center or FRAME, axes, PERIOD, 0.1)
+    return systems.WrenchSensor(PLANT, wrist or JOINT, tool, center or FRAME, axes, period, time_constant)
 
 
 def primitive(history=0):
@@ -174,3 +174,30 @@ def test_primitive_system_refuses_wrong_arguments(arguments, message):
 def test_history_refuses_sizes_beyond_its_limit(outputs, length):
     with pytest.raises(InputError, match="at most 1000000 numbers"):
         systems.HistoryBuffer(outputs, length, PERIOD)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: systems.RewardSystem(lambda pose: 0.0), "a reward needs a list of RewardTerm objects"),
+        (lambda: systems.RewardSystem([lambda pose: 0.0]), "a reward needs a list of RewardTerm objects"),
+        (lambda: systems.EpisodeMonitor(["success"], PERIOD), "a monitor needs a list of TerminationTerm objects"),
+        (lambda: systems.Recorder(["pose"], 4, PERIOD), "signals are sizes by name"),
+        (lambda: systems.Recorder({1: 6}, 4, PERIOD), "a signal needs a name, not 1"),
+        (lambda: systems.GripperCommand("a", ONES, ONES, period=PERIOD), "lower is not an array of numbers"),
+        (lambda: systems.ImpedanceMonitor({}), "limits is not an array of numbers"),
+        (lambda: systems.Residual("a"), "gain is not an array of numbers"),
+        (lambda: systems.SensorDisturbance(PERIOD, "a"), "noise is not an array of numbers"),
+        (lambda: systems.CommandWatchdog(PERIOD, timeout=None), "timeout must be a number, not None"),
+        (lambda: systems.CommandWatchdog("a"), "a system's period must be a number, not 'a'"),
+        (lambda: systems.CommandWatchdog(PERIOD, pose_size="6"), "pose_size must be a whole number"),
+        (lambda: systems.PoseRateLimiter(period=None), "a system's period must be a number, not None"),
+        (lambda: systems.HistoryLengthSchedule([1], PERIOD, dwell_steps=np.nan), "dwell_steps must be a whole"),
+        (lambda: wrench_sensor(period="a"), "a system's period must be a number, not 'a'"),
+        (lambda: wrench_sensor(time_constant=None), "time_constant must be a number, not None"),
+        (lambda: systems.PolicySystem(lambda seen: seen, None, 2, PERIOD), "the size of an observation must be"),
+    ],
+)
+def test_systems_refuse_arguments_of_another_type(build, message):
+    with pytest.raises(InputError, match=message):
+        build()
