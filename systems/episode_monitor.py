@@ -113,7 +113,7 @@ class EpisodeMonitor(LeafSystem):
         signals = self._signals.eval(context)
         state = context.get_discrete_state().value(self._state).copy()
         for i, term in enumerate(self._terms):
-            inputs = {name: signals[name] for name in term.inputs}
+            inputs = {name: signals[name].copy() for name in term.inputs}
             if term.progress is not None:
                 progress = float(term.progress(**inputs))
                 if progress > state[2 * i + 1] + term.min_progress:

@@ -106,7 +106,8 @@ class RewardSystem(LeafSystem):
         return total
 
     def _value(self, term: RewardTerm, signals: Mapping[str, np.ndarray]) -> float:
-        value = term.value(**{name: signals[name] for name in term.inputs})
+        # Copies: a function that changes its arguments must not change those of the next term.
+        value = term.value(**{name: signals[name].copy() for name in term.inputs})
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "fiub":
             raise InputError(f"reward term {term.name!r}{self._of_task} must be one number, and it is {brief(value)}")

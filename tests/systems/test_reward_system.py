@@ -61,6 +61,14 @@ def test_each_term_is_evaluated_once_for_all_ports():
     assert len(calls) == 1
 
 
+def test_term_that_changes_its_argument_does_not_affect_others():
+    changed = RewardTerm("changed", {"u": 1}, lambda u: u.fill(9.0) or 0.0)
+    system = RewardSystem([changed, RewardTerm("u", {"u": 1}, lambda u: u[0])])
+    context = system.CreateDefaultContext()
+    system.get_signal_input_port("u").FixValue(context, [2.0])
+    assert system.get_reward_output_port().Eval(context) == [2.0]
+
+
 @pytest.mark.parametrize(
     "terms",
     [
