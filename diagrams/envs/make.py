@@ -32,7 +32,7 @@ from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.diagrams.stations.disturbances import disturbed
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import StationKind
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
@@ -78,13 +78,23 @@ def make_station(task: Task) -> Station:
 
 
 def _checked_builder(kind: StationKind, workcell: Any, arguments: Mapping[str, Any]) -> Callable[..., Station]:
-    """Return a builder with its arguments bound, which raises an InputError unless it builds a `Station`."""
+    """Return a builder with its arguments bound, which raises an InputError unless it builds a complete `Station`."""
     build = partial(kind.build, workcell, **arguments)
+    try:
+        inspect.signature(kind.build).bind_partial(workcell, **arguments)
+    except TypeError as error:
+        raise InputError(f"station={kind.name!r} is built from a workcell and its options: {error}") from None
 
     def checked(**more: Any) -> Station:
         station = build(**more)
         if not isinstance(station, Station):
             raise InputError(f"station={kind.name!r} must build a Station, not {brief(station)}")
+        missing = [name for name in INPUTS if not station.HasInputPort(name)]
+        missing += [name for name in OUTPUTS if not station.HasOutputPort(name)]
+        if missing:
+            raise InputError(f"station={kind.name!r} lacks the port {', '.join(missing)}: export it")
+        if type(station).set_pose is Station.set_pose:
+            raise InputError(f"station={kind.name!r} lacks the method set_pose, which a reset calls")
         return station
 
     return update_wrapper(checked, build)

@@ -7,7 +7,9 @@ import guiderail
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.guidance.registry import GUIDANCE, default_guidance, register_guidance
 from guiderail.diagrams.hardware.driver import DRIVERS, Driver, register_driver
+from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.registry import STATIONS, register_station
+from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BASE_POLICIES, register_base_policy
@@ -84,6 +86,30 @@ def restored():
 def test_environment_refuses_a_station_that_is_none():
     add_station()
     with pytest.raises(InputError, match="station='mine' must build a Station, not None"):
+        guiderail.make_env("NarrowPassage", guidance="kgrl", station="mine")
+
+
+class NoPorts(Station):
+    def __init__(self, workcell):
+        super().__init__()
+
+
+class NoReset(PlaneStation):
+    set_pose = Station.set_pose
+
+
+@pytest.mark.usefixtures("restored")
+@pytest.mark.parametrize(
+    ("builder", "message"),
+    [
+        (NoPorts, "station='mine' lacks the port desired_pose, command_time, pose, wrench"),
+        (NoReset, "station='mine' lacks the method set_pose"),
+        (lambda: None, "station='mine' is built from a workcell and its options: too many positional arguments"),
+    ],
+)
+def test_environment_refuses_a_station_that_lacks_a_part(builder, message):
+    add_station(builder=builder)
+    with pytest.raises(InputError, match=message):
         guiderail.make_env("NarrowPassage", guidance="kgrl", station="mine")
 
 
