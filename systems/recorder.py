@@ -71,7 +71,12 @@ class Recorder(LeafSystem):
     get_num_recorded_output_port = output_getter("num_recorded", "number of samples so far, (1,)")
 
     def recording(self, context: Context) -> Recording:
-        """Return a copy of the samples so far; `context` is this system's."""
+        """Return a copy of the samples so far; `context` is this system's.
+
+        Raises:
+            RuntimeError: If it is the context of another system or the root context.
+        """
+        self.ValidateContext(context)
         count = int(context.get_discrete_state().value(self._count)[0])
         samples = context.get_discrete_state().value(self._samples).reshape(-1, self._width)[:count]
         ends = np.cumsum(list(self._sizes.values()))

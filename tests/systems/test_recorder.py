@@ -38,6 +38,12 @@ def test_sample_contains_a_command_and_its_result(ramp):
     np.testing.assert_allclose(recording.times, [0, PERIOD, 2 * PERIOD])
 
 
+def test_recording_refuses_the_root_context(ramp):
+    simulator, recorder = ramp
+    with pytest.raises(RuntimeError, match="Use GetMyContextFromRoot"):
+        recorder.recording(simulator.get_context())
+
+
 @pytest.mark.parametrize("period", [0.02, 0.1, 1 / 3, 0.007])
 def test_each_command_is_recorded_exactly_once(period):
     builder = DiagramBuilder()
