@@ -10,9 +10,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context, Diagram, OutputPort
+from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
 
 from guiderail.diagrams.envs.scene import View
+from guiderail.models.common.arrays import as_number, is_whole
+from guiderail.models.common.errors import InputError
 
 PORTS = (
     "observation",
@@ -116,8 +118,9 @@ class TaskDiagram:
         declaration: `Task` that the diagram was built from, if there is one.
 
     Raises:
-        ValueError: If the diagram lacks a port, `control_period` or `num_steps` is not positive, or the size of a
-            symmetry does not match the observation and the action.
+        InputError: If the diagram lacks a port, the size of the observation does not match its space,
+            `control_period` is not positive, `num_steps` is not a positive whole number, or the size of a symmetry does
+            not match the observation and the action.
     """
 
     diagram: Diagram
@@ -143,12 +146,15 @@ class TaskDiagram:
         if not self.diagram.HasInputPort("action"):
             missing.append("action")
         if missing:
-            raise ValueError(f"the task's diagram {self.diagram.get_name()!r} exports no port {', '.join(missing)}")
-        if self.num_steps < 1 or not self.control_period > 0:
-            raise ValueError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
+            raise InputError(f"the task's diagram {self.diagram.get_name()!r} exports no port {', '.join(missing)}")
+        port, shape = self.diagram.GetOutputPort("observation"), self.observation_space.shape
+        if port.get_data_type() == PortDataType.kVectorValued and shape != (port.size(),):
+            raise InputError(f"the observation has {port.size()} numbers, and observation_space the shape {shape}")
+        if not is_whole(self.num_steps, 1) or not as_number(self.control_period, "control_period") > 0:
+            raise InputError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
         for symmetry in (self.symmetry, self.near_symmetry):
             if symmetry is not None and (
                 symmetry.observations.shape[1:] != 2 * self.observation_space.shape
                 or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
             ):
-                raise ValueError("a symmetry permutes every observed number and every action")
+                raise InputError("a symmetry permutes every observed number and every action")

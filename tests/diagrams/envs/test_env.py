@@ -1,5 +1,7 @@
 """Reset and step of `DiagramEnv`, on a task so small that every number is known."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -434,6 +436,19 @@ def test_a_task_that_lacks_a_port_is_refused_by_name():
     builder.ExportOutput(toy.GetOutputPort("reward"), "reward")
     with pytest.raises(ValueError, match="observation"):
         TaskDiagram(builder.Build(), PERIOD, 3, gymnasium.spaces.Box(-1, 1, (4,)), (), ())
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"observation_space": gymnasium.spaces.Box(-1, 1, (5,))}, "the observation has 4 numbers"),
+        ({"num_steps": 2.5}, "a task can't last 2.5 steps"),
+        ({"control_period": None}, "control_period must be a number, not None"),
+    ],
+)
+def test_task_diagram_refuses_arguments_that_do_not_fit(wrong, message):
+    with pytest.raises(InputError, match=message):
+        replace(make().task, **wrong)
 
 
 def test_multiples_of_an_exact_period_are_exact():
