@@ -332,7 +332,10 @@ class DiagramEnv(DrakeGymEnv):
 
     def _advance(self) -> None:
         """Advance to the end of the next control step, computed from the count because a sum of periods drifts."""
-        self.simulator.AdvanceTo((self._control_steps + 1) * self.task.control_period)
+        end, time = (self._control_steps + 1) * self.task.control_period, self.simulator.get_context().get_time()
+        if time > end:  # Drake would end the process
+            raise InputError(f"the simulator was advanced by hand to {time:g} s: advance it by step() only")
+        self.simulator.AdvanceTo(end)
 
     def render(self) -> Any:
         """Return an (h, w, 3) image of uint8 for "rgb_array"; publish to Meshcat for "human"."""

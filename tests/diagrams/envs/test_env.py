@@ -438,6 +438,14 @@ def test_a_task_that_lacks_a_port_is_refused_by_name():
         TaskDiagram(builder.Build(), PERIOD, 3, gymnasium.spaces.Box(-1, 1, (4,)), (), ())
 
 
+def test_step_refuses_a_simulator_that_was_advanced_past_it():
+    env = make()
+    env.reset(seed=0)
+    env.simulator.AdvanceTo(3 * PERIOD)
+    with pytest.raises(InputError, match="advance it by step"):
+        env.step([0.0])
+
+
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
