@@ -100,6 +100,25 @@ def test_peers_of_the_hard_clamp():
     assert table["max_commanded_violation"].max() <= TOLERANCE
 
 
+def test_peers_of_the_hard_clamp_without_the_force_bound():
+    study = "peers_grid_clamp_hard_unbounded"
+    methods = {m: rows_of(study, m) for m in ("sct", "sct_alone", "residual", "policy_decorator", "crossq", "droq")}
+    more = {m: rows_of(study, f"{m}_400") for m in ("residual", "policy_decorator")}
+    assert all(len(rows) == 10 for rows in (*methods.values(), *more.values()))
+    mean = {m: round(100 * rows["success_rate"].mean()) for m, rows in methods.items()}
+    assert (mean["sct"], mean["policy_decorator"], mean["residual"]) == (98, 56, 39)
+    assert (methods["sct_alone"]["success_rate"] == 0.0).sum() == 5
+    assert [round(100 * rows["success_rate"].mean()) for rows in more.values()] == [93, 95]
+    stopped = {m: int(rows["training_ended_in_collision"].sum()) for m, rows in methods.items()}
+    assert stopped.pop("sct") == 82
+    assert stopped.pop("sct_alone") == 145
+    assert (min(stopped.values()), max(stopped.values())) == (510, 564)
+    assert [int(rows["training_ended_in_collision"].sum()) for rows in more.values()] == [1495, 1279]
+    assert methods["sct"]["ended_in_collision"].sum() == 0
+    assert [int(rows["ended_in_collision"].sum()) for rows in more.values()] == [67, 51]
+    assert read_table(RESULTS / f"{study}.csv")["max_commanded_violation"].max() <= TOLERANCE
+
+
 def test_bounded_force_makes_the_hard_clamp_easy():
     """docs/results.md: a search ends no episode, so random actions succeed within the time and residual RL learns."""
     methods = {method: rows_of("grid_clamp_hard", method) for method in ("sct", "residual", "none")}
