@@ -120,7 +120,7 @@ def _evaluate(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 def _outcome(rows: pd.DataFrame) -> str:
     """Return the success rate and the mean return of held-out episodes as text."""
     success, total, cost = (rows[name].mean() for name in ("success", "return", "reward_obstacle_cost"))
-    return f"{success:.0%} reach the goal, return {total:.1f}, {cost:+.1f} of it from the obstacle"
+    return f"{success:.0%} reach the goal, return {total:.1f}, {cost:+.1f} reward from the obstacle"
 
 
 def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
@@ -134,7 +134,7 @@ def _draw(out: Path, before: pd.DataFrame, after: pd.DataFrame) -> Path:
     rows = RunFolder(out).episodes()
     episodes = np.arange(1, len(rows) + 1)
     curve.plot(episodes, rows["return"], "o-", markersize=3, color=color("skgrl"), label="return")
-    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="of it from the obstacle")
+    curve.plot(episodes, rows["reward_obstacle_cost"], color="saddlebrown", label="reward from the obstacle")
     curve.axhline(before["return"].mean(), color="black", linewidth=0.8, linestyle=":", label="return before learning")
     curve.set(xlabel="training episode")
     curve.legend(frameon=False, fontsize=8)
