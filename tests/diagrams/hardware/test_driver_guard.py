@@ -322,3 +322,18 @@ def test_command_of_a_pose_driver_that_raises_is_a_failure(method):
     getattr(guard, method)(*[None] * {"configure": 1, "write_pose": 2, "stop": 0}[method])
     assert guard.command_error == f"{method} raised OSError: cable unplugged"
     assert [guard.take_failure(), guard.take_failure()] == [True, False]
+
+
+def test_a_guard_that_forgets_its_errors_reports_no_failure_and_no_recovery():
+    driver = NoisyDriver()
+    guard = driver.guard
+    for _ in range(2):
+        assert (guard.take_failure(), guard.take_recovery()) == (False, False)
+        driver.write = lambda torque, time: 1 / 0
+        guard.write(np.zeros(7), 0.0)
+        guard.forget_errors()
+        del driver.write
+        guard.write(np.zeros(7), 0.0)
+        guard.receive()
+        assert guard.read() is not MALFORMED_STATUS
+    assert (guard.take_failure(), guard.take_recovery()) == (False, False)

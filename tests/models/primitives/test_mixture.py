@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,8 +8,16 @@ import pytest
 from guiderail.diagrams.tasks.bnc_connector import task as connector
 from guiderail.diagrams.tasks.narrow_passage import task as passage
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations
-from guiderail.models.primitives.mixture import FIELDS, Mixture, digest, fit_mixture, fit_new_mixture, regress
+from guiderail.models.primitives import Demonstrations, mixture
+from guiderail.models.primitives.mixture import (
+    FIELDS,
+    Mixture,
+    digest,
+    fit_mixture,
+    fit_new_mixture,
+    information_criteria,
+    regress,
+)
 
 PACKAGED = [(path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()]
 PACKAGED.append((passage.demonstrations.PATH, passage.COMPONENTS))
@@ -62,9 +71,9 @@ def test_regression_returns_the_moments_of_the_mixture():
 def test_regression_extrapolates_the_most_likely_component():
     """If every density underflows, the mean continues along the line of one component."""
     times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
-    mixture = fit_mixture(times, outputs, components=20, seed=0)
+    fitted = fit_mixture(times, outputs, components=20, seed=0)
     far = np.array([-300.0, 300.0, 400.0])
-    means, covariances = regress(mixture, far)
+    means, covariances = regress(fitted, far)
     assert np.isfinite(means).all()
     assert (covariances[:, 0, 0] > 0).all()
     assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
@@ -82,3 +91,32 @@ def test_fit_mixture_selects_the_better_number_of_components():
     rng = np.random.default_rng(0)
     outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
     assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2
+
+
+def fit_with_criteria(monkeypatch, criteria):
+    """Replace the fit by one that only has the given criterion for each number of components."""
+    fits = [
+        SimpleNamespace(bic=lambda _, c=c: c, weights_=n, means_=n, covariances_=n) for n, c in enumerate(criteria, 1)
+    ]
+    monkeypatch.setattr(mixture, "_fit", lambda data, phase, count, seed: fits[count - 1])
+
+
+def test_search_ends_after_two_numbers_that_are_worse_than_the_best_of_all_before(monkeypatch):
+    criteria = [5.0, 4.0, 3.0, 3.5, 3.6, 1.0]
+    fit_with_criteria(monkeypatch, criteria)
+    found = information_criteria(np.arange(20.0), np.zeros((2, 20, 1)), range(1, 7), 0)
+    assert found == dict(zip(range(1, 6), criteria, strict=False))
+
+
+@pytest.mark.parametrize(("criteria", "expected"), [((1.0, 2.0, 3.0), 1), (range(50, 0, -1), 20)])
+def test_one_to_twenty_components_are_searched(criteria, expected, monkeypatch):
+    fit_with_criteria(monkeypatch, criteria)
+    assert fit_new_mixture(np.arange(100.0), np.zeros((2, 100, 1)), None, 0).weights == expected
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_seeds_of_scikit_learn_have_32_bits(seed):
+    times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
+    assert len(fit_mixture(times, outputs, components=1, seed=2**32 - 1).weights) == 1
+    with pytest.raises(InputError, match="seed must be from 0 to"):
+        fit_mixture(times, outputs, components=1, seed=seed)
