@@ -1,8 +1,10 @@
 """A driver without messages: a robot in the same process that implements `read` and `write` only."""
 
 import numpy as np
+from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.driver import Driver
+from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.joint_status import JointStatus
@@ -36,3 +38,12 @@ class DirectDriver(Driver):
 
     def elapse(self):
         self.positions, self.time = self.positions + self.period * self.velocities, self.time + self.period
+
+
+def started(driver):
+    """Return a station of a connector's workcell on a driver, started at `START`, and its simulator."""
+    station = HardwareStation(BncWorkcell(), driver)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    station.start(simulator)
+    return station, simulator

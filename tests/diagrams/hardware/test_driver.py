@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from direct_driver import START, DirectDriver
+from direct_driver import START, DirectDriver, started
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
@@ -50,10 +50,7 @@ def test_station_moves_a_robot_by_read_and_write():
 
 def test_wall_clock_steps_once_per_new_status():
     driver = DirectDriver()
-    station, clock = HardwareStation(BncWorkcell(), driver), WallClock(driver)
-    simulator = Simulator(station)
-    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
-    station.start(simulator)
+    (station, simulator), clock = started(driver), WallClock(driver)
     clock.begin()
     driver.elapse()
     before = driver.num_statuses

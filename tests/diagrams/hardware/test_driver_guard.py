@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from direct_driver import START, DirectDriver
+from direct_driver import START, DirectDriver, started
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
@@ -264,10 +264,7 @@ def test_start_raises_when_a_read_raises(method):
 
 def test_wall_clock_steps_when_receiving_raises():
     driver = DirectDriver()
-    station, clock = HardwareStation(BncWorkcell(), driver), WallClock(driver)
-    simulator = Simulator(station)
-    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
-    station.start(simulator)
+    (station, simulator), clock = started(driver), WallClock(driver)
     calls = []
 
     def receive(timeout=0.0):

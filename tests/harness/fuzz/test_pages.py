@@ -73,7 +73,7 @@ def expected_inputs(messages, slider, gamepad):
                 numbers = all(type(value) in (int, float) and math.isfinite(value) for value in values)
                 if type(index) is int and 0 <= index < 64 and numbers:
                     gamepad = [max(-1.0, min(1.0, float(value))) for value in event["gamepad"]["axes"]]
-        except Exception:
+        except Exception:  # the page ignores every malformed message, and random bytes fail in any way
             continue
     return clicks, slider, gamepad
 

@@ -41,7 +41,7 @@ def test_a_digest_names_all_arguments():
 
 
 def test_packaged_demonstrations_need_no_scikit_learn():
-    """Importing it takes 0.5 s and 80 MiB of every training process."""
+    """Importing it takes 0.5 s and 60 MiB of every training process."""
     program = (
         "import sys; from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory as connector; "
         "from guiderail.diagrams.tasks.narrow_passage.task import reference_trajectory as passage; "
