@@ -4,7 +4,7 @@ from pathlib import Path
 
 from guiderail.tools.files import write_atomically
 from research.command import Parser, run_program
-from research.results.methods import readme_table, update_readme
+from research.results.methods import README_COLUMNS, hard_tasks_table, replace_table
 from research.results.page import store, write_pages
 
 TABLES = Path(__file__).parent
@@ -16,7 +16,8 @@ def main(arguments: list[str]) -> None:
     parser = Parser(
         "results",
         "Store the tables of finished studies and figures, and write the pages of results. Without --out, the tables "
-        "are in research/results and the pages in docs/results, and the table in README.md is updated.",
+        "are in research/results and the pages in docs/results, and the tables of hard tasks in README.md and "
+        "docs/results.md are updated.",
         "studies reproductions",
     )
     parser.add_argument(
@@ -33,9 +34,12 @@ def main(arguments: list[str]) -> None:
     for page in write_pages(tables, args.out or ROOT / "docs" / "results"):
         print(page)
     if args.out is None:
-        readme = ROOT / "README.md"
-        write_atomically(readme, update_readme(readme.read_text("utf-8"), readme_table(tables)).encode())
-        print(readme)
+        for page, table in (
+            (ROOT / "README.md", hard_tasks_table(tables, README_COLUMNS)),
+            (ROOT / "docs" / "results.md", hard_tasks_table(tables)),
+        ):
+            write_atomically(page, replace_table(page.read_text("utf-8"), table).encode())
+            print(page)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Methods of every task in one table, and the table of the README."""
+"""Tables of methods: one for each task, and the hard tasks in one table."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ COLUMNS = (
     "episodes to convergence",
     "max. commanded violation", "peak force held out (in training) [N]",
 )  # fmt: skip
-README_COLUMNS = (
+HARD_TASKS_COLUMNS = (
     "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
-    "episodes with violations, guided / residual RL [%]", "stopped in training, guided / residual RL [%]",
+    "stopped in training, guided / residual RL [%]", "episodes with violations, guided / residual RL [%]",
     "training episodes per seed (seeds)",
 )  # fmt: skip
+README_COLUMNS = 5  # the README has only these first columns of the hard tasks
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
@@ -53,8 +54,13 @@ def task_table(task: str, tables: Path) -> str:
     return "\n".join(parts)
 
 
-def readme_table(tables: Path) -> str:
-    """Return the Markdown table of the README: a row for each section of a hard task."""
+def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS)) -> str:
+    """Return the Markdown table of the hard tasks: a row for each of their sections.
+
+    Args:
+        tables: Folder of the studies' tables.
+        columns: Number of columns.
+    """
     rows = []
     for section in (one for sections in SECTIONS.values() for one in sections if ", hard" in one.title):
         named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
@@ -71,16 +77,16 @@ def readme_table(tables: Path) -> str:
                 "; ".join(f"{_label(row)} {_percent((row, seeds))}" for row, seeds in guided),
                 _percent(residual),
                 f"{_percent(scripted)} / {_percent(random)}",
-                _compared(_violated, guided, residual),
                 _compared(_stopped, guided, residual),
+                _compared(_violated, guided, residual),
                 "; ".join(efforts),
-            )
+            )[:columns]
         )
-    return _markdown(README_COLUMNS, rows)
+    return _markdown(HARD_TASKS_COLUMNS[:columns], rows)
 
 
-def update_readme(text: str, table: str) -> str:
-    """Return the README's text with the table between its markers.
+def replace_table(text: str, table: str) -> str:
+    """Return the text of a page with the table between its markers.
 
     Raises:
         ValueError: If the markers are missing.
@@ -88,7 +94,7 @@ def update_readme(text: str, table: str) -> str:
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not begin or not end:
-        raise ValueError(f"the README has no place for the table: put {BEGIN!r} and {END!r} there")
+        raise ValueError(f"the page has no place for the table: put {BEGIN!r} and {END!r} there")
     return f"{before}{BEGIN}\n\n{table}\n\n{END}{after}"
 
 

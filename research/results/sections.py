@@ -33,7 +33,7 @@ class Section:
     Attributes:
         title: Title of the table.
         rows: Methods, guided ones first.
-        guided: Names of the guided methods in the README's table; empty if that table omits the section.
+        guided: Names of the guided methods in the table of hard tasks; empty if it omits the section.
     """
 
     title: str

@@ -7,7 +7,14 @@ import pytest
 
 from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.learning.config import LEARNERS
-from research.results.methods import knowledge, offsets, readme_table, task_table, update_readme
+from research.results.methods import (
+    README_COLUMNS,
+    hard_tasks_table,
+    knowledge,
+    offsets,
+    replace_table,
+    task_table,
+)
 from research.results.page import PAGES, write_pages
 from research.results.sections import BASELINES, NO_DEMONSTRATION, SECTIONS, Row, Section
 from research.studies import study_path
@@ -23,13 +30,20 @@ def rows(text):
     return [row for row in cells if row[0] not in ("method", "task")]
 
 
-def test_readme_has_the_table_of_the_stored_results():
-    readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    assert update_readme(readme, readme_table(TABLES)) == readme, "the README is stale: python -m research.results"
+@pytest.mark.parametrize(
+    ("page", "table"),
+    [
+        ("README.md", hard_tasks_table(TABLES, README_COLUMNS)),
+        ("docs/results.md", hard_tasks_table(TABLES)),
+    ],
+)
+def test_page_has_the_table_of_the_stored_results(page, table):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    assert replace_table(text, table) == text, f"{page} is stale: python -m research.results"
 
 
-def test_readme_table_has_at_most_ten_rows_of_hard_tasks():
-    titles = [row[0] for row in rows(readme_table(TABLES))]
+def test_hard_tasks_table_has_at_most_ten_rows_of_hard_tasks():
+    titles = [row[0] for row in rows(hard_tasks_table(TABLES))]
     assert 4 <= len(titles) <= 10
     assert all("hard" in title for title in titles)
 
@@ -59,7 +73,7 @@ def test_missing_study_is_left_out(tmp_path):
     (tmp_path / name).write_bytes((TABLES / name).read_bytes())
     assert [row[0] for row in rows(task_table("BncConnector", tmp_path))] == list(BASELINES)
     assert task_table("BncConnector", tmp_path / "nowhere") == ""
-    assert rows(readme_table(tmp_path)) == []
+    assert rows(hard_tasks_table(tmp_path)) == []
     assert len(NO_DEMONSTRATION) == len(BASELINES)
 
 
@@ -89,10 +103,10 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
         "0.40 mm, in 8 episodes",
         "14.5 (31.0)",
     ]
-    (row,) = rows(readme_table(tmp_path))
+    (row,) = rows(hard_tasks_table(tmp_path))
     effort = "60 (1); residual RL: 60 (2)"
     # 3 of 200 held-out episodes with violations are 1.5 %, 4 of 60 + 3 of 60 stopped ones 6 %.
-    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "0 / 2", "3 / 6", effort]
+    assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "3 / 6", "0 / 2", effort]
 
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
@@ -143,7 +157,7 @@ def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
     line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,0\n"
     (tmp_path / "peers_connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
-    assert rows(readme_table(tmp_path))[0][5] == "– / –"
+    assert rows(hard_tasks_table(tmp_path))[0][4] == "– / –"
 
 
 def test_training_success_is_marked_when_not_evaluated(tmp_path):
@@ -157,7 +171,7 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
 
 
 def test_results_with_the_offset_of_the_run_are_marked():
-    table = {row[0]: row for row in rows(readme_table(TABLES))}
+    table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
     assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
     assert table["Grid clamp, hard"][6] == "60 (10)"
     assert "†" not in "".join(table["Connector, hard"])
@@ -168,11 +182,11 @@ def test_results_with_the_offset_of_the_run_are_marked():
 
 
 def test_spilled_episodes_count_as_stopped():
-    table = {row[0]: row for row in rows(readme_table(TABLES))}
-    assert table["Pouring, hard"][5] == "31 / –"
-    assert table["Narrow passage, hard"][5] == "sKGRL 36; KGRL 41 / 63"
+    table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
+    assert table["Pouring, hard"][4] == "31 / –"
+    assert table["Narrow passage, hard"][4] == "sKGRL 36; KGRL 41 / 63"
 
 
-def test_update_readme_refuses_a_text_without_markers():
+def test_replace_table_refuses_a_text_without_markers():
     with pytest.raises(ValueError, match="no place for the table"):
-        update_readme("# guiderail\n", "")
+        replace_table("# guiderail\n", "")
