@@ -1,4 +1,4 @@
-"""Conversion to arrays of numbers, and small functions of vectors and sequences."""
+"""Conversion to numbers and arrays of numbers, and small functions of vectors and sequences."""
 
 import math
 from collections.abc import Iterable
@@ -18,12 +18,12 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def norm(vector: np.ndarray) -> float:
-    """Return the Euclidean norm of a few numbers (n,), bit-identical to `np.linalg.norm` and three times as fast."""
+    """Return the Euclidean norm of a short vector (n,), bit-identical to `np.linalg.norm` and three times as fast."""
     return math.sqrt(vector.dot(vector))
 
 
 def is_finite(values: np.ndarray) -> bool:
-    """Return True if a few numbers (n,) are all finite; several times faster than `np.isfinite(values).all()`."""
+    """Return True if a short vector (n,) is finite; several times faster than `np.isfinite(values).all()`."""
     return all(map(math.isfinite, values.tolist()))
 
 
@@ -37,10 +37,10 @@ def is_whole(value: object, least: float) -> bool:
 
 
 def as_whole(value: object, what: str) -> int:
-    """Return a whole number of Python or NumPy, such as 3 or 3.0, as an int; `what` is its name for the message.
+    """Convert a whole number of Python or NumPy, such as 3 or 3.0, to an int; `what` is its name for the message.
 
     Raises:
-        InputError: If it is not a whole number: 1.5, "3" and True are refused.
+        InputError: If the value is not a whole number: 1.5, "3" and True are refused.
     """
     if not is_whole(value, -math.inf):
         raise InputError(f"{what} must be a whole number, not {brief(value)}")
@@ -48,13 +48,13 @@ def as_whole(value: object, what: str) -> int:
 
 
 def as_number(value: object, what: str) -> float:
-    """Return a real number of Python or NumPy as a float; `what` is its name for the message.
+    """Convert a real number of Python or NumPy to a float; `what` is its name for the message.
 
-    NaN and infinity are numbers.
+    NaN and infinity are accepted.
 
     Raises:
-        InputError: If it is not one real number, such as "3", None and [1.0, 2.0], or it is beyond the range of a
-            double.
+        InputError: If the value is not a single real number, or exceeds the range of a double: "3", None and
+            [1.0, 2.0] are refused.
     """
     scalar = value[()] if isinstance(value, np.ndarray) and value.ndim == 0 else value
     try:
@@ -66,16 +66,16 @@ def as_number(value: object, what: str) -> float:
 
 
 def as_doubles(values: ArrayLike, what: str) -> np.ndarray:
-    """Return an array of doubles itself; convert other values with `as_numbers`, whose errors this function raises."""
+    """Return an array of doubles unchanged; convert other values with `as_numbers`, which may raise an InputError."""
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values
     return as_numbers(values, what)
 
 
 def parse_number(text: str) -> float:
-    """Return the number that a text holds.
+    """Convert a text to a number.
 
-    Python's float reads more than other programs do: digits of other scripts, and 1_000.
+    Texts that Python's `float` accepts, but other programs do not, are refused: digits of other scripts, and 1_000.
 
     Raises:
         ValueError: If the text is not a number.
@@ -115,8 +115,8 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
     is_large = (holds_integers or is_list) and bool((np.abs(array) >= _EXACT).any())
     is_rounded = holds_integers and is_large
     if is_list and is_large:
-        raw = np.asarray(values, dtype=object)  # whole numbers among others, which NumPy has already rounded
-    # NumPy holds whole numbers of 2^64 and more as objects.
+        raw = np.asarray(values, dtype=object)  # exact whole numbers: NumPy rounded those that a list mixes with floats
+    # NumPy stores whole numbers of 2^64 and more as objects.
     if is_rounded or any(isinstance(value, int | np.integer) and abs(int(value)) >= _EXACT for value in _objects(raw)):
         raise InputError(f"{what} holds whole numbers of 2^53 and more, which a double rounds: subtract an offset")
     return array
@@ -125,7 +125,7 @@ def as_numbers(values: ArrayLike, what: str) -> np.ndarray:
 def find_asymmetric(matrices: np.ndarray) -> int | None:
     """Return the index of the least symmetric of matrices (N, n, n), or None if all are symmetric up to rounding.
 
-    Rounding is 1e-9 of a matrix's largest entry.
+    A difference of at most 1e-9 of a matrix's largest entry counts as rounding.
     """
     asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
     excess = asymmetry - 1e-9 * np.abs(matrices).max(axis=(1, 2))
@@ -134,7 +134,7 @@ def find_asymmetric(matrices: np.ndarray) -> int | None:
 
 
 def _objects(array: np.ndarray) -> Iterable[object]:
-    """Return the elements of an array of objects, none of an array of numbers."""
+    """Return the elements of an array of objects, or no elements for an array of numbers."""
     return array.flat if array.dtype.kind == "O" else ()
 
 
@@ -154,10 +154,10 @@ _GRID = 2.0**-40  # unit of rounded periods [s], about a picosecond
 def round_period(seconds: float) -> float:
     """Round a period by at most a picosecond, so that its multiples are exact in double precision.
 
-    Drake triggers two events together only if their times are equal, and the floating-point numbers 10 k · 0.002,
-    0.02 + k · 0.02 and k · 0.02 often differ in the last bit: the plant would then step once more or once less between
+    Drake triggers two events together only if their times are equal. The floating-point numbers 10 k · 0.002,
+    0.02 + k · 0.02 and k · 0.02 often differ in the last bit. The plant would then step once more or once less between
     two control steps, or a history would be updated one step late. Round the plant's period, and use an integer
-    multiple of it as the control period.
+    multiple of the rounded period as the control period.
 
     Args:
         seconds: Period [s], positive.

@@ -42,21 +42,20 @@ def brief(value: Any) -> str:
 
 
 @contextmanager
-def naming_failures(action: str, *passed: type[Exception]) -> Iterator[None]:
-    """Turn any error of a user's code into an `InputError`: the action that failed, the file, the line and the error.
+def naming_failures(action: str, *unchanged: type[Exception]) -> Iterator[None]:
+    """Convert an error in a user's code to an `InputError` that names the action, the file, the line and the error.
 
-    An `InputError` and an error of the types `passed` are raised unchanged.
+    An `InputError` and errors of the types `unchanged` are raised unchanged.
     """
-    unchanged: tuple[type[Exception], ...] = (InputError, *passed)
     try:
         yield
-    except unchanged:
+    except (InputError, *unchanged):
         raise
     except (Exception, SystemExit) as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}, line {place.lineno}: " if place.filename.endswith(".py") else ""
-        words = " ".join(str(error).split())
-        raise InputError(f"{action} failed: {where}{type(error).__name__}: {words}") from error
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        location = f"{Path(frame.filename).name}, line {frame.lineno}: " if frame.filename.endswith(".py") else ""
+        message = " ".join(str(error).split())
+        raise InputError(f"{action} failed: {location}{type(error).__name__}: {message}") from error
 
 
 _SOFTWARE: dict[str, dict[str, str]] = {
@@ -87,7 +86,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "wandb": {"wandb": "Weights & Biases"},
 }
 EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for module, name in modules.items()}
-"""Name of the software, and of the extra that installs it, by the name of the module."""
+"""Software and the name of the extra that installs it, by the name of a module."""
 
 
 class MissingExtraError(InputError, ImportError):
@@ -96,19 +95,19 @@ class MissingExtraError(InputError, ImportError):
 
 def explain_missing(error: ImportError) -> MissingExtraError | None:
     """Return an error that names the extra to install; None if no extra installs the missing module."""
-    extra = EXTRAS.get((error.name or "").partition(".")[0])
-    if extra is None:
+    module = (error.name or "").partition(".")[0]
+    if module not in EXTRAS:
         return None
-    software, name = extra
-    return MissingExtraError(f'this needs {software}, which is not installed: pip install "guiderail[{name}]"')
+    software, extra = EXTRAS[module]
+    return MissingExtraError(f'this needs {software}, which is not installed: pip install "guiderail[{extra}]"')
 
 
 def import_extra(module: str) -> Any:
     """Import a module of an extra, and return it.
 
     Raises:
-        MissingExtraError: If it is not installed.
-        ModuleNotFoundError: If it is not installed, and no extra installs it.
+        MissingExtraError: If the module is missing and an extra installs it.
+        ModuleNotFoundError: If the module is missing and no extra installs it.
     """
     try:
         return import_module(module)
@@ -117,11 +116,11 @@ def import_extra(module: str) -> Any:
 
 
 def require_extra(module: str) -> None:
-    """Check that a module of an extra is installed, without importing it, because importing takes time.
+    """Check that a module of an extra is installed, without the time for an import.
 
     Raises:
-        MissingExtraError: If it is not installed.
-        ModuleNotFoundError: If it is not installed, and no extra installs it.
+        MissingExtraError: If the module is missing and an extra installs it.
+        ModuleNotFoundError: If the module is missing and no extra installs it.
     """
     try:
         is_installed = find_spec(module) is not None

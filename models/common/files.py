@@ -16,7 +16,7 @@ from guiderail.models.common.errors import InputError
 def write_atomically(path: Path, content: bytes) -> None:
     """Write a file atomically: readers find the old content or the new, even if the process is killed.
 
-    Missing folders are created. Several processes and threads may write the same file; the last to finish wins.
+    Missing folders are created. Several processes and threads may write the same file; the last content remains.
 
     Raises:
         InputError: If the file cannot be written.
@@ -37,18 +37,18 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def digest(arrays: Mapping[str, np.ndarray], text: str) -> str:
     """Compute a digest of a text and of arrays with their names, types and shapes."""
-    digest = hashlib.blake2b(text.encode())
+    hasher = hashlib.blake2b(text.encode())
     for key in sorted(arrays):
-        digest.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())
-        digest.update(arrays[key].tobytes())
-    return digest.hexdigest()
+        hasher.update(f"{key} {arrays[key].dtype} {arrays[key].shape}".encode())
+        hasher.update(arrays[key].tobytes())
+    return hasher.hexdigest()
 
 
 def read_bytes(path: Path, what: str, max_size: int) -> bytes:
     """Read a regular file of at most `max_size` bytes; `what` is its kind for messages, such as "template".
 
     Raises:
-        InputError: If there is no such file, it cannot be read, or it is too large.
+        InputError: If the file does not exist, cannot be read, or is too large.
     """
     try:
         if not path.is_file():  # reading a pipe or a device would block
@@ -63,10 +63,10 @@ def read_bytes(path: Path, what: str, max_size: int) -> bytes:
 
 
 def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
-    """Return the paths in a folder with one of the endings, in order, without hidden files.
+    """Return the paths of the files in a folder with one of the endings, in order; hidden files are left out.
 
     Raises:
-        InputError: If a folder has such a name.
+        InputError: If the name of a folder has one of the endings.
     """
     paths = [path for path in folder.iterdir() if path.suffix in endings and not path.name.startswith(".")]
     for path in paths:

@@ -25,10 +25,10 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     """Return `function(*arguments)`, computed in a forked process; the result is pickled.
 
     Args:
-        function: Function; it need not be importable, because the child process is a copy of this one.
+        function: Function; it need not be importable, because the child process is a copy of the calling process.
         arguments: Arguments of the function, which are not pickled.
         cpu_seconds: Limit of the function's CPU time, a whole number of at least 1 [s].
-        max_bytes: Limit of the memory that the function allocates [bytes]; default: none.
+        max_bytes: Limit of the memory that the function allocates [bytes]; no limit by default.
 
     Raises:
         InputError: If `cpu_seconds` is not a whole number of at least 1.
@@ -40,7 +40,7 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
     cpu_seconds = int(cpu_seconds)
     context = multiprocessing.get_context("fork")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(sender, function, arguments, cpu_seconds, max_bytes))
+    process = context.Process(target=_run_child, args=(sender, function, arguments, cpu_seconds, max_bytes))
     seconds_before = _children_seconds()
     process.start()
     sender.close()
@@ -50,7 +50,7 @@ def run_isolated(function: Callable[..., Any], *arguments: Any, cpu_seconds: int
         is_result, value = receiver.recv()
     except EOFError:
         process.join()
-        # A library may ignore SIGXCPU; the kernel then sends SIGKILL, as it does if the machine's memory is exhausted.
+        # If a library ignores SIGXCPU, the kernel sends SIGKILL, as it does if the machine's memory is exhausted.
         is_killed = process.exitcode == -signal.SIGKILL
         is_late = is_killed and _children_seconds() - seconds_before > cpu_seconds
         if process.exitcode == -signal.SIGXCPU or is_late:
@@ -73,25 +73,26 @@ def _children_seconds() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def _limit(kind: int, soft: int, hard: int) -> None:
-    """Set a limit of this process, at most its present hard limit, which only root may raise."""
-    present = resource.getrlimit(kind)[1]
-    largest = math.inf if present == resource.RLIM_INFINITY else present
+def _set_limit(kind: int, soft: int, hard: int) -> None:
+    """Set a limit of this process, at most the current hard limit, which only root may raise."""
+    current = resource.getrlimit(kind)[1]
+    largest = math.inf if current == resource.RLIM_INFINITY else current
     resource.setrlimit(kind, (int(min(soft, largest)), int(min(hard, largest))))
 
 
-def _child(
+def _run_child(
     sender: Any, function: Callable[..., Any], arguments: tuple[Any, ...], cpu_seconds: int, max_bytes: int | None
 ) -> None:
+    """Set the limits of the child process, and send (True, result) or (False, reason of the failure)."""
     used_seconds = int(sum(os.times()[:2])) + 1
-    _limit(resource.RLIMIT_CPU, used_seconds + cpu_seconds, used_seconds + cpu_seconds + 1)
-    _limit(resource.RLIMIT_CORE, 0, 0)
+    _set_limit(resource.RLIMIT_CPU, used_seconds + cpu_seconds, used_seconds + cpu_seconds + 1)
+    _set_limit(resource.RLIMIT_CORE, 0, 0)
     if max_bytes is not None:
         pages = int(Path("/proc/self/statm").read_text().split()[0])  # address space inherited from the parent
         size = pages * resource.getpagesize() + max_bytes
-        _limit(resource.RLIMIT_AS, size, size)
+        _set_limit(resource.RLIMIT_AS, size, size)
     devnull = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(devnull, 1)  # compiled libraries print their progress and their aborts
+    os.dup2(devnull, 1)  # compiled libraries print progress and reasons of aborts
     os.dup2(devnull, 2)
     try:
         sender.send((True, function(*arguments)))

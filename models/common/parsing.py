@@ -20,9 +20,6 @@ _DIRECTIVES = (".yaml", ".yml")
 def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
     """Add the only model of a local SDF or URDF file to a plant.
 
-    The constructor of Drake's `Parser` registers the remote package `drake_models`, and raises an error if
-    DRAKE_ALLOW_NETWORK forbids it. The variable is therefore changed while parsing; nothing is downloaded.
-
     Raises:
         InputError: As `add_models`.
         ValueError: If the file has several models or none.
@@ -37,7 +34,7 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
     Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
 
     Raises:
-        InputError: If the file, or a mesh that it names, cannot be read, or the file is of another type.
+        InputError: If the file is of another type, or the file or one of its meshes cannot be read.
     """
     with _allow_package_map():
         parser = _make_parser(plant)
@@ -52,11 +49,11 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
 
 
 def _refuse_crossed_limits(path: Path) -> None:
-    """Raise an `InputError` that names the joint if a lower limit is above the upper one; Drake would not name it."""
+    """Raise an `InputError` if a joint's lower limit is above its upper one; Drake's error would not name the joint."""
     try:
         joints = list(ElementTree.parse(path).iter("joint"))
     except (ElementTree.ParseError, OSError, ValueError):
-        return  # a file of another type, or one that the parser refuses
+        return  # not XML, or a file that Drake's parser refuses
     for joint in joints:
         for limit in joint.iter("limit"):  # attributes in URDF, elements in SDF
             lower, upper = (_to_float(limit.get(name, limit.findtext(name))) for name in ("lower", "upper"))
@@ -73,7 +70,7 @@ def _to_float(text: str | None) -> float:
 
 
 def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:
-    """Add the models of Drake model directives, whose files have absolute paths (file://), to a plant.
+    """Add the models of Drake model directives to a plant; the directives name files by absolute paths (file://).
 
     Raises:
         InputError: If the directives cannot be processed.
@@ -95,6 +92,10 @@ def _make_parser(plant: MultibodyPlant) -> Parser:
 
 @contextmanager
 def _allow_package_map() -> Iterator[None]:
+    """Allow Drake's `Parser` to register the remote package `drake_models`; nothing is downloaded.
+
+    The constructor of the parser registers this package, and raises an error if DRAKE_ALLOW_NETWORK forbids it.
+    """
     allowed = os.environ.get(_VARIABLE)
     if allowed is None or "package_map" in allowed:
         yield

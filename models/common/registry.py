@@ -24,18 +24,19 @@ _NO_VALUE: Any = object()  # default of `register`, because None is refused like
 class Registry(Generic[Entry]):
     """Registry of entries by name.
 
-    Getting an entry imports its module; listing the names imports no module if `decorator` is given. `register`, as a
-    decorator or a call, adds an entry: in a module of `package`, which is found without being imported; in an installed
-    package with an entry point of the group `entry_points`; or in any other file that is imported. An entry point with
-    the name of an entry of `package` is ignored, with a warning: an installed package cannot replace or break it.
+    Entries have three sources: calls of `register` in the modules of `package`, entry points of the group
+    `entry_points` in installed packages, and calls of `register` in any other imported module. An entry point with the
+    name of an entry of `package` is ignored, with a warning, so that an installed package cannot replace this entry.
+
+    `get` imports the module of an entry. If `decorator` is given, no module is imported to list the names.
 
     Args:
         noun: Kind of the entries for messages, such as "task".
         package: Import name of the package, or of each package, whose modules register entries.
-        decorator: Name of the function that registers an entry under its first argument; its calls are found in the
-            modules' source. Without it, all modules are imported at the first use.
-        entry_points: Group of entry points of further entries.
-        check: Function of a name and an entry, called before the entry is added; it raises an `InputError`.
+        decorator: Name of the function that registers an entry under its first argument; calls of this function are
+            found in the modules' source. Without `decorator`, all modules are imported at the first use.
+        entry_points: Group of the entry points; none by default.
+        check: Function that is called with name and entry before the entry is added, and may raise an `InputError`.
     """
 
     def __init__(
@@ -62,9 +63,9 @@ class Registry(Generic[Entry]):
         """Add an entry; without a value, return a decorator that adds the decorated object.
 
         Raises:
-            InputError: If the name is no word, as for a decorator without parentheses, if an object that is defined
-                elsewhere has this name already, a module of the package that is not imported yet declares it, or the
-                registry's `check` refuses it.
+            InputError: If the name is not a text (as for a decorator without parentheses) or is blank, the registry's
+                `check` refuses the entry, or the name belongs to an object that is defined elsewhere or to a module of
+                the package that is not imported yet.
         """
         self.check_name(name)
         if value is _NO_VALUE:
@@ -75,7 +76,7 @@ class Registry(Generic[Entry]):
         is_used, place = name in self._entries and existing != origin, existing[0]
         if self._decorator is not None and name not in self._entries and name in self._declarations:
             place = self._declarations[name].module
-            # The declaring module itself may register the name: while it is imported, or runs under another name.
+            # The declaring module registers the name while it is imported, or if it is executed as `__main__`.
             is_used = place not in sys.modules and origin[0] != _file(place)
         if is_used:
             raise InputError(f"there is a {self.noun} {name!r} already, from {place}: choose another name")
@@ -113,7 +114,7 @@ class Registry(Generic[Entry]):
         return self._entries[name]
 
     def _load(self, point: metadata.EntryPoint) -> None:
-        """Load an entry point; raise an InputError if that fails, or if another object is registered by its name."""
+        """Load an entry point; raise an InputError if loading fails, or another object is registered under its name."""
         name = point.name
         try:
             with naming_failures(f"importing {point.value}"):
@@ -133,7 +134,7 @@ class Registry(Generic[Entry]):
 
     @cached_property
     def broken(self) -> dict[str, str]:
-        """Message of `get` by name, for each entry point that cannot be used; all entry points are loaded."""
+        """Error message of each entry point that cannot be used, by name; this attribute loads all entry points."""
         messages = {}
         for name in self._points:
             try:
@@ -143,11 +144,11 @@ class Registry(Generic[Entry]):
         return messages
 
     def usable(self) -> list[str]:
-        """Return the names of all entries but the `broken` ones, sorted."""
+        """Return the names of all entries except the `broken` ones, sorted."""
         return [name for name in self.names() if name not in self.broken]
 
     def name_of(self, value: object) -> str | None:
-        """Return the name of an object that is registered, or that an entry point declares; None if there is none."""
+        """Return the name under which an object is registered, or that of its entry point; None if there is neither."""
         declared = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
         points = (point for points in self._points.values() for point in points)
         names = (name for name, entry in self._entries.items() if entry is value)
@@ -160,8 +161,8 @@ class Registry(Generic[Entry]):
     def declared(self, name: str, keyword: str) -> Any:
         """Return an attribute of an entry: a keyword argument of its decorator, or an attribute of its class.
 
-        The entry's module is only imported if its source does not show the value. A literal is read from the source.
-        For a name that is imported from another module, only that other module is imported.
+        A literal is read from the source of the entry's module. If the value is a name that this module imports from
+        another module, only the other module is imported. Otherwise, the entry's module is imported.
         """
         values = self._declarations[name].values if name in self._declarations else {}
         if name in self._entries or keyword not in values:
@@ -195,7 +196,7 @@ class Registry(Generic[Entry]):
 
     @cached_property
     def _points(self) -> dict[str, list[metadata.EntryPoint]]:
-        """Entry points by name; those of one name and value are one."""
+        """Entry points by name, without duplicates of the same value."""
         points: dict[str, dict[str, metadata.EntryPoint]] = {}
         for point in metadata.entry_points(group=self._group) if self._group else ():
             points.setdefault(point.name, {}).setdefault(point.value, point)
@@ -203,14 +204,14 @@ class Registry(Generic[Entry]):
 
 
 class _Declaration(NamedTuple):
-    """Module that registers an entry, and the values of the entry's attributes that its source shows."""
+    """Module that registers an entry, and the attributes of the entry that can be read from the module's source."""
 
     module: str
     values: dict[str, Any]
 
 
 class _ImportedName(NamedTuple):
-    """Value that a module imports from another one."""
+    """Name that a module imports from the module `module`."""
 
     module: str
     name: str
@@ -223,21 +224,21 @@ def check_callable(name: str, value: object) -> None:
 
 
 def check_class(name: str, value: object, kind: type) -> None:
-    """Raise an InputError unless a value is a subclass of `kind` without abstract methods; as `check_callable`."""
+    """Raise an InputError unless a value is a subclass of `kind` without abstract methods; see `check_callable`."""
     if not (isinstance(value, type) and issubclass(value, kind)):
-        raise InputError(f"{brief(name)} is registered with a class made of {kind.__name__}, not with {brief(value)}")
+        raise InputError(f"{brief(name)} is registered with a subclass of {kind.__name__}, not with {brief(value)}")
     missing = sorted(getattr(value, "__abstractmethods__", ()))
     if missing:
         raise InputError(f"the class {value.__name__} lacks {', '.join(missing)}: see `{kind.__name__}`")
 
 
 def did_you_mean(name: object, known: Iterable[str], otherwise: str = "") -> str:
-    """Return the end of a message about an unknown name: the closest known name, or all of them and `otherwise`."""
+    """Return the end of a message about an unknown name: the closest known name, or all names and `otherwise`."""
     known = sorted(known)
-    lower = {word.lower(): word for word in known}
-    near = difflib.get_close_matches(str(name).lower(), lower, n=1)
-    if near:
-        return f"did you mean {lower[near[0]]}?"
+    by_lower = {word.lower(): word for word in known}
+    closest = difflib.get_close_matches(str(name).lower(), by_lower, n=1)
+    if closest:
+        return f"did you mean {by_lower[closest[0]]}?"
     return (f"choose one of {', '.join(known)}" if known else "none is registered") + otherwise
 
 
@@ -259,7 +260,8 @@ def _file(module: str) -> str | None:
 def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the name and the values of each entry that the source registers with `decorator`.
 
-    The values are literals and imported names among the keyword arguments and the attributes of the decorated class.
+    The values are the literals and imported names among the decorator's keyword arguments and the attributes of the
+    decorated class.
     """
     if not re.search(rf"\b{decorator}\(\s*[\"']", source):  # faster than parsing
         return
@@ -271,15 +273,16 @@ def _registered(source: str, decorator: str) -> Iterator[tuple[str, dict[str, An
         for alias in node.names
     }
     for statement in tree.body:
-        for node in (each for one in getattr(statement, "decorator_list", [statement]) for each in ast.walk(one)):
+        roots = getattr(statement, "decorator_list", [statement])
+        for node in (node for root in roots for node in ast.walk(root)):
             if not (isinstance(node, ast.Call) and getattr(node.func, "id", None) == decorator and node.args):
                 continue
             name = node.args[0]
             if isinstance(name, ast.Constant) and isinstance(name.value, str):
-                assigned = dict(_assignments(statement.body)) if isinstance(statement, ast.ClassDef) else {}
-                assigned |= {str(argument.arg): argument.value for argument in node.keywords}
+                expressions = dict(_assignments(statement.body)) if isinstance(statement, ast.ClassDef) else {}
+                expressions |= {str(argument.arg): argument.value for argument in node.keywords}
                 values: dict[str, Any] = {}
-                for attribute, value in assigned.items():
+                for attribute, value in expressions.items():
                     if isinstance(value, ast.Name) and value.id in imported:
                         values[attribute] = imported[value.id]
                     with suppress(ValueError):
@@ -299,8 +302,8 @@ def _assignments(body: Iterable[ast.stmt]) -> Iterator[tuple[str, ast.expr]]:
 def _origin(value: object) -> tuple[str, str]:
     """Return the file or module in which an object is defined, and its qualified name.
 
-    The origin identifies the object when its module is imported again, possibly under another name. An entry with an
-    attribute `build` has the origin of this attribute.
+    The origin stays the same if the module is imported again, possibly under another name. An entry with an attribute
+    `build` has the origin of this attribute.
     """
     defined: Any = value if hasattr(value, "__qualname__") else getattr(value, "build", value)
     while isinstance(defined, partial):

@@ -1,7 +1,7 @@
 """Rigid transforms in NumPy with the interface of Drake's classes of the same names, and poses as six coordinates.
 
-The templates use the transforms, so that they run without Drake; they accept Drake's objects as well. Rotations are
-computed by Drake's formulas in the same order of operations, and agree with Drake's to the last bit.
+Templates use these transforms in order to run without Drake, and accept Drake's objects as well. Rotations are computed
+by Drake's formulas in the same order of operations, and agree with Drake's rotations to the last bit.
 
 A pose is [x y z Rz Ry Rx], the coordinates of recorded and commanded poses in the thesis.
 """
@@ -19,13 +19,13 @@ class RotationMatrix:
     """Rotation R_AB.
 
     Args:
-        R: Orthonormal matrix (3, 3), which is not checked; the identity by default.
+        R: Orthonormal matrix (3, 3), not checked; the identity by default.
     """
 
     __slots__ = ("_R",)
 
     def __init__(self, R: ArrayLike | None = None):
-        # Column-major as Drake's, because the order decides how products with vectors round.
+        # Column-major like Drake's matrices: the memory order determines how products with vectors are rounded.
         self._R = np.eye(3) if R is None else np.asfortranarray(R, dtype=float)
 
     @staticmethod
@@ -60,16 +60,16 @@ class RotationMatrix:
         return RotationMatrix(self._R.T)
 
     def __matmul__(self, other: Any) -> Any:
-        """Return R_AB R_BC for a rotation, or the product with vectors (3,) or (3, n)."""
-        return self._R @ np.asarray(other, dtype=float) if not hasattr(other, "matrix") else self.multiply(other)
+        """Return R_AB R_BC for a rotation R_BC, or vectors (3,) or (3, n) in B expressed in A."""
+        return self.multiply(other) if hasattr(other, "matrix") else self._R @ np.asarray(other, dtype=float)
 
 
 class RigidTransform:
     """Pose X_AB.
 
     Args:
-        R: Rotation R_AB, an object or a matrix (3, 3); the identity by default. Without `p`, it can also be a
-            transform, which is copied, or a translation (3,).
+        R: Rotation R_AB, an object or a matrix (3, 3); the identity by default. If `p` is not given, `R` can also be a
+            transform, which is copied, or a translation (3,) [m].
         p: Translation p_AB (3,) [m]; zero by default.
     """
 
@@ -118,10 +118,6 @@ class RigidTransform:
         """Return the homogeneous matrix (4, 4)."""
         return np.vstack([self.GetAsMatrix34(), [0.0, 0.0, 0.0, 1.0]])
 
-    def IsExactlyEqualTo(self, other: RigidTransform) -> bool:
-        """Return True if all numbers are equal."""
-        return bool(np.array_equal(self.GetAsMatrix34(), other.GetAsMatrix34()))
-
 
 def rpy_rotation(roll: float, pitch: float, yaw: float) -> RotationMatrix:
     """Return Rz(yaw) Ry(pitch) Rx(roll) of angles [rad]."""
@@ -137,7 +133,7 @@ def rpy_rotation(roll: float, pitch: float, yaw: float) -> RotationMatrix:
 
 
 def _sin_cos(angle: float) -> tuple[float, float]:
-    """Return sine and cosine of an angle [rad]; NaN if it is not finite, because `math.sin` rejects infinity."""
+    """Return sine and cosine of an angle [rad]; NaN for an infinite angle, which `math.sin` would refuse."""
     return (math.sin(angle), math.cos(angle)) if math.isfinite(angle) else (math.nan, math.nan)
 
 
@@ -241,7 +237,7 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
 
 def pose_difference(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return `first` minus `second`, two poses (6,), each angle in [−π, π)."""
-    # Angles in plain Python: NumPy is slower for three numbers, and this runs at every step of a plant.
+    # Plain Python, because NumPy is slower for three numbers and this function runs at every step of a plant.
     x, y, z, a, b, c = (first - second).tolist()
     return np.array([x, y, z, _wrapped(a), _wrapped(b), _wrapped(c)])
 
@@ -253,14 +249,15 @@ def _wrapped(angle: float) -> float:
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Convert a generalized force (6,) along a pose's coordinates to the wrench (6,) at P in T that does the same work.
 
-    The components of the angles are torques about the axes ez, Rz(a) ey and Rz(a) Ry(b) ex. These axes are
-    linearly dependent for b = ±π/2, near which the result is large. The pose is X_TP as [x y z a b c] (6,) [m, rad].
+    The pose [x y z a b c] (6,) [m, rad] is X_TP. The last three components of the force are torques about the axes ez,
+    Rz(a) ey and Rz(a) Ry(b) ex. For b = ±π/2 these axes are linearly dependent; near these angles the result is large.
     """
     x, y, z, about_z, about_y, about_x = force.tolist()
     (cos_a, cos_b), (sin_a, sin_b) = np.cos(pose[3:5]).tolist(), np.sin(pose[3:5]).tolist()
     cos_b = math.copysign(max(abs(cos_b), 1e-9), cos_b)
-    along = (about_x + sin_b * about_z) / cos_b
-    return np.array([x, y, z, cos_a * along - sin_a * about_y, sin_a * along + cos_a * about_y, about_z])
+    about_heading = (about_x + sin_b * about_z) / cos_b  # torque about Rz(a) ex
+    torque_x, torque_y = cos_a * about_heading - sin_a * about_y, sin_a * about_heading + cos_a * about_y
+    return np.array([x, y, z, torque_x, torque_y, about_z])
 
 
 MM = 1e-3  # one millimeter [m]

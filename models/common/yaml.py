@@ -1,7 +1,7 @@
 """Reader of YAML files: templates, tasks, run configurations and studies.
 
-Files hold null, booleans, numbers, texts, lists and mappings as in YAML 1.2's core schema, except that integers are
-decimal without leading zeros: `yes` and `010` are texts, `1e-3` is a number. Reading takes bounded time and memory for
+Values are null, booleans, numbers, texts, lists and mappings as in YAML 1.2's core schema, except that integers are
+decimal without leading zeros: `yes` and `010` are texts, `1e-3` is a number. Time and memory of reading are bounded for
 any content.
 """
 
@@ -28,7 +28,7 @@ MAX_ENTRIES = 10_000  # largest number of entries; an alias counts as many as it
 MAX_DEPTH = 30  # largest depth of nested lists and mappings; the innermost values count as a level
 
 _TAG = "tag:yaml.org,2002:"
-_PATTERNS = {
+_PATTERNS = {  # pattern of plain scalars of each type, and their possible first characters
     "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
     "bool": (r"true|True|TRUE|false|False|FALSE", list("tTfF")),
     "int": (r"[-+]?(0|[1-9][0-9]*)", list("-+0123456789")),
@@ -60,27 +60,28 @@ def parse_yaml(text: str, where: str = "text") -> Any:
     """Read one YAML document as Python's own types; `where` is its name for messages.
 
     Raises:
-        InputError: If it is not YAML or not a single document, has a tag, a date, a duplicate key or a key that is not
-            text, or is too large or too deep.
+        InputError: If the text is not YAML or not a single document, has a tag, a date, a duplicate key or a key that
+            is not text, or is too large or too deep.
     """
-    with _refusals(text, where):
+    with _naming_errors(text, where):
         return _make_yaml().load(text)
 
 
 def check_yaml(text: str, where: str, tags: Collection[str]) -> None:
-    """Check that documents are within the limits of `parse_yaml`, and that they have only tags in `tags`.
+    """Check that YAML documents are within the limits of `parse_yaml`, and have no tags except `tags`.
 
     Raises:
         InputError: As `parse_yaml`, except for several documents, unknown aliases, wrong merges (`<<`) and integers of
             thousands of digits.
     """
-    with _refusals(text, where):
+    with _naming_errors(text, where):
         for _ in _make_yaml(tags).parse(text):
             pass
 
 
 @contextmanager
-def _refusals(text: str, where: str) -> Iterator[None]:
+def _naming_errors(text: str, where: str) -> Iterator[None]:
+    """Raise an `InputError` with the name `where` if the text is too long or reading it raises an error."""
     if len(text) > MAX_SIZE:
         raise InputError(f"{where} is longer than {MAX_SIZE} characters: leave out what is not needed")
     try:
@@ -118,7 +119,7 @@ def _make_yaml(tags: Collection[str] = ()) -> YAML:
 
 
 class _RefusedError(Exception):
-    """Error for valid YAML that exceeds the reader's limits or uses a feature that is not accepted."""
+    """Error for valid YAML that exceeds the reader's limits or uses a refused feature."""
 
 
 class _Collection:
@@ -131,7 +132,7 @@ class _Collection:
 
 
 class _Parser(Parser):
-    """Parser that checks each event before anything is built from it."""
+    """Parser that checks each event before any object is built."""
 
     tags: Collection[str] = ()  # accepted tags
 
@@ -141,7 +142,7 @@ class _Parser(Parser):
         self._parents: list[_Collection] = []
         self._sizes: dict[str, tuple[int, int]] = {}  # entries and levels of anchored nodes
         self._anchored: dict[str, Any] = {}  # events of anchored nodes
-        loader.composer.warn_double_anchors = False  # an alias is that of the last anchor with its name
+        loader.composer.warn_double_anchors = False  # an alias refers to the last anchor of its name
 
     def get_event(self) -> Any:
         event = super().get_event()
@@ -178,12 +179,12 @@ class _Parser(Parser):
         return event
 
     def _check_key(self, node: Any, event: Any) -> None:
-        """Refuse a node as a key of the innermost mapping; `event` is the node's own, or that of an alias."""
+        """Refuse a node that cannot be a key of the innermost mapping; `event`, for the message, may be an alias."""
         kind, keys = _kind(node, self.resolver), self._parents[-1].keys
         if kind not in ("str", "merge"):
             key = "a list or a mapping" if kind == "collection" else brief(node.value)
             _refuse(f"the key {key} is not text: put it in quotes", event)
-        if node.value in keys:  # readers differ in which of the two values counts
+        if node.value in keys:  # YAML readers differ in which of the two values they use
             _refuse(f'duplicate key "{brief(node.value)[1:-1]}": leave one of the two out', event)
         keys.add(node.value)
 

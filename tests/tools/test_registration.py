@@ -47,7 +47,7 @@ class Loose:
         (lambda: register_kernel("mine", 3), "'mine' is registered with a function or a class, not with 3"),
         (lambda: register_base_policy("mine", 3), "registered with a function or a class, not with 3"),
         (lambda: register_engine("mine")(3), "registered with a function or a class, not with 3"),
-        (lambda: register_driver("mine", 3), "registered with a class made of Driver, not with 3"),
+        (lambda: register_driver("mine", 3), "registered with a subclass of Driver, not with 3"),
         (lambda: register_driver("mine", HalfDriver), "the class HalfDriver lacks write"),
         (lambda: register_guidance("mine")(3), "registered with a function or a class, not with 3"),
         (lambda: register_guidance("mine", options=dict)(build), "options of mine must be a class made of Options"),

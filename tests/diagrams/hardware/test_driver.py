@@ -117,7 +117,7 @@ def test_driver_that_cannot_be_opened_is_refused(monkeypatch, factory, message):
 
 
 def test_driver_that_is_not_callable_is_not_registered():
-    with pytest.raises(InputError, match="'number' is registered with a class made of Driver, not with 3"):
+    with pytest.raises(InputError, match="'number' is registered with a subclass of Driver, not with 3"):
         register_driver("number", 3)
 
 
