@@ -1,9 +1,10 @@
 """Trained policies: weights and a description in files without code, evaluated with NumPy.
 
-A base policy predicts chunks of commanded poses, which guidance takes as its reference. It is a function from an
-observation (n,) to the next K commanded outputs, one per control step. It returns samples (E, K, O) of an ensemble or
-of a generative model, one chunk (K, O), or one chunk as a flat vector. A `Policy` whose description has the entry
-`chunk`, [E, K, O], is a base policy (`guiderail train --algorithm chunk`); it returns samples as a flat vector.
+A base policy predicts chunks of commanded poses, which guidance uses as its reference. It is a function from an
+observation (n,) to chunks of the next K commands with O outputs, one command per control step. It returns E samples
+(E, K, O) of an ensemble or of a generative model, one chunk (K, O), or one chunk as a flat vector. A `Policy` whose
+description has the entry `chunk`, [E, K, O], is a base policy (`guiderail train --algorithm chunk`); it returns samples
+as a flat vector.
 """
 
 from __future__ import annotations
@@ -32,20 +33,21 @@ MAX_DESCRIPTION_SIZE = 1_000_000  # [bytes]
 class Policy:
     """Deterministic policy: a feed-forward network whose output is squashed by a tanh or clipped.
 
-    It computes the same action as Stable-Baselines3's `predict(deterministic=True)`, in single precision, with NumPy
-    alone, so that a robot's computer needs neither PyTorch nor the learner.
+    It computes the same action as Stable-Baselines3's `predict(deterministic=True)`, in single precision. It only needs
+    NumPy, so that a robot's computer needs neither PyTorch nor the learner.
 
     Args:
         layers: Weight (out, in) and bias (out,) of each layer, first to last.
-        description: Content of `policy.json`: the shape of observations, the limits of actions, `activation` ("relu",
-            the default, "normalized_relu" or "tanh") and `squash` ("tanh", the default, or "clip"). Images need `pool`,
-            the side of the squares of pixels that are averaged. `image_shape`, (height, width, channels), declares that
-            observations are vectors [image / 255, state] (see `ImageObservation`).
+        description: Content of `policy.json`: `observation_shape`, the limits `action_low` and `action_high`,
+            `activation` ("relu", the default, "normalized_relu" or "tanh") and `squash` ("tanh", the default, or
+            "clip"). Images need `pool`, the side [pixels] of the squares over which pixels are averaged. `image_shape`,
+            (height, width, channels), declares that observations are vectors [image / 255, state] (see
+            `ImageObservation`).
         encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution of an image, with stride 2 and a ReLU.
 
     Raises:
-        ValueError: If the description is incomplete, the activation is unknown, the layers do not lead from observation
-            to action, or a number is not finite.
+        ValueError: If the description is incomplete, `activation` or `squash` is unknown, the sizes of the layers do
+            not match each other, observation and action, or a number is not finite.
     """
 
     def __init__(
@@ -61,7 +63,7 @@ class Policy:
             raise ValueError(f"a policy has no activation {activation!r}")
         self._squash = self.description.get("squash", "tanh")
         if self._squash not in ("tanh", "clip"):
-            raise ValueError(f"the output of a policy is not squashed by {self._squash!r}")
+            raise ValueError(f"a policy has no squashing function {self._squash!r}")
         self._activation = np.tanh if activation == "tanh" else partial(np.maximum, np.float32(0))
         self._normalizes = activation == "normalized_relu"
         try:
@@ -83,7 +85,7 @@ class Policy:
         if image is not None and (len(image) != 3 or math.prod(image) > math.prod(self._shape)):
             raise ValueError("image_shape must be (height, width, channels) and fit into the observation")
         if image is not None and "pool" not in self.description:
-            raise ValueError("a policy of images needs `pool`, the side of the squares of pixels that are averaged")
+            raise ValueError("a policy of images needs `pool`, the side of the squares over which pixels are averaged")
         if any(bias.ndim != 1 for _, bias in (*self._encoder, *self._layers)):
             raise ValueError("a bias has one number for each output of its layer")
         sizes = [self._num_features(), *(len(bias) for _, bias in self._layers)]
@@ -141,18 +143,18 @@ class Policy:
             ) from error
 
     def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
-        """Write `policy.safetensors` and `policy.json` into a folder, which is made if there is none.
+        """Write `policy.safetensors` and `policy.json` into a folder, which is created if it is missing.
 
         `write` is called with the path and the content of each file.
 
         Raises:
-            InputError: If the folder cannot be made.
+            InputError: If the folder cannot be created.
         """
         folder = Path(folder)
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise InputError(f"{folder} cannot be made ({error.strerror}): name another folder") from error
+            raise InputError(f"{folder} cannot be created ({error.strerror}): name another folder") from error
         arrays: dict[str, np.ndarray] = {}
         for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):
             for index, (weight, bias) in enumerate(stored):
@@ -166,7 +168,7 @@ class Policy:
         """Return the action (A,) for one observation, in the units of the action space.
 
         Raises:
-            ValueError: If the observation does not have the shape of the training's observations.
+            ValueError: If the shape of the observation differs from `observation_shape`.
         """
         observation = np.asarray(observation)
         if observation.shape != self._shape:
@@ -188,7 +190,7 @@ class Policy:
         return self._activation(features)
 
     def _features(self, observation: np.ndarray) -> np.ndarray:
-        """Return the inputs of the first layer: features of the image, channel by channel, and the other entries."""
+        """Return the inputs of the first layer: features of the image, channel by channel, then the state."""
         if self._image_shape is None:
             return observation.astype(np.float32).ravel()
         height, width, channels = self._image_shape
@@ -207,7 +209,7 @@ class Policy:
 
 
 def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
-    """Return the digest of weights and description, which detects damaged files."""
+    """Return the digest of weights and description, by which damaged files are detected."""
     return digest(arrays, json.dumps(description, sort_keys=True))
 
 
@@ -223,7 +225,7 @@ def find_base_policy(source: str) -> BasePolicy:
     """Return the base policy of a registered name, or of a folder with `policy.safetensors`.
 
     Raises:
-        InputError: If there is no such base policy, or the folder's policy predicts no chunks.
+        InputError: If there is no base policy `source`, or the folder's policy predicts no chunks.
     """
     if source in BASE_POLICIES.names():
         return BASE_POLICIES.get(source)
@@ -242,7 +244,7 @@ def chunk_samples(policy: BasePolicy, observation: np.ndarray, num_outputs: int)
     """Return the chunks (E, K, O) that a base policy predicts for an observation (n,).
 
     Raises:
-        ValueError: If it does not return finite chunks of O outputs.
+        ValueError: If the policy does not return finite chunks of `num_outputs` (O) outputs.
     """
     samples = np.asarray(policy(observation), dtype=float)
     chunk = getattr(policy, "description", {}).get("chunk", (1, -1, num_outputs))
@@ -259,10 +261,10 @@ def chunk_samples(policy: BasePolicy, observation: np.ndarray, num_outputs: int)
 
 
 def mean_and_variance(samples: np.ndarray, num_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and the variance over the samples of chunks (E, K, O) at the next points, each (num_points, O).
+    """Return mean and variance over the samples of chunks (E, K, O) at the next points, each (num_points, O).
 
-    The last point of a chunk of fewer than `num_points` points is repeated. Covariances between outputs are left out,
-    because those of few samples are spurious. The variance of a single sample is zero.
+    If the chunks have fewer than `num_points` points, their last point is repeated. Covariances between outputs are
+    left out, because estimates from few samples are spurious. The variance of a single sample is zero.
     """
     points = np.minimum(np.arange(num_points), samples.shape[1] - 1)
     variances = samples.var(axis=0, ddof=1) if len(samples) > 1 else np.zeros(samples.shape[1:])

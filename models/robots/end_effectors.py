@@ -7,8 +7,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from guiderail.models.robots.robot import EndEffector, JointDrives, register_end_effector
 
-# A bayonet is locked by a quarter turn, from 90 degrees to 0. With the tool mounted half of that angle back, the
-# quarter turn is in the middle of the last joint's range for every robot.
+# A bayonet is locked by a quarter turn, from 90 degrees to 0. The tool is mounted at half of this angle, so that the
+# quarter turn is centered in the range of every robot's last joint.
 MOUNT_ANGLE = math.pi / 4  # half of the quarter turn [rad]
 
 CONNECTOR_TOOL = register_end_effector(

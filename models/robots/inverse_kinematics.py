@@ -9,7 +9,7 @@ from pydrake.solvers import Solve
 
 from guiderail.models.common.errors import InputError
 
-STARTS = 10  # number of start postures of a search: the given one, then random ones around it
+STARTS = 10  # number of start postures of a search: the given posture, then random postures around it
 TOLERANCE = 1e-9  # largest norm of the pose error, translation [m] and rotation [rad] together
 AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 
@@ -17,10 +17,10 @@ AT_LIMIT = 1e-6  # distance from a limit within which a joint is fixed [rad]
 def solve_inverse_kinematics(
     plant: MultibodyPlant, reference: Frame, tool_center: Frame, X: RigidTransform, posture: np.ndarray
 ) -> np.ndarray:
-    """Return the joint positions (n,) [rad] near `posture` that put the tool center at X in the reference frame.
+    """Return joint positions (n,) [rad] near `posture` at which the tool center has the pose X in the reference frame.
 
-    A local search minimizes ‖q − posture‖² subject to the pose and the joint limits, starting at `posture`. If it finds
-    no solution, further searches start at random postures, and the solution nearest to `posture` is returned. The
+    A local search starts at `posture` and minimizes ‖q − posture‖² subject to the pose and the joint limits. If it
+    finds no solution, further searches start at random postures, and the solution nearest to `posture` is returned. The
     random postures have a fixed seed, so that the result is deterministic.
 
     Args:
@@ -54,14 +54,14 @@ class _Problem:
         self._context = plant.CreateDefaultContext()
 
     def search(self, within_limits: bool) -> np.ndarray | None:
-        """Return the solution found from the posture, otherwise the nearest one found from random starts, or None."""
+        """Return the solution of the search from the posture, else the nearest solution from random starts, or None."""
         lower, upper = self._plant.GetPositionLowerLimits(), self._plant.GetPositionUpperLimits()
         if not within_limits:
             lower, upper = np.full_like(lower, -np.inf), np.full_like(upper, np.inf)
         solution = self._solve(self._posture, lower, upper, within_limits)
         if solution is not None:
             return solution
-        # Starts within half a turn of the posture, so that a joint with a range of several turns is not wound up.
+        # Starts within half a turn of the posture, so that a joint with a range of several turns does not turn farther.
         random = np.random.default_rng(0)
         low, high = np.maximum(lower, self._posture - np.pi), np.minimum(upper, self._posture + np.pi)
         starts = random.uniform(np.minimum(low, high), np.maximum(low, high), (STARTS - 1, len(lower)))
@@ -99,8 +99,8 @@ class _Problem:
     def _refine(self, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
         """Refine the solver's solution to the exact pose, with joints at their limits fixed; None if it fails.
 
-        The method is Levenberg-Marquardt, damped by the squared norm of the error: it converges quadratically at a
-        regular pose and takes no large steps at a singular one.
+        The method is Levenberg-Marquardt, damped by the squared norm of the error. It converges quadratically at a
+        regular posture, and its steps are small at a singular posture.
         """
         is_free = (q > lower + AT_LIMIT) & (q < upper - AT_LIMIT)
         error, J = self._error_and_jacobian(q)
@@ -126,6 +126,6 @@ class _Problem:
 
 
 def pose_error(X_desired: RigidTransform, X: RigidTransform) -> np.ndarray:
-    """Return the twist (6,) that leads from a pose to the desired one in unit time, rotation first [rad, m]."""
+    """Return the twist (6,) that leads from a pose to the desired pose in unit time, rotation first [rad, m]."""
     turn = (X_desired.rotation() @ X.rotation().inverse()).ToAngleAxis()
     return np.concatenate([turn.axis() * turn.angle(), X_desired.translation() - X.translation()])

@@ -1,4 +1,4 @@
-"""Joint limits of an arm, and distance from singular postures, as constraints on the commanded pose."""
+"""Constraints on the commanded pose: joint limits of an arm, and distance from singular postures."""
 
 from functools import lru_cache
 
@@ -21,21 +21,21 @@ _DIFFERENCE = 1e-6  # joint step of the finite difference of a singular value [r
 class JointRange:
     """Joint positions at a commanded pose [x y z Rz Ry Rx], and constraints on them.
 
-    The joint positions of a pose are those nearest to the posture, because null-space control brings an arm there.
-    Near a command y they are q(z) ≈ q(y) + J⁺ (z − y) for the Jacobian J from joint positions to the pose, so that
-    limits of the joints are linear constraints on the next command z. The second-order error of these constraints is
-    not bounded in advance: `violation` computes the joint positions of the command itself, and a command with a
-    violation is not executed (`MotionConstraintFilter`).
+    The joint positions of a pose are those nearest to the posture, because null-space control pulls the arm towards the
+    posture. Near a command y, the joint positions of a pose z are q(z) ≈ q(y) + J⁺ (z − y), with the Jacobian J from
+    joint positions to the pose. With this approximation, joint limits are linear constraints on the next command z. The
+    second-order error of these constraints is not bounded in advance. Therefore `violation` computes the joint
+    positions of the command itself, and a command with a violation is not executed (`MotionConstraintFilter`).
 
     Args:
         plant: Finalized plant with the arm only.
         reference: Frame of poses.
         tool_center: Frame whose pose is commanded.
         posture: Joint positions (n,) [rad] within the limits.
-        margin: Distance to keep from the limits [rad], not negative, for the deviation of an arm under impedance
-            control.
-        min_singular_value: Lower bound of the singular values of the Jacobian whose rotations are scaled by `LEVER`
-            [m]; 0 for no constraint.
+        margin: Distance of the command from the limits [rad], not negative: allowance for the position error of an arm
+            under impedance control.
+        min_singular_value: Lower bound [m] of the singular values of the Jacobian whose rotations are scaled by
+            `LEVER`; 0 for no constraint.
 
     Raises:
         InputError: If the posture is not within the limits and the margin, or an argument is negative or infinite.
@@ -51,11 +51,11 @@ class JointRange:
         min_singular_value: float = 0.0,
     ):
         if not (0.0 <= margin < np.inf and 0.0 <= min_singular_value < np.inf):
-            raise InputError(f"a margin and a singular value are not negative, not {margin} and {min_singular_value}")
+            raise InputError(f"margin and min_singular_value must be finite and ≥ 0: {margin}, {min_singular_value}")
         self._plant, self._reference, self._tool_center = plant, reference, tool_center
         self._context = plant.CreateDefaultContext()
         self._solve_once = lru_cache(maxsize=8)(self._solve)  # a control step requests the same poses several times
-        self._posture, self._smallest = np.array(posture, dtype=float), float(min_singular_value)
+        self._posture, self._min_singular_value = np.array(posture, dtype=float), float(min_singular_value)
         self._lower = plant.GetPositionLowerLimits() + margin
         self._upper = plant.GetPositionUpperLimits() - margin
         if not ((self._lower < self._posture) & (self._posture < self._upper)).all():
@@ -64,8 +64,8 @@ class JointRange:
     def solve(self, pose: np.ndarray) -> np.ndarray | None:
         """Return the joint positions (n,) [rad] of a pose (6,), nearest to the posture; None if none is found.
 
-        The positions may be beyond the limits. The result for a pose that is not finite is None. The array is
-        read-only, because results are cached.
+        The positions may be beyond the limits. A pose that is not finite has the result None. The array is read-only,
+        because results are cached.
         """
         return self._solve_once(np.asarray(pose, dtype=float).tobytes())
 
@@ -91,36 +91,36 @@ class JointRange:
     def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rows G (F, 6) of unit norm and c (F,) of constraints G y ≥ c near a pose (6,).
 
-        There are no rows if the pose cannot be reached.
+        If the pose cannot be reached, there are no rows.
         """
         q = self.solve(output)
         if q is None:
             return np.zeros((0, POSE_SIZE)), np.zeros(0)
         inverse = np.linalg.pinv(self._jacobian(q)) @ (TOOL_SCALE[:, None] * _twist_of_change(output))
         rows, bounds = [inverse, -inverse], [self._lower - q, q - self._upper]
-        if self._smallest:
+        if self._min_singular_value:
             value, gradient = self._singular_value(q)
             rows.append((gradient @ inverse)[None])
-            bounds.append(np.array([self._smallest - value]))
+            bounds.append(np.array([self._min_singular_value - value]))
         G, c = np.concatenate(rows), np.concatenate(bounds)
         norms = np.linalg.norm(G, axis=1)
-        used = norms > 1e-9  # a joint that does not move has no constraint
-        G = G[used] / norms[used, None]
-        return G, G @ output + c[used] / norms[used]
+        is_used = norms > 1e-9  # a joint that does not move has no constraint
+        G = G[is_used] / norms[is_used, None]
+        return G, G @ output + c[is_used] / norms[is_used]
 
     def violation(self, output: np.ndarray) -> float:
-        """Return the largest violation of a pose (6,), negative inside; infinite if it cannot be reached.
+        """Return the largest violation [rad] at a pose (6,): negative inside, infinite if the pose cannot be reached.
 
-        The violation of a joint limit is an angle [rad]. The violation of the singular value [m] is divided by `LEVER`
-        [m] to give an angle too.
+        The violation of a joint limit is an angle. The violation of the singular value [m] is divided by `LEVER` [m],
+        so that it is an angle too.
         """
         q = self.solve(output)
         if q is None:
             return np.inf
         violation = float(np.maximum(self._lower - q, q - self._upper).max())
-        if self._smallest:
+        if self._min_singular_value:
             sigma = np.linalg.svd(self._jacobian(q), full_matrices=False)[1]
-            violation = max(violation, (self._smallest - float(sigma[-1])) / LEVER)
+            violation = max(violation, (self._min_singular_value - float(sigma[-1])) / LEVER)
         return violation
 
     def _jacobian(self, q: np.ndarray) -> np.ndarray:
@@ -141,7 +141,7 @@ class JointRange:
 
 
 def _twist_of_change(pose: np.ndarray) -> np.ndarray:
-    """Return the matrix (6, 6) from a change of [x y z Rz Ry Rx] to the twist, rotation first."""
+    """Return the matrix (6, 6) from the rate of change of a pose [x y z Rz Ry Rx] to the twist, rotation first."""
     a, b = pose[3], pose[4]
     matrix = np.zeros((6, 6))
     matrix[3:, :3] = np.eye(3)

@@ -37,7 +37,7 @@ class MountedRobot:
 
 @dataclass(frozen=True)
 class MountedEndEffector:
-    """End effector on a robot's flange."""
+    """End effector on a robot's flange in a plant."""
 
     wrist: WeldJoint  # joint to the flange, at which a wrist sensor measures
     tool_center: Frame  # frame P of the tool center
@@ -51,7 +51,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     """Add a robot; its base is welded to the world's origin, unless the model file mounts it.
 
     Raises:
-        InputError: If its model file is missing, can't be read, or does not match the robot's data.
+        InputError: If the model file is missing, cannot be read, or does not match the robot's data.
     """
     label = f"robot {robot.name!r}"
     models = _read(plant, robot.model, label)
@@ -59,7 +59,7 @@ def add_robot(plant: MultibodyPlant, robot: Robot) -> MountedRobot:
     joints = [find("joint", name) for name in robot.joints]
     model = joints[0].model_instance()
     if any(joint.model_instance() != model for joint in joints):
-        raise InputError(f"{label}: its joints must all be of one model instance")
+        raise InputError(f"{label}: all its joints must belong to one model instance")
     base = find("frame", robot.base_frame)
     if not any(plant.get_joint(i).child_body().index() == base.body().index() for i in plant.GetJointIndices()):
         plant.WeldFrames(plant.world_frame(), base)
@@ -76,12 +76,13 @@ def add_end_effector(
     Args:
         plant: Plant with the robot, not finalized.
         robot: Robot, whose `tool_turn` defines the orientation of the mount.
-        mounted: The robot in the plant.
+        mounted: Robot in the plant.
         end_effector: End effector to mount.
-        as_rigid: Add a gripper, opened, as one rigid body, for a controller's plant; no effect on a rigid tool.
+        as_rigid: If True, add the opened gripper as one rigid body, for a controller's plant; no effect on a rigid
+            tool.
 
     Raises:
-        InputError: If its model file is missing, can't be read, or does not match its data.
+        InputError: If the model file is missing, cannot be read, or does not match the end effector's data.
     """
     X_FlangeMount = RigidTransform(RotationMatrix.MakeZRotation(robot.tool_turn), [0.0, 0.0, 0.0])
     X_FlangeMount = X_FlangeMount @ end_effector.X_FlangeMount
@@ -100,27 +101,24 @@ def lighten_rotors(robot: Robot, mounted: MountedRobot) -> None:
 
 
 def add_drives(actuators: Sequence[JointActuator], drives: JointDrives) -> None:
-    """Give each joint a spring to its desired position and a damper; the plant integrates both implicitly."""
+    """Add a spring to the desired position and a damper to each joint; the plant integrates both implicitly."""
     for actuator, stiffness, damping in zip(actuators, drives.stiffness, drives.damping, strict=True):
         actuator.set_controller_gains(PdControllerGains(p=stiffness, d=damping))
 
 
-def _read(plant: MultibodyPlant, file: Path, label: str, *, only_one: bool = False) -> list[ModelInstanceIndex]:
+def _read(plant: MultibodyPlant, file: Path, label: str) -> list[ModelInstanceIndex]:
     if not Path(file).is_file():
         raise InputError(f"{label}: there is no model file {file}")
     try:
-        models = add_models(plant, file)
+        return add_models(plant, file)
     except InputError as error:
         raise InputError(f"{label}: {error}") from error
-    if only_one and len(models) != 1:
-        raise InputError(f"{label}: {file} must hold one model, not {len(models)}")
-    return models
 
 
 def _find(
     plant: MultibodyPlant, models: Sequence[ModelInstanceIndex], label: str, file: Path, kind: str, name: str
 ) -> Any:
-    """Return the element with a name; `kind` is "frame", "body" or "joint"."""
+    """Return the frame, body or joint called `name`; `kind` is "frame", "body" or "joint"."""
     has_name = getattr(plant, f"Has{kind.title()}Named")
     for model in models:
         if has_name(name, model):
@@ -129,9 +127,11 @@ def _find(
 
 
 def _add_opened(plant: MultibodyPlant, end_effector: EndEffector) -> tuple[Frame, Frame, list[RigidBody], list[Joint]]:
-    """Add the model of an end effector at its opening; return mount, tool center, bodies and actuated joints."""
+    """Add the model of an opened end effector; return mount, tool center, bodies and actuated joints."""
     label = f"end effector {end_effector.name!r}"
-    models = _read(plant, end_effector.model, label, only_one=True)
+    models = _read(plant, end_effector.model, label)
+    if len(models) != 1:
+        raise InputError(f"{label}: {end_effector.model} must contain one model, not {len(models)}")
     find = partial(_find, plant, models, label, end_effector.model)
     mount, tool_center = (find("frame", name) for name in (end_effector.mount_frame, end_effector.tool_center))
     bodies = [find("body", name) for name in end_effector.bodies]
@@ -142,11 +142,14 @@ def _add_opened(plant: MultibodyPlant, end_effector: EndEffector) -> tuple[Frame
 
 
 def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) -> list[JointActuator]:
-    """Return the actuators of the joints, which must be all actuated joints of their model, in its order."""
+    """Return the actuators of the joints; these must be all actuated joints of their model, in the model's order."""
     if not joints:
         return []
-    everywhere = [plant.get_joint_actuator(index) for index in plant.GetJointActuatorIndices()]
-    actuators = [actuator for actuator in everywhere if actuator.model_instance() == joints[0].model_instance()]
+    actuators = [
+        actuator
+        for actuator in map(plant.get_joint_actuator, plant.GetJointActuatorIndices())
+        if actuator.model_instance() == joints[0].model_instance()
+    ]
     actuated = [actuator.joint().name() for actuator in actuators]
     names = [joint.name() for joint in joints]
     for name in names:
@@ -154,8 +157,8 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
             raise InputError(f"{label}: joint {name!r} has no actuator: give its model file a transmission")
     if names != actuated and sorted(names) == sorted(actuated):
         raise InputError(
-            f"{label}: its joints and the transmissions in its model file must both be in the order from the base on, "
-            f"not {', '.join(names)} and {', '.join(actuated)}"
+            f"{label}: its joints and the transmissions in its model file must both be in the order from base to "
+            f"flange, not {', '.join(names)} and {', '.join(actuated)}"
         )
     if names != actuated:
         raise InputError(f"{label}: name all joints that its model file actuates, in its order: {', '.join(actuated)}")
@@ -165,7 +168,7 @@ def _list_actuators(plant: MultibodyPlant, joints: Sequence[Joint], label: str) 
 def _check_joints(
     plant: MultibodyPlant, robot: Robot, joints: Sequence[Joint], actuators: Sequence[JointActuator], label: str
 ) -> None:
-    """Raise an `InputError` unless limits, masses and drives are complete and the postures are within the limits."""
+    """Raise an `InputError` unless limits, masses and drives are complete and postures are within the limits."""
     for index, (joint, actuator) in enumerate(zip(joints, actuators, strict=True)):
         lower, upper = joint.position_lower_limits().item(), joint.position_upper_limits().item()
         if not -math.inf < lower < upper < math.inf:

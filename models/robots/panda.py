@@ -14,7 +14,7 @@ PANDA = register_robot(
         joints=tuple(f"panda_joint{number}" for number in range(1, 8)),
         home=(0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.0),
         tool_turn=0.0,
-        # This value is a guess: the arm has joint torque feedback like the iiwa, but the value is not published.
+        # A guess: the arm has joint torque feedback like the iiwa, but its apparent inertia is not published.
         apparent_rotor_inertia=0.25,
         source=(
             "Franka's interface specifications: kinematics, limits; Gaz et al., IEEE RA-L 4(4), 2019: masses, centers "

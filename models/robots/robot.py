@@ -1,8 +1,8 @@
 """Robots and end effectors as data, and their registries.
 
-A robot of this package consists of a Python file and a model file. The Python file constructs a `Robot` and calls
-`register_robot`; `find_robot(name)` then returns it. An installed package adds robots by an entry point of the group
-`guiderail.robots` (end effectors: `guiderail.end_effectors`), a script by calling `register_robot`.
+A robot of this package consists of a Python file and a model file. The Python file constructs a `Robot` and registers
+it by `register_robot`; `find_robot(name)` returns it. An installed package adds a robot by an entry point of the group
+`guiderail.robots` (end effectors: `guiderail.end_effectors`), a script by a call of `register_robot`.
 """
 
 import math
@@ -25,7 +25,7 @@ class JointDrives:
         InputError: If the numbers of values differ, or a value is not a positive and finite number.
     """
 
-    stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic one
+    stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic joint
     # Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
     inertia: tuple[float, ...]
 
@@ -50,27 +50,27 @@ class Robot:
         name: Name in the registry.
         title: Name for users.
         model: URDF or SDF file, or a file of Drake model directives (.yaml) with its packages in the same folder. Each
-            joint needs an actuator with effort limit, rotor inertia and gear ratio: without reflected inertia an
-            impedance controller is unstable at a step of milliseconds. The transmissions must be in the order of the
-            joints.
+            joint needs an actuator with effort limit, rotor inertia and gear ratio, because an impedance controller
+            with a period of milliseconds is unstable without reflected inertia. The transmissions must be in the order
+            of the joints.
         base_frame: Frame that is welded to the world's origin, unless a joint of the model file moves or fixes it.
         flange_frame: Frame to which tools are mounted; its z axis points away from the arm.
         joints: Names of the joints (n,) from the base to the flange, each once.
-        home: Joint positions (n,) [rad], within the limits of the model file, with the flange pointing down in front of
-            the robot, far from limits and singularities; inverse kinematics starts there.
-        tool_turn: Rotation of the tool mount about the flange's z axis [rad] that aligns the tool's x axis with the
-            base's x axis if the last joint is in the middle of its range, and the other joints are at home.
+        home: Joint positions (n,) [rad] at which inverse kinematics starts: the flange points down in front of the
+            robot, far from singularities and from the limits of the model file.
+        tool_turn: Rotation of the tool mount about the flange's z axis [rad]. It aligns the tool's x axis with the
+            base's x axis if the last joint is in the middle of its range and the other joints are at home.
         apparent_rotor_inertia: Fraction of the rotors' reflected inertia that acts on the joints under torque control;
             joint torque feedback reduces it (Albu-Schäffer, Ott, Hirzinger 2007).
         drives: Drives of the joints under position control; None if unknown.
-        level_posture: Joint positions (n,) [rad] with a horizontal z axis of the flange, for a gripper that holds an
-            upright cup; None if unknown.
+        level_posture: Joint positions (n,) [rad] at which the flange's z axis is horizontal, for a gripper that holds
+            an upright cup; None if unknown.
         source: Source of the model's numbers.
 
     Raises:
         InputError: If there are fewer than six joints, a joint occurs twice, the number of joint positions or drives
-            differs from that of joints, a position or `tool_turn` is not a finite number, or `apparent_rotor_inertia`
-            is not in (0, 1].
+            differs from the number of joints, a position or `tool_turn` is not a finite number, or
+            `apparent_rotor_inertia` is not in (0, 1].
     """
 
     name: str
@@ -97,7 +97,7 @@ class Robot:
         if not (_are_numbers((self.apparent_rotor_inertia,), 1) and 0.0 < self.apparent_rotor_inertia <= 1.0):
             raise InputError(f"robot {self.name!r}: apparent_rotor_inertia must be more than 0 and at most 1")
         if self.drives is not None and len(self.drives.stiffness) != self.num_joints:
-            raise InputError(f"robot {self.name!r}: it has {self.num_joints} joints, so it needs as many drives")
+            raise InputError(f"robot {self.name!r} needs a drive for each of its {self.num_joints} joints")
 
     @property
     def num_joints(self) -> int:
@@ -110,15 +110,16 @@ class EndEffector:
     """End effector: a rigid tool or a gripper.
 
     Raises:
-        InputError: If there are no bodies, a position in `opening` is not finite, that of an actuated joint is missing,
-            or the number of drives differs from that of actuated joints.
+        InputError: If there are no bodies, a position in `opening` is not finite, `opening` lacks an actuated joint, or
+            the number of drives differs from the number of actuated joints.
     """
 
     name: str  # name in the registry
     title: str  # name for users
     model: Path  # URDF or SDF file
     mount_frame: str  # frame that is mounted to the flange
-    # Name of the frame P that a station commands: the center of compliance, z towards the flange, fixed to the mount.
+    # Name of the frame P whose pose a station commands: the center of compliance, with z towards the flange, fixed to
+    # the mount.
     tool_center: str
     bodies: tuple[str, ...]  # names of all bodies, the mount first
     # Pose of the mount in the flange frame, after a rotation of that frame by the robot's `tool_turn`.
@@ -167,10 +168,7 @@ robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot to the registry and return it.
-
-    Args:
-        robot: Robot with a name that is not registered yet.
+    """Add a robot, whose name is not registered yet, to the registry and return it.
 
     Raises:
         InputError: If `robot` is not a `Robot`, or its name is taken.

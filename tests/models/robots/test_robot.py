@@ -103,7 +103,7 @@ def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
         ({"joints": ("a",) * 6}, "each once"),
         ({"apparent_rotor_inertia": 0.0}, "apparent_rotor_inertia"),
         ({"apparent_rotor_inertia": 1.5}, "apparent_rotor_inertia"),
-        ({"drives": JointDrives((1.0,), (1.0,))}, "as many drives"),
+        ({"drives": JointDrives((1.0,), (1.0,))}, "needs a drive for each of its"),
     ],
 )
 def test_robot_refuses_invalid_data(wrong, sentence):

@@ -143,7 +143,7 @@ def test_save_makes_its_folder(tmp_path):
     policy.save(tmp_path / "new" / "folder")
     assert Policy.load(tmp_path / "new" / "folder")(np.ones(3)) == policy(np.ones(3))
     for file in ("policy.json", "policy.json/below"):
-        with pytest.raises(InputError, match=r"cannot be made \(.*\): name another folder"):
+        with pytest.raises(InputError, match=r"cannot be created \(.*\): name another folder"):
             policy.save(tmp_path / "new" / "folder" / file)
 
 
