@@ -19,7 +19,7 @@ DWELLS = (1, 1, 2, 3, 5, 10, 20, 50, 100)  # steps between two changes of sign
 class AttackResult:
     """Worst values that an adversary reached.
 
-    The first row of `excess` and of `residue` is the largest value at one step, the second the largest sum over a
+    In `excess` and `residue`, the first row is the largest value at one step, the second row the largest sum over a
     sequence.
     """
 
@@ -28,14 +28,14 @@ class AttackResult:
     largest: dict[str, np.ndarray]
     lower: np.ndarray  # smallest commands (N, O)
     upper: np.ndarray  # largest commands (N, O)
-    excess: np.ndarray  # (2, A), excess over ±1 of actions that give the corrected commands without a correction
+    excess: np.ndarray  # (2, A), excess over ±1 of the actions that lead to the corrected commands without a correction
     # (2, O), difference between the corrected commands and the commands of these actions, in outputs that no action
     # moves.
     residue: np.ndarray
     steps: int = 0  # number of executed steps
     corrected: int = 0  # number of steps with a correction
-    # Worst value, its actions (N, A) and its start (O,). The key is the quantity, the index of the output (for
-    # "excess" of the action), and True for steps at which a constraint can be active, False for the others.
+    # Worst value, its actions (N, A) and its start (O,). The key is the quantity, the index of the output (of the
+    # action for "excess"), and True for steps at which a constraint can be active, False for all other steps.
     worst: dict[tuple[str, int, bool], tuple[float, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
@@ -44,10 +44,10 @@ class Adversary:
 
     Args:
         loop: Loop to attack.
-        can_be_corrected: Mask (N,) of the steps at which a constraint can be active. These steps and the others have
-            separate worst values.
+        can_be_corrected: Mask (N,) of the steps at which a constraint can be active. Worst values are recorded
+            separately for these steps and for all other steps.
         seed: Seed of all random numbers.
-        attacks_budgets: If True, only sequences with the largest excess or residue are varied.
+        attacks_budgets: If True, variations start from sequences with the largest excess or residue only.
     """
 
     def __init__(self, loop: CertifiedLoop, can_be_corrected: np.ndarray, seed: int = 0, attacks_budgets: bool = False):
@@ -119,8 +119,8 @@ class Adversary:
             np.maximum(result.largest[name], values, out=result.largest[name])
             for is_corrected, steps in self._masks.items():
                 for o, value in enumerate(values[steps].max(axis=0, initial=0.0)):
-                    before = result.worst.get((name, o, is_corrected))
-                    if before is None or value > before[0]:
+                    previous = result.worst.get((name, o, is_corrected))
+                    if previous is None or value > previous[0]:
                         result.worst[name, o, is_corrected] = (float(value), actions, start)
 
     def _measure(self, commands: np.ndarray, start: np.ndarray) -> dict[str, np.ndarray]:
@@ -135,7 +135,7 @@ class Adversary:
         }
 
     def _sample_start(self) -> np.ndarray:
-        """Sample a corner of the box of starts or, with a history, any start in the box with probability 0.5."""
+        """Sample a corner of the box of starts; with a history, sample inside the box with probability 0.5."""
         loop, rng = self._loop, self._rng
         offset = rng.choice([-1.0, 1.0], len(loop.start))
         if self._past and loop.start_within.any() and rng.uniform() < 0.5:
@@ -153,7 +153,7 @@ class Adversary:
         return (1.0 - 2.0 * turns) * self._rng.choice([-1.0, 1.0], size), self._sample_start()
 
     def _impulse_signs(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the sequence that is worst without constraints, for one quantity at one step."""
+        """Return the actions and the start that are worst without constraints, for one quantity at one step."""
         rng, steps, size = self._rng, self._loop.primitive.num_steps, len(self._moved)
         if self._targets:
             order, o, n, side = self._targets.pop()
@@ -179,10 +179,10 @@ class Adversary:
     def _variation(self) -> tuple[np.ndarray, np.ndarray]:
         """Return one of the worst sequences so far, with parts negated or resampled, and sometimes shifted in time."""
         worst, rng = self.result.worst, self._rng
-        names = [name for name in worst if (name[0] not in QUANTITIES) or not self._attacks_budgets]
-        if not names or not len(self._moved):
+        keys = [key for key in worst if key[0] not in QUANTITIES or not self._attacks_budgets]
+        if not keys or not len(self._moved):
             return self._switching_actions()
-        _, actions, start = worst[names[rng.integers(len(names))]]
+        _, actions, start = worst[keys[rng.integers(len(keys))]]
         actions = actions.copy()
         for _ in range(rng.integers(1, 4)):
             first = rng.integers(len(actions))

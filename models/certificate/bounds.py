@@ -1,24 +1,25 @@
 """Bounds on the commands of a primitive for all sequences of actions in [−1, 1].
 
-Without active constraints the loop history → next command is affine and its reachable set is a zonotope. Its generators
-are the impulse responses. Its half-width along a direction is the sum of the absolute values of the generators along
-that direction. Three regimes are certified:
+Without active constraints, the next command is an affine function of the history and the action, and the set of
+reachable motions is a zonotope. The generators of the zonotope are the impulse responses. Its half-width along a
+direction is the sum of the absolute values of the generators along that direction. Three regimes are certified:
 
 - *free*: all sequences, until a constraint becomes active. These bounds are exact.
-- *always*: all sequences. The window of a step is this step and its H future points with constraints. The bounds are
-  those of *free* at steps where no constraint of the window can be active. With a history, they are those of *free*
-  only before the first step where one can. Elsewhere, a constrained output is bounded by the constraints themselves.
+- *always*: all sequences. The window of a step consists of this step and its H future points with constraints. Without
+  a history, the bounds of *free* are valid at each step where no constraint of the window can be active; with a
+  history, only before the first step where a constraint can be active. At all other steps, a constrained output is
+  bounded by the constraints themselves.
   Without a history (KGRL), a command depends on one action only, and the actions are divided into cells. An action in
   a cell is a convex combination of the corners, with weights λ_i. The same combination v̄ = Σ λ_i v_i of the corners'
   corrections v_i is feasible for this action. The smallest feasible correction v satisfies ‖v − v̄‖² ≤ ‖v̄‖² − ‖v‖².
   The multipliers at a corner give a lower bound of ‖v‖ (weak duality). So an output exceeds the range of the outputs
   at the corners by at most ‖v − v̄‖ times the output's largest displacement per unit of correction. With a history,
-  corrections feed back: an unconstrained output that is coupled to a constrained one has no bound in this regime.
+  corrections act on later commands, and an unconstrained output that is coupled to a constrained output has no bound.
 - *budgeted*, with a history: all sequences whose corrections satisfy a budget. A corrected command equals the command
   of another action, possibly outside ±1, plus a residue in the outputs that no action moves. The budget limits the
   excess of these actions over ±1, and the residue, at one step and summed over the sequence. Excess and residue are
   small, because a correction counteracts the action that violates a constraint. In the worst case, the corrections
-  occur at the steps with the largest response. The budget is an assumption about the sequence; it is not proven.
+  occur at the steps with the largest response. The budget is an assumption about the sequence and is not proven.
 """
 
 import itertools
@@ -47,7 +48,7 @@ class CertifiedBounds:
     always: Bounds  # bounds for all sequences
     can_be_active: np.ndarray  # mask (N,) of the steps at which some actions make a constraint of the window active
     # Lagrange multipliers that prove `always`, (T, (K+1)^A, H+1, F): T steps of `can_be_active`, corners of the cells
-    # (K along each of A actions), points of the window, and constraints of each point. Empty with a history.
+    # (K cells along each of A actions), points of the window, and constraints of each point. Empty with a history.
     multipliers: np.ndarray
     budgeted: BudgetedBounds | None = None  # bounds for corrections within a budget, or None
 
@@ -55,7 +56,7 @@ class CertifiedBounds:
 def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBounds:
     """Compute the bounds of a loop.
 
-    The regime *budgeted* is skipped without a budget, without a history, or if no constraint can be active.
+    The regime *budgeted* is left out without a budget, without a history, or if no constraint can be active.
 
     Raises:
         InputError: If a primitive without a history has more than `MAX_ACTIONS` actions, or its constraints leave less
@@ -128,7 +129,7 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
         spread = history_map @ generators[n : past + n].reshape(history_map.shape[1], generators.shape[2])
         spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
-        # A constraint that is almost reached counts as active, so that the result does not depend on rounding.
+        # A constraint with less slack than `BORDER` counts as active, so that the result does not depend on rounding.
         limits = np.array([lower, upper])
         near = BORDER * (np.abs(value - np.where(np.isfinite(limits), limits, value)) + size)
         can_be_active[n] = bool((value - size < lower + near[0]).any() or (value + size > upper - near[1]).any())
@@ -136,7 +137,7 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
 
 
 def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds (2, N, O) of corrected commands, NaN at other steps, and the multipliers that prove them."""
+    """Return bounds (2, N, O) of corrected commands, NaN at steps without corrections, and multipliers as proof."""
     primitive = _with_margin(loop.primitive)
     bounds, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
     actions, cells = action_cells(loop.gains)
@@ -144,16 +145,17 @@ def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.nda
         predictions = [primitive.predict(n, action) for action in actions]
         multipliers.append([prediction.multipliers for prediction in predictions])
         rows, lower, upper = loop.primitive.free_constraints(n)  # without `CORNER_MARGIN`, for `_min_norms`
-        rank = next((len(one.correction) for one in predictions if one.correction is not None), 0)
-        corrections = np.array([np.zeros(rank) if one.correction is None else one.correction for one in predictions])
+        solutions = [prediction.correction for prediction in predictions]
+        rank = next((len(solution) for solution in solutions if solution is not None), 0)
+        corrections = np.array([np.zeros(rank) if solution is None else solution for solution in solutions])
         free, sizes = actions @ rows.T, primitive.output_sizes(n)
-        outputs = np.array([one.output for one in predictions])
+        outputs = np.array([prediction.output for prediction in predictions])
         ranges = []
         for cell in cells:
             norms = [
                 _min_norms(predictions[k].signed_multipliers, free[cell], lower, upper, corrections[k]) for k in cell
             ]
-            radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], each) for each in norms))
+            radius = sizes * np.sqrt(min(_squared_radius(corrections[cell], min_norms) for min_norms in norms))
             ranges.append([outputs[cell].min(axis=0) - radius, outputs[cell].max(axis=0) + radius])
         bounds[0, n], bounds[1, n] = np.min(ranges, axis=0)[0], np.max(ranges, axis=0)[1]
     return bounds, np.array(multipliers) if multipliers else _no_multipliers(primitive)
@@ -172,14 +174,14 @@ def _with_margin(primitive: LcNsKmp) -> LcNsKmp:
     except InputError as error:
         raise InputError("constraints that leave less than 20 nm of room can't be certified: widen them") from error
     settings = {name: getattr(primitive, name) for name in ("lambda_", "beta", "horizon", "solver")}
-    # The deviation is not checked again: the motion without constraints is that of `primitive`, which was accepted.
+    # No check of the deviation: the motion without constraints is that of `primitive`, which has passed this check.
     return LcNsKmp(primitive.reference, primitive.kernel, constraints=tightened, max_deviation=np.inf, **settings)
 
 
 def _min_norms(
     signed: np.ndarray | None, free: np.ndarray, lower: np.ndarray, upper: np.ndarray, correction: np.ndarray
 ) -> np.ndarray:
-    """Return lower bounds, proven by multipliers, on the norms of the corrections at a cell's corners, or zeros."""
+    """Return lower bounds on the norms of the corrections at a cell's corners, proven by multipliers, or zeros."""
     norm = np.linalg.norm(correction)
     if signed is None or not norm > 0.0:
         return np.zeros(len(free))
@@ -201,7 +203,7 @@ def _no_multipliers(primitive: LcNsKmp) -> np.ndarray:
 
 
 def _find_coupled(primitive: LcNsKmp) -> np.ndarray:
-    """Return the mask (O,) of outputs that are constrained, or coupled to a constrained one by covariance."""
+    """Return the mask (O,) of outputs that are constrained, or coupled to a constrained output by covariance."""
     coupling = (primitive.reference.covariances != 0.0).any(axis=0)
     is_coupled = (primitive.constraints.G.reshape(-1, primitive.num_outputs) != 0.0).any(axis=0)
     for _ in range(primitive.num_outputs):
@@ -210,13 +212,12 @@ def _find_coupled(primitive: LcNsKmp) -> np.ndarray:
 
 
 def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarray) -> Bounds:
-    """Combine the bounds without constraints with those of corrected commands (2, N, O), which are NaN elsewhere."""
+    """Combine the bounds `free` with those of corrected commands (2, N, O), which are NaN at steps of `free`."""
     is_corrected = ~np.isnan(corrected_bounds[0])
     low, high = single_output_bounds(loop)
     lower = np.where(is_corrected, np.maximum(corrected_bounds[0], low), free.lower)
     upper = np.where(is_corrected, np.minimum(corrected_bounds[1], high), free.upper)
-    # Values at each step and at the two steps before it. Before the first step, the robot rests at a pose in the box of
-    # starts.
+    # Bounds from two steps before the first step on, when the robot rests at a pose in the box of starts.
     least = np.vstack([[loop.start - loop.start_within] * 2, lower])
     greatest = np.vstack([[loop.start + loop.start_within] * 2, upper])
     recent = np.vstack([np.zeros((2, lower.shape[1]), bool), is_corrected])

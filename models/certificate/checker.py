@@ -2,12 +2,12 @@
 
 Exit codes: 0 valid, 1 rejected, 2 unreadable or wrong arguments.
 The checker bounds the commands y of a window of steps for all actions a. Given the history h, the prior has the mean
-W h and the kernel C; μ, Σ, λ and β are the primitive's means, covariances and parameters, G its rows of constraints:
+W h and the kernel C. μ, Σ, λ and β are the primitive's means, covariances and parameters, G its rows of constraints:
     y = W h + S Σ⁻¹ (μ − W h) + β S[:, first] a + S Gᵀ α,   S = (Σ⁻¹ + (λ + β) C⁻¹)⁻¹,   multipliers α ≥ 0
 
-Windows are computed in extended precision, with a bound on their rounding errors for which a claim must leave room
-(docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also compares subject, primitive, impedance
-and budget with those of the skill. The digest detects accidental changes only; a signature needs the key.
+Windows are computed in extended precision. The computed bounds include a bound on the rounding errors, and a claim must
+not be tighter (docs/concepts/certificates.md). `guiderail certify SKILL --verify FOLDER` also compares subject,
+primitive, impedance and budget with those of the skill. Only a signature, made with a key, detects deliberate changes.
 """
 
 import hashlib
@@ -27,14 +27,14 @@ Real = np.longdouble
 KERNELS: dict[str, Any] = {"squared_exponential": lambda d, length: (-(d * d) / (2 * length * length)).exp()}
 QUANTITIES, BUDGETS = ("lower", "upper", "speed", "acceleration"), ("excess", "residue")
 AGREEMENT = 1e-4  # largest excess of a claim over the computed value, relative to the largest value of the quantity
-BORDER = 1e-5  # slack, relative to a constraint's terms, up to which a claim that the constraint is active is accepted
+BORDER = 1e-5  # largest slack of a constraint that a claim may call active, relative to the constraint's terms
 COMMAND_TOLERANCE = 1e-9  # largest violation of constraints, with rows of unit norm, that the primitive accepts
 ROUNDING = 1e-6  # smallest squared radius of a cell, relative to the squared correction
 getcontext().prec = 60
 EPS, EXTENDED = 2.0**-52, float(np.finfo(Real).eps)
 MAX_BYTES = 2**30  # largest size of the arrays of one file
 MAX_WINDOW = 500  # history and horizon together must be less [steps]; environments accept 200 of each
-# First halves of the SHA-256 of assumptions: the six that are always stated, that of a budget, that of another period
+# First halves of the SHA-256 of assumptions: the six required ones together, that of a budget, that of another period
 ASSUMED = ["9bd65911915dcaf0b60317de23ac5814", "24d1c5853812f1558e29694e3071f8b5", "a36592ef1fbc0ffbb0d3964081e759de"]
 # Kind and shape of each array: N steps, O outputs, F rows, H steps of a window, T active steps, C corners, R rounds
 ARRAYS: dict[str, dict[str, tuple[str, str]]] = {
@@ -53,10 +53,10 @@ class Rejected(Exception):
     """Reason why a certificate is rejected."""
 
 
-def require(condition: Any, words: str) -> None:
-    """Raise `Rejected` with the reason `words` unless a condition holds."""
+def require(condition: Any, reason: str) -> None:
+    """Raise `Rejected` with a reason unless a condition holds."""
     if not condition:
-        raise Rejected(words)
+        raise Rejected(reason)
 
 
 def canonical(claims: dict[str, Any], *left_out: str) -> str:
@@ -99,7 +99,7 @@ def read(folder: Path, key: bytes | None) -> tuple[Arrays, Arrays, dict[str, Any
 
 
 def numbers(value: Any, shape: tuple[int, ...], what: str, may_be_null: bool = False) -> np.ndarray:
-    """Return lists of floats as an array, with `may_be_null` null as NaN; reject anything else, such as integers."""
+    """Convert nested lists of floats to an array, null to NaN if `may_be_null`; reject other types, even integers."""
     if shape:
         require(type(value) is list and len(value) == shape[0], f"{what} has another shape")
         return np.array([numbers(one, shape[1:], what, may_be_null) for one in value]).reshape(shape)
@@ -163,7 +163,7 @@ class Primitive:
         np.linalg.cholesky(self.covariances)  # raises an error unless they are positive definite
         eye = np.broadcast_to(np.eye(self.outputs, dtype=Real), self.covariances.shape)
         self.precisions = solve(self.covariances.astype(Real), eye)
-        # The kernel is the same in every window: it is conditioned on the history in 60 digits, once.
+        # The kernel, which is the same in every window, is conditioned on the history once, with 60 digits.
         n, P, length = self.past + self.horizon + 1, self.past, Decimal(float(p["length_scale"]))
         along = [KERNELS[kernel](k * Decimal(float(p["clock"])), length) for k in range(n)]
         k = np.array(along, dtype=object)[np.abs(np.arange(n)[:, None] - np.arange(n))]
@@ -191,8 +191,8 @@ class Primitive:
     def window(self, n: int) -> tuple[Any, ...]:
         """Compute the window's maps of history and action, offset, L with S = L Lᵀ, rows, c and two bounds on errors.
 
-        The first bound is a function of the history without actions, (P outs,), and of the history's generators,
-        (P outs, K). The second bound is per unit of the actions.
+        The first bound is a function of the history without actions (P outs,) and the history's generators (P outs, K).
+        The second bound is per unit of the actions.
         """
         outs, at = self.outputs, np.minimum(np.arange(n, n + self.horizon + 1), self.steps - 1)
         eye, precision, r = np.eye(outs, dtype=Real), self.precisions[at], self.F.shape[1] * self.outputs
@@ -234,7 +234,7 @@ class Primitive:
         """Compute the commands that are reached without active constraints, and bounds where one can be active.
 
         Returns: centers (P + N, outs) and generators (P + N, outs, B) of commands, bounds (P + N, outs) of their
-        rounding errors, bounds (2, N, outs) of corrected commands, or NaN, and maps (N, outs, P outs) of histories.
+        rounding errors, bounds (2, N, outs) of corrected commands or NaN, and maps (N, outs, P outs) of histories.
         """
         P, N, outs = self.past, self.steps, self.outputs
         moved, claimed = np.flatnonzero(p["gains"]), witness["active"]
@@ -352,7 +352,7 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, limits: Any, alp
     nodes = np.array(list(itertools.product(range(along + 1), repeat=A)))
     free = y + (2.0 * nodes / along - 1.0) @ by.T
     v, short = alphas @ rows_L, c - free @ rows.T
-    # The corrections at corners are feasible in spite of rounding; then their interpolation is feasible in the cell.
+    # If the corrections at corners are feasible in spite of rounding, their interpolation is feasible in the cell.
     sizes = np.abs(alphas) @ (np.abs(rows_L) @ np.abs(rows_L).T)
     require(
         (v @ rows_L.T - short >= room + 8 * len(c) * EPS * sizes).all(), f"step {n}: a correction violates a constraint"
@@ -372,7 +372,7 @@ def cells(n: int, y: np.ndarray, by: np.ndarray, L: np.ndarray, limits: Any, alp
 
 
 def compare(claims: dict[str, Arrays], computed: dict[str, Arrays]) -> None:
-    """Reject a claim that is tighter than the computed quantity, or much wider, and name the worst step."""
+    """Reject a claim that is tighter than the computed quantity or much wider; the reason names the worst step."""
     for regime, name in itertools.product(computed, QUANTITIES):
         own, claimed, sign = computed[regime][name], claims[regime][name], -1.0 if name == "lower" else 1.0
         require(not np.isnan(own).any(), f"{regime} {name} has no value: numbers are too large")
@@ -386,7 +386,7 @@ def compare(claims: dict[str, Arrays], computed: dict[str, Arrays]) -> None:
 
 
 def check_forces(impedance: Any, computed: dict[str, Arrays] | None, regimes: tuple[str, ...], outputs: int) -> None:
-    """Reject forces that do not follow from `impedance` and `computed` bounds; None: no impedance, no bounds yet."""
+    """Reject forces that do not follow from `impedance` and from `computed` bounds; None: no impedance, no bounds."""
     if impedance is None:
         return
     fields(impedance, ("stiffness", "limits", "force", "rest_force"), "impedance")

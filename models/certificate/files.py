@@ -54,7 +54,7 @@ def certificate_files(
         stiffness: Stiffness (6,) [N/m, Nm/rad] of the impedance that executes the commands; None if the robot has no
             impedance.
         limits: Limits (6,) of the impedance's wrench [N, Nm]; None if the robot has no impedance.
-        about: Texts by name that identify the skill: its task, and others such as its run.
+        about: Texts that identify the skill, by name: the task, and further texts such as the run.
         key: Key of the signature; None for no signature. The checker rejects a key of fewer than 16 bytes.
 
     Raises:
@@ -103,7 +103,7 @@ def certificate_files(
 
 
 def seal(claims: Mapping[str, Any], key: bytes | None = None) -> bytes:
-    """Return the text of claims with their digest, which anyone can compute, and with a signature if a key is given."""
+    """Return the text of claims with their digest, which needs no key, and with a signature if a key is given."""
     content = {name: value for name, value in claims.items() if name not in ("digest", "signature")}
     content["digest"] = hashlib.sha256(checker.canonical(content).encode()).hexdigest()
     if key is not None:
@@ -120,12 +120,12 @@ def compare_subject(
 ) -> str | None:
     """Return the name of the first difference between a certificate and a skill, or None.
 
-    Everything that the checker assumes is compared, except for the budget: the skill's description, kernel, period,
-    impedance, primitive, gains, start and constraints. `files` has the content of each file of a certificate that the
-    checker accepts; the other arguments describe the skill as in `certificate_files`.
+    All inputs of the checker except the budget are compared: the skill's description, kernel, period, impedance,
+    primitive, gains, start and constraints. `files` contains the files of a certificate that the checker accepts, by
+    name; the other arguments describe the skill as in `certificate_files`.
 
     Raises:
-        InputError: If the skill cannot have a certificate, as in `certificate_files`.
+        InputError: If the skill cannot be certified, as in `certificate_files`.
     """
     claims = json.loads(files[CERTIFICATE])
     claimed = {name: claims[name] for name in ("about", "kernel", "period")}
@@ -150,7 +150,7 @@ def _checked_kernel(loop: CertifiedLoop) -> str:
 
 
 def _subject_arrays(loop: CertifiedLoop) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the arrays of the primitive in its loop, and those of its constraints at every step.
+    """Return the arrays of the primitive and its loop, and the arrays of its constraints at every step.
 
     Raises:
         InputError: If the primitive's time steps are not equal.
@@ -178,7 +178,7 @@ def _subject_arrays(loop: CertifiedLoop) -> tuple[dict[str, Any], dict[str, Any]
 
 
 def _as_lists(bounds: Bounds) -> dict[str, Any]:
-    """Return bounds, widened by the margin for rounding, as lists with None for an infinite bound."""
+    """Return bounds, widened by the margin `OUTWARD`, as lists with None for an infinite bound."""
     lists = {}
     for name in ("lower", "upper", "speed", "acceleration"):
         values = getattr(bounds, name)

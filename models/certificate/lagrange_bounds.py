@@ -2,11 +2,11 @@
 
 A correction is the change of a command by active constraints; see `bounds.py` for the budget.
 
-The largest value of a direction over a zonotope is the sum of the absolute values of the generators along this
-direction. Commands at other steps satisfy constraints, too. For any multiplier α, another valid bound is computed by
-subtracting α times the generators of such a command from those of the direction, and adding |α| times the margin of
-the command's constraint. Any multipliers prove a bound; they are feasible points of the dual of a linear program. A
-greedy search finds good multipliers.
+The largest displacement from the center of a zonotope along a direction is the sum of the absolute values of the
+generators along this direction. Constraints on commands at nearby steps tighten this bound: for any multiplier α,
+subtract α times the generators of such a command from those along the direction, and add |α| times the margin of the
+command's constraint. Any multipliers give a valid bound, because they are feasible points of the dual of a linear
+program. A greedy search finds good multipliers.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_outp
 
 ROUNDS = 4  # number of constraints at nearby steps that tighten one bound
 MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing [steps]
-NUM_CANDIDATES = 6  # number of constraints tried in each round: those most correlated with the direction
+NUM_CANDIDATES = 6  # number of constraints tried in each round, those most correlated with the direction
 FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
 
 
@@ -33,15 +33,15 @@ class Budget:
 class BudgetedBounds:
     """Bounds under the assumption that corrections satisfy a budget.
 
-    The last three attributes prove the bounds. Their shape is (3, 2, N, O, R): order of the difference (0 for
-    commands, 1 for speeds, 2 for accelerations), sign, step, output and round of the search.
+    The last three attributes prove the bounds. The axes of their shape (3, 2, N, O, R) are the order of the difference
+    (0 for commands, 1 for speeds, 2 for accelerations), sign, step, output and round of the search.
     """
 
     budget: Budget  # assumed budget
     bounds: Bounds  # bounds on commands, speeds and accelerations
     steps: np.ndarray  # step of the constraint that tightens a bound
-    outputs: np.ndarray  # output of that constraint
-    multipliers: np.ndarray  # multiplier of that constraint, positive if it is an upper bound, negative if a lower one
+    outputs: np.ndarray  # output of this constraint
+    multipliers: np.ndarray  # multiplier of this constraint, positive for an upper bound, negative for a lower bound
 
 
 def bound_within_budget(
@@ -79,7 +79,7 @@ def bound_within_budget(
 
 
 def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
-    """Compute the responses (P + N, O, B) to a unit residue in each unmoved output at each step from `first` on."""
+    """Compute the responses (P + N, O, B) to a unit residue at each step from `first` in each unmoved output."""
     primitive, past = loop.primitive, loop.primitive.history
     steps, unmoved = primitive.num_steps, np.flatnonzero(loop.gains == 0.0)
     response = np.zeros((past + steps, primitive.num_outputs, (steps - first) * len(unmoved)))
@@ -93,7 +93,7 @@ def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
 class MultiplierSearch:
     """Greedy search for Lagrange multipliers that tighten the bound in a direction.
 
-    Arguments are those of `bound_within_budget`, with `generators` followed by those of `residue_generators`.
+    The arguments are those of `bound_within_budget`; `generators` also include the `residue_generators`, at the end.
     """
 
     def __init__(self, loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
@@ -118,30 +118,30 @@ class MultiplierSearch:
     def find(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return steps, outputs and multipliers (O, R) that tighten the bound in directions (O, ·)."""
         outputs = len(directions)
-        rest, every = directions[:, : self._free].copy(), np.arange(outputs)
+        rest, rows = directions[:, : self._free].copy(), np.arange(outputs)
         shape = (outputs, ROUNDS)
         steps, constrained, multipliers = np.zeros(shape, int), np.zeros(shape, int), np.zeros(shape)
         for r in range(ROUNDS if len(self._at) else 0):
             products = rest @ self._rows.T
             tried = np.argsort(-np.abs(products) / np.sqrt(self._sizes), axis=1)[:, :NUM_CANDIDATES]
-            alpha = (products / self._sizes)[every[:, None], tried][..., None] * FACTORS
+            alpha = (products / self._sizes)[rows[:, None], tried][..., None] * FACTORS
             margin = self._margins[(alpha > 0.0).astype(int), self._at[tried][..., None], self._of[tried][..., None]]
             cost = np.where(np.isfinite(margin), np.abs(alpha) * np.where(np.isfinite(margin), margin, 0.0), np.inf)
             bounds = np.abs(rest[:, None, None] - alpha[..., None] * self._rows[tried][:, :, None]).sum(axis=3) + cost
             best = bounds.reshape(outputs, -1).argmin(axis=1)
-            is_better = bounds.reshape(outputs, -1)[every, best] < np.abs(rest).sum(axis=1)
-            row = tried[every, best // len(FACTORS)]
-            steps[:, r], constrained[:, r] = self._at[row], self._of[row]
-            multipliers[:, r] = np.where(is_better, alpha.reshape(outputs, -1)[every, best], 0.0)
-            rest -= multipliers[:, r, None] * self._rows[row]
+            is_better = bounds.reshape(outputs, -1)[rows, best] < np.abs(rest).sum(axis=1)
+            chosen = tried[rows, best // len(FACTORS)]
+            steps[:, r], constrained[:, r] = self._at[chosen], self._of[chosen]
+            multipliers[:, r] = np.where(is_better, alpha.reshape(outputs, -1)[rows, best], 0.0)
+            rest -= multipliers[:, r, None] * self._rows[chosen]
         return steps, constrained, multipliers
 
     def bound(
         self, directions: np.ndarray, steps: np.ndarray, outputs: np.ndarray, multipliers: np.ndarray
     ) -> np.ndarray:
-        """Compute upper bounds (O,) on the displacement of commands in directions, given as generators (O, ·).
+        """Compute upper bounds (O,) on the displacement along directions, which are given as generators (O, ·).
 
-        The `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R) prove the bounds.
+        The bounds are proven by the `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R).
         """
         rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]

@@ -1,4 +1,4 @@
-"""Feedback loop that a certificate is about: its data, and the set of its motions without active constraints."""
+"""Feedback loop of a primitive, the subject of a certificate, and its motions without active constraints."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 
 @dataclass(frozen=True)
 class CertifiedLoop:
-    """Feedback loop of a primitive: the next command depends on the past commands (with a history) and the action."""
+    """Feedback loop of a primitive: the next command depends on the action and, with a history, on past commands."""
 
     primitive: LcNsKmp  # movement primitive
     gains: np.ndarray  # null-space action per unit of the action (O,); zero for outputs that no action moves
@@ -21,7 +21,7 @@ class CertifiedLoop:
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of the commands at every step, for one regime of `bounds`; infinite where a command has no bound."""
+    """Bounds of the commands at every step in one regime of `bounds.py`; infinite if a command has no bound."""
 
     lower: np.ndarray  # smallest command (N, O) [unit of the output]
     upper: np.ndarray  # largest command (N, O) [unit of the output]
@@ -34,8 +34,8 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 
     Returns:
         Center (P + N, O) and generators (P + N, O, B) of the zonotope [unit of the output]. The center is the motion
-        without actions; it begins with P copies of the start. There is one generator for each entry of each step's
-        action and, with a history, one for each output of the start.
+        without actions and begins with P copies of the start. Each entry of each step's action has one generator; with
+        a history, so has each output of the start.
     """
     primitive, past = loop.primitive, loop.primitive.history
     steps, outputs = primitive.num_steps, primitive.num_outputs
@@ -58,7 +58,7 @@ def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
 def single_output_bounds(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Return lower and upper bounds (N, O) from the constraints on a single output, widened by `TOLERANCE`.
 
-    The bounds [unit of the output] are infinite where no constraint is on this output alone.
+    The bounds [unit of the output] are infinite if no constraint applies to this output alone.
     """
     primitive = loop.primitive
     G, c = primitive.constraints.window(np.arange(primitive.num_steps))

@@ -1,8 +1,8 @@
 """Active constraints: projections of the end effector's pose into an allowed set (thesis, equation 2.21).
 
 Each projection is idempotent up to rounding: an allowed pose is not changed. The constraints of a state are applied in
-the order of the file. A constraint on the orientation that depends on the position therefore comes after the
-constraints on the position.
+the order of the file. Therefore, constraints on the position must precede a constraint on the orientation that depends
+on the position.
 """
 
 import math
@@ -41,21 +41,21 @@ class ActiveConstraint(StatePart, ABC):
         """Return the projection of X_WE, equal to X_WE up to rounding if X_WE is allowed."""
 
     def violation(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the distance of X_WE from its projection, the larger of position [m] and angle [rad]; 0 if allowed."""
+        """Return the distance between X_WE and its projection, the larger of position [m] and angle [rad]."""
         return pose_distance(self.project(X_WE, frames), X_WE)
 
 
 class FrameConstraint(ActiveConstraint):
     """Constraint on the pose in one frame F, computed on arrays.
 
-    Consecutive constraints in the same frame share one conversion of the pose, see `ConstraintGroup`.
+    The pose is converted to F once for consecutive constraints in the same frame, see `ConstraintGroup`.
     """
 
     frame: str
 
     @abstractmethod
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; the argument itself means no change."""
+        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; an unchanged one is the argument itself."""
 
     @override
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
@@ -68,7 +68,7 @@ class FrameConstraint(ActiveConstraint):
 
 @dataclass(frozen=True)
 class ConstraintGroup:
-    """Constraints in the same frame, at least one, applied in order."""
+    """One or more constraints in the same frame, applied in order."""
 
     constraints: tuple[FrameConstraint, ...]
 
@@ -78,7 +78,7 @@ class ConstraintGroup:
         R_FE, p_FE = R, p = pose_in(frame, X_WE, frames)
         for constraint in self.constraints:
             R, p = constraint.project_in_frame(R, p)
-        # An unchanged part is not converted: conversion to the frame and back would change the last digits.
+        # An unchanged position or rotation is not converted back, because conversion would change the last digits.
         if p is not p_FE:
             X_WE = with_position_in(frame, p, X_WE, frames)
         if R is not R_FE:
@@ -99,7 +99,7 @@ class ConstraintGroup:
 
 
 def group_constraints(constraints: Iterable[ActiveConstraint]) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
-    """Return the constraints in their order, consecutive ones in the same frame as one group."""
+    """Return the constraints in their order; consecutive constraints in the same frame form a group."""
     groups: list[ActiveConstraint | ConstraintGroup] = []
     for constraint in constraints:
         last = groups[-1] if groups else None
@@ -144,8 +144,8 @@ class HalfSpace(PositionConstraint):
 
     @override
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
-        short = self.offset_m - self._unit @ p_FE
-        return p_FE if short <= 0 else p_FE + short * self._unit
+        shortfall = self.offset_m - self._unit @ p_FE
+        return p_FE if shortfall <= 0 else p_FE + shortfall * self._unit
 
 
 @register(ACTIVE_CONSTRAINTS, "box")
@@ -164,9 +164,8 @@ class Box(PositionConstraint):
 
     @override
     def project_position(self, p_FE: np.ndarray) -> np.ndarray:
-        inside = p_FE.tolist()
-        # Plain Python: NumPy is many times slower for three numbers, and each command evaluates this repeatedly.
-        if all(low <= x <= high for low, x, high in zip(self.lower_m, inside, self.upper_m, strict=True)):
+        # Plain Python, because NumPy is many times slower for three numbers and each command needs several projections.
+        if all(low <= x <= high for low, x, high in zip(self.lower_m, p_FE.tolist(), self.upper_m, strict=True)):
             return p_FE
         return np.clip(p_FE, self.lower_m, self.upper_m)
 
@@ -176,8 +175,7 @@ class Box(PositionConstraint):
 class Cylinder(PositionConstraint):
     """Bounds on the distance from F's z axis; z is free.
 
-    `min_radius_m` is the radius of an excluded region around the axis; everything beyond `max_radius_m` is excluded
-    too.
+    Positions nearer to the axis than `min_radius_m` and farther from it than `max_radius_m` are excluded.
     """
 
     frame: str  # F: frame of an object, or `world`
@@ -247,19 +245,19 @@ class KeepAbove(FrameConstraint):
 
     @override
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        short = self.height_m - (float((R_FE[2] @ self._points).min()) + p_FE[2])
-        return R_FE, p_FE if short <= 0 else np.array([p_FE[0], p_FE[1], p_FE[2] + short])
+        shortfall = self.height_m - (float((R_FE[2] @ self._points).min()) + p_FE[2])
+        return R_FE, p_FE if shortfall <= 0 else np.array([p_FE[0], p_FE[1], p_FE[2] + shortfall])
 
 
 @register(ACTIVE_CONSTRAINTS, "funnel")
 @dataclass(frozen=True)
 class Funnel(PositionConstraint):
-    """Ceiling of p_FE that falls like a cone to F's z axis: z ≤ height_m + slope · max(0, radius − radius_m)."""
+    """Upper bound on z that falls like a cone to F's z axis: z ≤ height_m + slope · max(0, radius − radius_m)."""
 
     frame: str  # F: frame of an object, or `world`
-    radius_m: float  # radius within which the ceiling is flat
-    height_m: float  # ceiling within radius_m
-    slope: float  # rise of the ceiling per meter of radius
+    radius_m: float  # radius within which the bound on z is constant
+    height_m: float  # bound on z within radius_m
+    slope: float  # rise of the bound per meter of radius
 
     def __post_init__(self) -> None:
         require(self.radius_m >= 0 and self.slope >= 0, "radius_m and slope must not be negative.")
@@ -292,10 +290,10 @@ class FixedOrientation(FrameConstraint):
 class TiltConstraint(FrameConstraint):
     """Orientation `rpy_deg`, tilted towards F's z axis by an angle from an interval.
 
-    The interval may depend on the distance to F's origin. The projection is the nearest such rotation. With
-    `turns_along`, the end effector turns about F's z axis as it moves around that axis, so that it always tilts about
-    the same axis of E; `rpy_deg` then applies to a bearing along F's x axis. Without `turns_along`, the heading
-    is constant and the tilt axis changes.
+    The interval may depend on the distance to F's origin. The projection is the nearest rotation with an allowed tilt.
+    With `turns_along`, the end effector turns about F's z axis as it moves around that axis, so that the tilt axis is
+    constant in E; `rpy_deg` is the orientation at a bearing along F's x axis. Without `turns_along`, the heading is
+    constant and the tilt axis changes.
     """
 
     rpy_deg: tuple[float, ...]
@@ -306,18 +304,18 @@ class TiltConstraint(FrameConstraint):
         """Return the bounds of the tilt [deg] at a distance from F's origin."""
 
     def tilt(self, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the tilt [rad], in [−π, π], of the nearest orientation that is only tilted towards F's z axis."""
+        """Return the tilt [rad] in [−π, π] of the nearest orientation that is only tilted towards F's z axis."""
         R_FE, p_FE = pose_in(self.frame, X_WE, frames)
         return self._tilt(self._heading(p_FE), R_FE)
 
     @staticmethod
     def _heading(p_FE: np.ndarray) -> np.ndarray:
-        """Return R_FH of the heading frame H with F's z axis, the bearing as x axis and the tilt axis as y axis."""
+        """Return R_FH of the heading frame H: x along the bearing, y along the tilt axis, z along F's z axis."""
         x, y, _ = bearing(p_FE).tolist()
         return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
     def _tilt(self, R_FH: np.ndarray, R_FE: np.ndarray) -> float:
-        """Return the tilt for which R_FH Ry(tilt) R_HRest is nearest to R_FE in the Frobenius norm."""
+        """Return the tilt [rad] for which R_FH Ry(tilt) R_HRest is nearest to R_FE in the Frobenius norm."""
         R = R_FH.T @ R_FE @ matrix_deg(self.rpy_deg).T
         if not self.turns_along:
             R = R @ R_FH
@@ -388,7 +386,7 @@ class TiltByDistance(TiltConstraint):
 @register(ACTIVE_CONSTRAINTS, "arc")
 @dataclass(frozen=True)
 class Arc(FrameConstraint):
-    """Circle about F's z axis; the orientation turns with the angle along the circle, as for a door handle.
+    """Circle about F's z axis; E turns with its angle on the circle, as for a door handle.
 
     At angle 0 the end effector is above, below or on F's positive x axis, with R_FE = rpy_deg.
     """
@@ -413,6 +411,6 @@ class Arc(FrameConstraint):
         angle = nearest_turn(math.atan2(p_FE[1], p_FE[0]), 0.5 * (lower + upper))
         angle = min(max(angle, lower), upper)
         c, s = math.cos(angle), math.sin(angle)
-        # A matrix, because Drake's rotations refuse a NaN angle.
+        # A matrix, because Drake's rotations refuse an angle of NaN.
         R_FArc = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
         return R_FArc.dot(matrix_deg(self.rpy_deg)), np.array([self.radius_m * c, self.radius_m * s, self.height_m])

@@ -1,7 +1,7 @@
 """Frames, tilt, bearing and distances of poses, shared by mappings and constraints.
 
-Frames: W world, E the end effector (or the tip of what it holds), F an object. A tilt is a rotation about the
-horizontal axis that is perpendicular to the bearing, the horizontal direction from E to the object.
+Frames: W is the world, E the end effector (or the tip of the object in its gripper), F an object. The bearing is the
+horizontal direction from E to the object. A tilt is a rotation about the horizontal axis perpendicular to the bearing.
 """
 
 import math
@@ -24,9 +24,9 @@ WORLD = "world"
 
 
 class StatePart:
-    """Mapping, constraint or distance of a template's state, with at most one frame of its own, the field `frame`."""
+    """Mapping, constraint or distance of a template's state; the field `frame`, if there is one, names its frame."""
 
-    own_frames: ClassVar[tuple[str, ...]] = (WORLD,)  # frames that are not those of objects
+    own_frames: ClassVar[tuple[str, ...]] = (WORLD,)  # names of frames that do not belong to objects
 
     @property
     def frame_names(self) -> tuple[str, ...]:
@@ -35,7 +35,7 @@ class StatePart:
         return () if frame in self.own_frames else (frame,)
 
 
-NEAR_AXIS = 1e-9  # distance from the axis below which the bearing is undefined [m]
+NEAR_AXIS = 1e-9  # distance from F's z axis below which the bearing is undefined [m]
 
 
 @lru_cache(maxsize=64)
@@ -48,7 +48,7 @@ def matrix_deg(rpy_deg: tuple[float, ...]) -> np.ndarray:
 
 
 def axes(frame: str, frames: Frames) -> np.ndarray:
-    """Return R_WF (3, 3), the orientation of a frame."""
+    """Return R_WF (3, 3), the orientation of the frame F called `frame`."""
     return np.eye(3) if frame == WORLD else frames[frame].rotation().matrix()
 
 
@@ -67,7 +67,7 @@ def pose_in(frame: str, X_WE: RigidTransform, frames: Frames) -> tuple[np.ndarra
 
 
 def with_position_in(frame: str, p_FE: np.ndarray, X_WE: RigidTransform, frames: Frames) -> RigidTransform:
-    """Return X_WE with its origin moved to p_FE [m] in the frame F and its orientation unchanged."""
+    """Return X_WE with the origin of E moved to p_FE [m] in the frame F called `frame`, and the same orientation."""
     if frame == WORLD:
         return RigidTransform(X_WE.rotation(), p_FE)
     X_WF = frames[frame]
@@ -83,31 +83,31 @@ def bearing(p_FE: np.ndarray) -> np.ndarray:
 
 
 def tilt_axis(p_FE: np.ndarray) -> np.ndarray:
-    """Return the axis (3,) in F about which a positive angle tilts an upright tool towards F's origin, z × bearing."""
+    """Return z × bearing (3,) in F: a positive rotation about this axis tilts an upright tool towards F's origin."""
     towards = bearing(p_FE)
     return np.array([-towards[1], towards[0], 0.0])
 
 
 def angle_between(R_WA: RotationMatrix, R_WB: RotationMatrix) -> float:
-    """Return the angle [rad] of the rotation from A to B; accurate for small angles too."""
+    """Return the angle [rad] of the rotation from A to B, accurate for small angles too."""
     return chord_angle(R_WA.matrix(), R_WB.matrix())
 
 
 def chord_angle(R_WA: np.ndarray, R_WB: np.ndarray) -> float:
-    """Return the angle [rad] between two rotation matrices (3, 3), as `angle_between`."""
-    # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; a trace loses half of the digits near zero.
+    """Return the angle [rad] between two rotation matrices (3, 3), accurate for small angles too."""
+    # ‖A − B‖ = 2√2 sin(θ/2) in the Frobenius norm; the formula with the trace loses half of the digits near zero.
     difference = R_WA - R_WB
     chord = math.sqrt(float(np.vdot(difference, difference)))
     return 2.0 * math.asin(min(1.0, chord / math.sqrt(8.0)))
 
 
 def pose_distance(X_WA: RigidTransform, X_WB: RigidTransform) -> float:
-    """Return the distance of two poses, the larger of the distance [m] and the angle [rad] between them."""
+    """Return the larger of the distance [m] and the angle [rad] between two poses."""
     return max(math.dist(X_WA.translation(), X_WB.translation()), angle_between(X_WA.rotation(), X_WB.rotation()))
 
 
 def largest(violations: Iterable[float]) -> float:
-    """Return the largest violation, at least 0; NaN if any is NaN, which `max` would hide."""
+    """Return the largest violation, at least 0; NaN if a violation is NaN, which `max` would hide."""
     worst = 0.0
     for violation in violations:
         if math.isnan(violation):
@@ -117,7 +117,7 @@ def largest(violations: Iterable[float]) -> float:
 
 
 def between(X_WA: RigidTransform, X_WB: RigidTransform, fraction: float) -> RigidTransform:
-    """Return the pose at a fraction of the motion from A to B, along a line and about a constant axis."""
+    """Return the pose at a fraction of the motion from A to B along a straight line and about a constant axis."""
     if fraction == 1.0:
         return X_WB
     p_WA, p_WB = X_WA.translation(), X_WB.translation()

@@ -1,7 +1,7 @@
 """Registries of the kinds of input mapping, active constraint and transition distance.
 
-A kind is a frozen dataclass whose fields are the entries that a template file may give. The name of an entry with a
-unit contains the unit. A kind is registered under the name that the file uses:
+A kind is a frozen dataclass whose fields are the entries of a template file. The name of an entry with a unit contains
+the unit. A kind is registered under its name in template files:
 
     @register(ACTIVE_CONSTRAINTS, "half_space")
     @dataclass(frozen=True)
@@ -27,8 +27,8 @@ def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
     """Return a decorator that makes a dataclass available to template files as a `kind` of a registry.
 
     Raises:
-        InputError: When the decorator is applied, if another kind has that name, the name is no word, or the decorated
-            object is not a dataclass or lacks a method.
+        InputError: When the decorator is applied, if another kind has the name, the name is not a text or is empty, or
+            the decorated object is not a dataclass or lacks a method.
     """
 
     def add(kind: Kind) -> Kind:
@@ -37,9 +37,9 @@ def register(registry: dict[str, type], name: str) -> Callable[[Kind], Kind]:
         require(is_class, f"the kind {name!r} must be a dataclass, not {brief(kind)}: add @dataclass(frozen=True)")
         missing = ", ".join(sorted(getattr(kind, "__abstractmethods__", ())))
         require(not missing, f"the kind {name!r} lacks {missing}: implement what its base class declares")
-        other = registry.get(name, kind)
-        is_same = (other.__module__, other.__qualname__) == (kind.__module__, kind.__qualname__)
-        require(is_same, f"there is a kind {name!r} already, {other.__name__}: choose another name")
+        existing = registry.get(name, kind)
+        is_same = (existing.__module__, existing.__qualname__) == (kind.__module__, kind.__qualname__)
+        require(is_same, f"there is a kind {name!r} already, {existing.__name__}: choose another name")
         registry[name] = kind
         return kind
 

@@ -14,7 +14,7 @@ TOOL = "tool"
 
 
 class InputMapping(StatePart, ABC):
-    """Displacement by some of the inputs, a part of the mapping map_q of a state q (equation 2.19).
+    """Displacement commanded by some of the inputs, a part of the mapping map_q of a state q (equation 2.19).
 
     A displacement ΔH is a RigidTransform. Its translation is added to p_WE. Its rotation, about the end effector's
     origin and expressed in the world, is applied to R_WE from the left.
@@ -25,7 +25,7 @@ class InputMapping(StatePart, ABC):
 
     @abstractmethod
     def displacement(self, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float) -> RigidTransform:
-        """Return ΔH during `period_s` [s]; `inputs` (n,) are all inputs of the template, each in [−1, 1]."""
+        """Return ΔH of one period `period_s` [s]; `inputs` (n,) are all inputs of the template, each in [−1, 1]."""
 
     @property
     def used_inputs(self) -> tuple[int, ...]:
@@ -34,7 +34,7 @@ class InputMapping(StatePart, ABC):
 
 
 def axes_in_world(frame: str, X_WE: RigidTransform, frames: Frames) -> np.ndarray:
-    """Return R_WF (3, 3), whose columns are the axes of `frame`: `world`, `tool` or that of an object."""
+    """Return R_WF (3, 3), whose columns are the axes of `frame`: `world`, `tool` or the frame of an object."""
     return X_WE.rotation().matrix() if frame == TOOL else axes(frame, frames)
 
 
@@ -46,7 +46,7 @@ def _require_axes(inputs: tuple[int, ...], axes: tuple[tuple[float, ...], ...]) 
 
 
 def _require_object(frame: str) -> None:
-    require(frame != TOOL, "frame must be that of an object or world, not the tool's own.")
+    require(frame != TOOL, f"frame must be the frame of an object or {WORLD}, not {TOOL}.")
 
 
 @register(INPUT_MAPPINGS, "translation")
@@ -59,7 +59,7 @@ class Translation(InputMapping):
 
     inputs: tuple[int, ...]  # indices of the inputs, from 0
     speed_m_per_s: float  # speed at an input of 1
-    frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
+    frame: str = WORLD  # frame of the axes: `world`, `tool` or the frame of an object
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
     def __post_init__(self) -> None:
@@ -82,7 +82,7 @@ class Rotation(InputMapping):
 
     inputs: tuple[int, ...]  # indices of the inputs, from 0
     speed_rad_per_s: float  # speed at an input of 1
-    frame: str = WORLD  # frame of the axes: `world`, `tool` or that of an object
+    frame: str = WORLD  # frame of the axes: `world`, `tool` or the frame of an object
     axes: tuple[tuple[float, ...], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))  # one axis for each input
 
     def __post_init__(self) -> None:
@@ -108,7 +108,7 @@ class TiltTowards(InputMapping):
 
     inputs: tuple[int, ...]  # indices of two inputs, from 0
     speed_rad_per_s: float  # speed at an input of 1
-    frame: str  # frame to tilt towards: that of an object, or `world`
+    frame: str  # frame to tilt towards: frame of an object, or `world`
 
     def __post_init__(self) -> None:
         _require_object(self.frame)
@@ -144,7 +144,7 @@ class ScaledMapping(InputMapping):
 class Scaled(ScaledMapping):
     """Another mapping with its inputs multiplied by a factor that depends on the distance to a frame."""
 
-    frame: str  # frame to which the distance is measured: that of an object, or `world`
+    frame: str  # frame to which the distance is measured: frame of an object, or `world`
     distance_m: tuple[float, ...]  # distances to the frame's origin, increasing
     factor: tuple[float, ...]  # factors in [0, 1], one for each distance; linear in between, constant beyond
     of: InputMapping  # mapping whose inputs are scaled, an entry with its own kind

@@ -1,4 +1,4 @@
-"""Active constraints to stay outside or inside of a convex shape."""
+"""Active constraints to positions outside or inside of a convex shape."""
 
 import math
 from abc import abstractmethod
@@ -16,19 +16,19 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, register, requi
 
 
 class _Tangent(HalfSpace):
-    """Half-space at a shape's surface; its offset, and thus the command, is not finite if an object's pose is not."""
+    """Half-space at a shape's surface, with an offset that is not finite if the pose of an object is not finite."""
 
     @override
     def __post_init__(self) -> None:
-        """Check nothing: callers check the command."""
+        """Check nothing, because callers check that the command is finite."""
 
 
 class Outside(PositionConstraint):
-    """Base class of constraints to stay outside of a convex shape in F.
+    """Base class of constraints to positions outside of a convex shape in F.
 
     `SharedControlTemplate.command` linearizes the constraint at the last command: it projects a request into a
-    half-space outside of the shape. The straight line from a command outside to the next one is therefore outside too.
-    `project` and `violation` use the nearest point of the shape's surface.
+    half-space outside of the shape. If the last command is outside, the straight line to the next command is therefore
+    outside too. `project` and `violation` use the nearest point of the shape's surface.
     """
 
     @property
@@ -52,7 +52,7 @@ class Outside(PositionConstraint):
 class OutsideSphere(Outside):
     """Outside of a sphere."""
 
-    radius_m: float  # radius of the sphere, including the distance to keep
+    radius_m: float  # radius of the sphere, including a safety distance
     center_m: tuple[float, ...] = (0.0, 0.0, 0.0)  # center in F
     frame: str = WORLD  # F: frame of an object, or `world`
 
@@ -75,7 +75,7 @@ class OutsideCylinder(Outside):
     radius_m: float  # radius of the cylinder
     min_m: float  # z of the lower face in F
     max_m: float  # z of the upper face in F
-    margin_m: float = 0.0  # distance to keep from the cylinder
+    margin_m: float = 0.0  # minimum distance from the cylinder
 
     def __post_init__(self) -> None:
         require(self.radius_m > 0, f"radius_m must be positive, not {self.radius_m}.")
@@ -99,7 +99,7 @@ class OutsideBox(Outside):
     lower_m: tuple[float, ...]  # lower corner in F
     upper_m: tuple[float, ...]  # upper corner in F
     frame: str = WORLD  # F: frame of an object, or `world`
-    margin_m: float = 0.0  # distance to keep from the box
+    margin_m: float = 0.0  # minimum distance from the box
 
     def __post_init__(self) -> None:
         require_three(self.lower_m, "lower_m")

@@ -72,9 +72,9 @@ class AxisDistance(TransitionDistance):
 @register(TRANSITION_DISTANCES, "tilt_to_go")
 @dataclass(frozen=True)
 class TiltToGo(TransitionDistance):
-    """Remaining tilt towards F's z axis, until_deg minus the present tilt.
+    """Remaining tilt towards F's z axis: until_deg minus the current tilt.
 
-    The tilt is in (−180°, 180°], so the distance jumps by 360° where the tilt passes 180°.
+    The tilt is in (−180°, 180°], so the distance jumps by 360° when the tilt passes 180°.
     """
 
     frame: str  # F: frame of an object, or `world`
@@ -99,7 +99,7 @@ class TiltToGo(TransitionDistance):
 @register(TRANSITION_DISTANCES, "rotation_to_go")
 @dataclass(frozen=True)
 class RotationToGo(TransitionDistance):
-    """Angle between the end effector's orientation and a given one."""
+    """Angle between the end effector's orientation and a given orientation."""
 
     rpy_deg: tuple[float, ...]  # given orientation R_FE
     frame: str = WORLD  # F: frame of an object, or `world`
