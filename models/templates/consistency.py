@@ -1,15 +1,16 @@
 """Proofs that no pose satisfies a set of active constraints.
 
-Constraints are compared only with constraints in the same frame, because objects move. A set counts as contradictory
-only if one of these holds, however the poses are sampled:
+Constraints are compared only with constraints in the same frame, because objects move. A set is reported as
+contradictory only if one of these statements is true:
 
 - Two orientations, tilts or angles of an arc are disjoint.
-- All positions that one constraint allows are inside the region that another one excludes.
-- The convex parts of the constraints on the position are separated by half-spaces: at the minimum of the sum of squared
-  distances, the normals n_i = p − P_i(p) add up to e, and a point y of all sets would satisfy e · (y − p) ≤ −Σ ‖n_i‖².
-  No point nearer than Σ ‖n_i‖² / ‖e‖ does.
+- All positions that one constraint allows are inside the region that another constraint excludes.
+- The convex parts of the constraints on the position are separated by half-spaces. Let P_i be the projection onto the
+  set i, p the approximate minimum of the sum of squared distances from all sets, n_i = p − P_i(p) the normals at p, and
+  e their sum. A common point y of all sets satisfies e · (y − p) ≤ −Σ ‖n_i‖², so it is at least Σ ‖n_i‖² / ‖e‖ away
+  from p. If this distance exceeds `UNBOUNDED`, the sets are separated.
 
-Whatever is not proven is not a contradiction here. Kinds that are registered elsewhere are not examined.
+A contradiction without such a proof is not reported. Kinds of constraint outside of this package are not examined.
 """
 
 import math
@@ -37,8 +38,8 @@ from guiderail.models.templates.constraints import (
 from guiderail.models.templates.geometry import chord_angle, matrix_deg
 from guiderail.models.templates.shape_constraints import InsideSphere, Outside
 
-CLEAR = 1e-6  # least violation that counts as a contradiction, far above rounding [m or rad]
-STEPS = 400  # largest number of steps to the nearest point of all sets
+CLEAR = 1e-6  # smallest violation that counts as a contradiction, far above rounding [m or rad]
+STEPS = 400  # largest number of gradient steps to the point nearest to all sets
 
 Projection = Callable[[np.ndarray], np.ndarray]
 
@@ -51,11 +52,11 @@ def find_contradiction(constraints: Sequence[ActiveConstraint]) -> tuple[int, ..
             by_frame.setdefault(constraint.frame, []).append((i, constraint))
     for numbered in by_frame.values():
         for (i, a), (j, b) in combinations(numbered, 2):
-            if _turns_apart(a, b) or _is_excluded(a, b) or _is_excluded(b, a):
+            if _have_disjoint_orientations(a, b) or _is_excluded(a, b) or _is_excluded(b, a):
                 return i, j
-        found = _find_separated([i for i, _ in numbered], [constraint for _, constraint in numbered])
-        if found:
-            return found
+        separated = _find_separated(dict(numbered))
+        if separated:
+            return separated
     return ()
 
 
@@ -66,25 +67,25 @@ def describe(constraints: Sequence[ActiveConstraint], contradictory: Sequence[in
     return f"active constraint {first} contradicts {' and '.join(others)}; no pose satisfies {both}: change one"
 
 
-def _turns_apart(a: FrameConstraint, b: FrameConstraint) -> bool:
-    """Return True if no orientation satisfies both constraints at any position."""
+def _have_disjoint_orientations(a: FrameConstraint, b: FrameConstraint) -> bool:
+    """Return True if no orientation satisfies both constraints, at any position."""
     for one, other in ((a, b), (b, a)):
         if isinstance(one, FixedOrientation):
             return _angle_to(other, matrix_deg(one.rpy_deg)) > CLEAR
     tilts = [constraint for constraint in (a, b) if isinstance(constraint, TiltConstraint)]
     if len(tilts) == 2 and tilts[0].rpy_deg == tilts[1].rpy_deg:
-        (low, high), (other_low, other_high) = (_tilts(tilt) for tilt in tilts)
+        (low, high), (other_low, other_high) = (_tilt_range(tilt) for tilt in tilts)
         if tilts[0].turns_along != tilts[1].turns_along:
-            return _gap(*_sizes(low, high), *_sizes(other_low, other_high)) > CLEAR
+            return _gap(*_magnitude_range(low, high), *_magnitude_range(other_low, other_high)) > CLEAR
         return min(_gap(low, high, other_low + turn, other_high + turn) for turn in (-math.tau, 0, math.tau)) > CLEAR
     arcs = [constraint for constraint in (a, b) if isinstance(constraint, Arc)]
     if len(arcs) == 1 and len(tilts) == 1 and arcs[0].rpy_deg == tilts[0].rpy_deg:
-        return _sizes(*_tilts(tilts[0]))[0] > CLEAR  # the orientation on an arc is not tilted
+        return _magnitude_range(*_tilt_range(tilts[0]))[0] > CLEAR  # the orientation on an arc is not tilted
     return False
 
 
 def _angle_to(constraint: FrameConstraint, R_FE: np.ndarray) -> float:
-    """Return a lower bound of the angle [rad] from an orientation to those that a constraint allows anywhere."""
+    """Return a lower bound of the angle [rad] from an orientation to all orientations that a constraint allows."""
     if isinstance(constraint, FixedOrientation):
         return chord_angle(R_FE, matrix_deg(constraint.rpy_deg))
     if isinstance(constraint, TiltConstraint):
@@ -92,7 +93,7 @@ def _angle_to(constraint: FrameConstraint, R_FE: np.ndarray) -> float:
         R = R_FE @ matrix_deg(constraint.rpy_deg).T
         tilt = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2])
         twist = 0.0 if constraint.turns_along else abs(float(R[1, 0] - R[0, 1])) / 2.0
-        return max(_gap(tilt, tilt, *_sizes(*_tilts(constraint))), twist)
+        return max(_gap(tilt, tilt, *_magnitude_range(*_tilt_range(constraint))), twist)
     if isinstance(constraint, Arc):
         R = R_FE @ matrix_deg(constraint.rpy_deg).T
         tilt, angle = math.atan2(math.hypot(R[0, 2], R[1, 2]), R[2, 2]), math.atan2(R[1, 0], R[0, 0])
@@ -101,8 +102,8 @@ def _angle_to(constraint: FrameConstraint, R_FE: np.ndarray) -> float:
     return 0.0
 
 
-def _tilts(constraint: TiltConstraint) -> tuple[float, float]:
-    """Return the least and the largest tilt [rad] that a constraint allows at any distance."""
+def _tilt_range(constraint: TiltConstraint) -> tuple[float, float]:
+    """Return the smallest and the largest tilt [rad] that a constraint allows at any distance."""
     if isinstance(constraint, TiltByDistance):
         return math.radians(min(constraint.tilt_deg)), math.radians(max(constraint.tilt_deg))
     if isinstance(constraint, TiltLimits):
@@ -110,8 +111,8 @@ def _tilts(constraint: TiltConstraint) -> tuple[float, float]:
     return -math.pi, math.pi
 
 
-def _sizes(low: float, high: float) -> tuple[float, float]:
-    """Return the least and the largest magnitude of a tilt between two limits in [−π, π]."""
+def _magnitude_range(low: float, high: float) -> tuple[float, float]:
+    """Return the smallest and the largest magnitude of a tilt between two limits in [−π, π]."""
     return max(0.0, low, -high), max(abs(low), abs(high))
 
 
@@ -121,7 +122,7 @@ def _gap(low: float, high: float, other_low: float, other_high: float) -> float:
 
 
 def _is_excluded(inner: FrameConstraint, outer: FrameConstraint) -> bool:
-    """Return True if every position that `inner` allows is in the region around F or a shape that `outer` excludes."""
+    """Return True if `outer` excludes all positions that `inner` allows: they are within its shape or near F's axis."""
     if isinstance(outer, Outside):
         if isinstance(inner, InsideSphere):
             return outer.shape.distance(np.array(inner.center_m)) + inner.radius_m < -CLEAR
@@ -149,9 +150,9 @@ def _largest_radius(constraint: FrameConstraint) -> float:
     return math.inf
 
 
-def _find_separated(numbers: Sequence[int], constraints: Sequence[FrameConstraint]) -> tuple[int, ...]:
+def _find_separated(constraints: dict[int, FrameConstraint]) -> tuple[int, ...]:
     """Return the numbers of constraints on the position in one frame whose convex parts have no point in common."""
-    parts = list(_convex_parts(dict(zip(numbers, constraints, strict=True))))
+    parts = list(_convex_parts(constraints))
     if len({sources for sources, _ in parts}) < 2:
         return ()
     p = np.mean([project(np.zeros(3)) for _, project in parts], axis=0)
@@ -171,9 +172,9 @@ def _find_separated(numbers: Sequence[int], constraints: Sequence[FrameConstrain
 
 
 def _convex_parts(constraints: dict[int, FrameConstraint]) -> Iterator[tuple[tuple[int, ...], Projection]]:
-    """Yield projections onto convex sets that contain all positions that numbered constraints in a frame allow.
+    """Yield convex sets as projections, each with the numbers of the constraints from which it is derived.
 
-    A set follows from the constraints whose numbers are given with it.
+    A set contains all positions in the frame that its constraints allow.
     """
     narrowest = min(constraints, key=lambda number: _largest_radius(constraints[number]))
     radius = _largest_radius(constraints[narrowest])
@@ -183,13 +184,13 @@ def _convex_parts(constraints: dict[int, FrameConstraint]) -> Iterator[tuple[tup
         elif isinstance(constraint, Cylinder):
             yield (number,), Cylinder(constraint.frame, 0.0, constraint.max_radius_m).project_position
         elif isinstance(constraint, Sector) and constraint.max_deg - constraint.min_deg <= 180:
-            # Two half-spaces, because the projection of a sector keeps the radius and is not the nearest point.
+            # Two half-spaces, because the sector's own projection has a constant radius and is not the nearest point.
             low, high = math.radians(constraint.min_deg), math.radians(constraint.max_deg)
             yield (number,), HalfSpace((-math.sin(low), math.cos(low), 0.0), 0.0).project_position
             yield (number,), HalfSpace((math.sin(high), -math.cos(high), 0.0), 0.0).project_position
         elif isinstance(constraint, KeepAbove):
             points = np.array(constraint.points_m).T
-            # No point is higher above E than its distance from E, whatever the orientation.
+            # At any orientation, the height of a point above E is at most its distance from E.
             yield (number,), _above(constraint.height_m - float(np.linalg.norm(points, axis=0).min()))
             for other, fixed in constraints.items():
                 if isinstance(fixed, FixedOrientation) and points.any():

@@ -28,7 +28,7 @@ def state_lines(state: TemplateState) -> list[str]:
 
 
 def list_edges(template: SharedControlTemplate) -> list[tuple[str, str, str]]:
-    """Return (from, to, condition) of every transition, including returns."""
+    """Return (from, to, condition) of every transition and every return."""
     edges = []
     for state in template.states:
         unit = state.transition_distance.unit
@@ -89,7 +89,7 @@ def draw_figure(template: SharedControlTemplate) -> "Figure":
     axes.set_axis_off()
     axes.set_xlim(-width / 2 - 0.2, (len(template.states) - 1) * (width + gap) + width / 2 + 0.2)
     axes.set_ylim(-1.4, 1.4)
-    plain: Any = {"parse_math": False}  # so that a dollar sign in a name does not start a formula
+    plain: Any = {"parse_math": False}  # otherwise a dollar sign in a name would start a formula
     x = {state.name: i * (width + gap) for i, state in enumerate(template.states)}
     for number, state in enumerate(template.states):
         box = {

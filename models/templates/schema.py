@@ -1,4 +1,4 @@
-"""Reader of shared control templates from YAML files; a faulty file raises an InputError of one sentence."""
+"""Reader of shared control templates from YAML files; a faulty file raises an InputError with one sentence."""
 
 import ast
 import dataclasses
@@ -53,15 +53,16 @@ _OPERATORS: dict[type, Callable[..., float]] = {
 
 
 def load_template(source: str | Path, **parameters: float) -> SharedControlTemplate:
-    """Read a template.
+    """Read a template from a file.
 
-    The file is checked, but not whether the constraints and transitions can be satisfied: guidance refuses constraints
-    that are proven to contradict each other, and `guiderail template validate` checks transitions at random poses.
+    The content of the file is checked, but it is not checked that constraints and transitions can be satisfied. For
+    that, guidance refuses constraints that are proven to contradict each other, and `guiderail template validate`
+    checks transitions at random poses.
 
     Args:
         source: Path of a .yaml or .yml file, or the name of a shipped template: `pouring`, `pouring_aimed`,
             `grid_clamp` or `end_effector_velocity`.
-        **parameters: Values, such as sizes of objects, that replace those under `parameters` in the file.
+        **parameters: Values, such as sizes of objects, that replace the values under `parameters` in the file.
 
     Raises:
         InputError: If the file cannot be read or is not a valid template.
@@ -98,11 +99,11 @@ def shipped_templates() -> list[str]:
 
 
 def _shipped_files() -> dict[str, Path]:
-    """Return the files of the shipped templates by name; each is in the folder of its object."""
+    """Return the files of the shipped templates by name; each file is in the folder of its object."""
     return {file.stem: file for file in Path(__file__).parents[1].joinpath("objects").glob("*/*.yaml")}
 
 
-_load_shipped = lru_cache(load_yaml)  # a study makes many environments
+_load_shipped = lru_cache(load_yaml)  # cached, because a study constructs many environments
 
 
 def _calculate(node: ast.expr, parameters: Mapping[str, float] | None) -> float:
@@ -129,8 +130,8 @@ def _check_known(message: str, name: str, known: Iterable[str]) -> None:
         raise InputError(f"{message} {brief(name)}: {did_you_mean(name, known)}")
 
 
-def _number(entry: Any, info: ValidationInfo) -> float:
-    """Return the value of a number, or of an expression of the parameters in `info.context`."""
+def _read_number(entry: Any, info: ValidationInfo) -> float:
+    """Return the value of a number or of an expression; `info.context` contains the parameters."""
     context: Any = info.context
     entry = entry.item() if isinstance(entry, np.generic) else entry
     if type(entry) not in (str, int, float):
@@ -151,32 +152,32 @@ def _number(entry: Any, info: ValidationInfo) -> float:
     return value
 
 
-def _name(text: str) -> str:
-    """Return `text`; raise a ValueError if it is empty, too long for a figure, or not printable."""
+def _check_name(text: str) -> str:
+    """Return a name; raise a ValueError if it is empty, too long for a figure, or not printable."""
     if not (0 < len(text) <= 100 and text.isprintable()):
         raise ValueError(f"{brief(text)} can't name anything; use a short text")
     return text
 
 
-def _parameter_name(text: str) -> str:
-    """Return `text`; raise a ValueError if an expression could not refer to it."""
+def _check_parameter_name(text: str) -> str:
+    """Return the name of a parameter; raise a ValueError if it cannot occur in an expression."""
     if not re.fullmatch("[A-Za-z_][A-Za-z0-9_]{0,99}", text):
         raise ValueError(f"{brief(text)} can't name a parameter; use letters from a to z, digits and _, a letter first")
     return text
 
 
-def _part(entry: Any, info: ValidationInfo, registry: dict[str, type]) -> Any:
-    """Build a mapping, constraint or distance from an entry with its `kind` and the fields of that kind."""
+def _build_part(entry: Any, info: ValidationInfo, registry: dict[str, type]) -> Any:
+    """Build a mapping, constraint or distance from an entry with a `kind` and the fields of this kind."""
     return _union(tuple(registry.items())).validate_python(entry, context=info.context)
 
 
-Number = Annotated[float, BeforeValidator(_number)]
+Number = Annotated[float, BeforeValidator(_read_number)]
 Positive = Annotated[Number, Field(gt=0)]
-Name = Annotated[str, AfterValidator(_name)]
-ParameterName = Annotated[str, AfterValidator(_parameter_name)]
-AnyMapping = Annotated[InputMapping, PlainValidator(partial(_part, registry=INPUT_MAPPINGS))]
-AnyConstraint = Annotated[ActiveConstraint, PlainValidator(partial(_part, registry=ACTIVE_CONSTRAINTS))]
-AnyDistance = Annotated[TransitionDistance, PlainValidator(partial(_part, registry=TRANSITION_DISTANCES))]
+Name = Annotated[str, AfterValidator(_check_name)]
+ParameterName = Annotated[str, AfterValidator(_check_parameter_name)]
+AnyMapping = Annotated[InputMapping, PlainValidator(partial(_build_part, registry=INPUT_MAPPINGS))]
+AnyConstraint = Annotated[ActiveConstraint, PlainValidator(partial(_build_part, registry=ACTIVE_CONSTRAINTS))]
+AnyDistance = Annotated[TransitionDistance, PlainValidator(partial(_build_part, registry=TRANSITION_DISTANCES))]
 FIELD_TYPES = {
     float: Number, int: StrictInt, bool: StrictBool, str: str,
     InputMapping: AnyMapping, ActiveConstraint: AnyConstraint, TransitionDistance: AnyDistance,
@@ -184,7 +185,7 @@ FIELD_TYPES = {
 
 
 class _Entry(BaseModel):
-    """Base class of the entries of a template file; an error about an unknown field suggests the nearest known one."""
+    """Base class of the entries of a template file; the error for an unknown field suggests a similar known field."""
 
     @model_validator(mode="before")
     @classmethod
@@ -195,13 +196,13 @@ class _Entry(BaseModel):
         return data
 
     def build(self, kind: type, **fields: Any) -> Any:
-        """Return an instance of a dataclass with the fields that the file gives, and `fields`."""
+        """Return an instance of the dataclass `kind` with the fields in the file and the further `fields`."""
         return kind(**{key: getattr(self, key) for key in self.model_fields_set - {"kind"}}, **fields)
 
 
 @lru_cache
 def _union(kinds: tuple[tuple[str, type], ...]) -> TypeAdapter[Any]:
-    """Return the discriminated union of registered kinds; it is cached until another kind is registered."""
+    """Return the discriminated union of registered kinds, cached until another kind is registered."""
     models: Any = tuple(_kind_model(name, kind) for name, kind in kinds)
     return TypeAdapter(Annotated[Union[models], Field(discriminator="kind")])  # noqa: UP007  (of a tuple)
 
@@ -217,7 +218,7 @@ def _kind_model(name: str, kind: type) -> Any:
 
 
 def _field_type(hint: Any) -> Any:
-    """Return the type that reads a field of a kind: expressions for floats, and no conversion of anything else."""
+    """Return the type that reads a field of a kind: expressions for floats, no conversion for other types."""
     if get_origin(hint) is tuple:
         element: Any = _field_type(get_args(hint)[0])
         return tuple[element, ...]
@@ -228,7 +229,7 @@ _UNLIMITED: Any = Field(None)
 
 
 class _State(_Entry):
-    """State without the fields whose names contain the unit of its transition distance."""
+    """State without the fields whose names end in the unit of its transition distance."""
 
     transition_distance: AnyDistance
     input_mapping: tuple[AnyMapping, ...] = Field(max_length=MAX_PARTS)
@@ -241,7 +242,7 @@ class _State(_Entry):
 
 @lru_cache
 def _state_model(unit: str) -> Any:
-    """Return the type of a state with a transition distance in `unit`, "m" or "deg"; values are converted to SI."""
+    """Return the type of a state whose transition distance has the unit "m" or "deg"; values are converted to SI."""
     si = math.pi / 180 if unit == "deg" else 1.0
     number: Any = Annotated[Number, AfterValidator(lambda value: si * value)]
     margin: Any = Annotated[Positive, AfterValidator(lambda value: si * value)]
@@ -270,8 +271,7 @@ class _StateDistance(BaseModel):
     transition_distance: AnyDistance
 
 
-def _state(entry: Any, info: ValidationInfo) -> Any:
-    """Read one state."""
+def _read_state(entry: Any, info: ValidationInfo) -> Any:
     unit = _StateDistance.model_validate(entry, context=info.context).transition_distance.unit
     state = _state_model(unit).model_validate(entry, context=info.context)
     if state.ends_at is None and not state.transitions:
@@ -288,14 +288,14 @@ def _state(entry: Any, info: ValidationInfo) -> Any:
 class TemplateFile(_Entry):
     """Content of a template file."""
 
-    # This field is first, because the expressions in the other fields need the values of the parameters.
+    # This field must be first, because the expressions in the other fields need the values of the parameters.
     parameters: dict[ParameterName, Number] = Field({}, validate_default=True)
     name: Name
     inputs: StrictInt = Field(ge=1, le=6)
     frames: tuple[Name, ...] = ()
     max_speed_m_per_s: Positive
     max_speed_rad_per_s: Positive
-    states: dict[Name, Annotated[Any, PlainValidator(_state)]] = Field(min_length=1, max_length=MAX_STATES)
+    states: dict[Name, Annotated[Any, PlainValidator(_read_state)]] = Field(min_length=1, max_length=MAX_STATES)
     initial_state: str | None = None
 
     @field_validator("parameters")
@@ -317,7 +317,7 @@ class TemplateFile(_Entry):
 
 
 def _read(data: Any, where: str, overrides: Mapping[str, float]) -> SharedControlTemplate:
-    """Build the template of a file with the content `data`."""
+    """Build a template from the content of its file."""
     try:
         file = TemplateFile.model_validate(data, context={"overrides": overrides, "parameters": None})
         states = tuple(state.build(TemplateState, name=name) for name, state in file.states.items())
@@ -328,20 +328,20 @@ def _read(data: Any, where: str, overrides: Mapping[str, float]) -> SharedContro
         for state in states:
             _check_references(template, state)
     except ValidationError as error:
-        raise InputError(f"{where}: {_sentence(error)}") from None
+        raise InputError(f"{where}: {_describe_error(error)}") from None
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
     return template
 
 
 def _check_references(template: SharedControlTemplate, state: TemplateState) -> None:
-    """Raise an InputError if a state uses a name that the template lacks, or is faster than the template allows."""
+    """Raise an InputError if a state uses an unknown name, or has a higher speed limit than the template."""
     for name in ("max_speed_m_per_s", "max_speed_rad_per_s"):
         speed, largest = getattr(state, name), getattr(template, name)
         if speed is not None and speed > largest:
             raise InputError(f"states.{state.name}.{name} must be at most the template's, {largest:g}, not {speed:g}")
     for transition in state.transitions:
-        names = [other.name for other in template.states]
+        names = [candidate.name for candidate in template.states]
         _check_known(f"states.{state.name}: there is no state", transition.to, names)
         if transition.to == state.name:
             raise InputError(
@@ -356,10 +356,10 @@ def _check_references(template: SharedControlTemplate, state: TemplateState) -> 
             )
 
 
-def _sentence(error: ValidationError) -> str:
+def _describe_error(error: ValidationError) -> str:
     """Return the first error and its place in the file as a sentence."""
     first: Any = error.errors()[0]
-    location = first["loc"][:-2] if first["loc"][-1:] == ("[key]",) else first["loc"]  # the message has the key itself
+    location = first["loc"][:-2] if first["loc"][-1:] == ("[key]",) else first["loc"]  # the message names the key
     names = (key if isinstance(key, int) or key.isidentifier() else brief(key) for key in location)
     place = "".join(f"[{name}]" if isinstance(name, int) else f".{name:.60}" for name in names)
     place = place.lstrip(".") or "the file"

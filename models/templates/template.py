@@ -1,4 +1,4 @@
-"""Shared control templates: their data, and their laws as functions of a state and a pose (thesis, section 2.3)."""
+"""Shared control templates: data, and control laws as functions of a state and a pose (thesis, section 2.3)."""
 
 import math
 from collections.abc import Mapping
@@ -19,16 +19,16 @@ from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
-MAX_START_DISTANCE = 0.2  # largest distance of a start from the constraints [m]; a larger one is probably in mm
-MAX_START_ANGLE = 1.0  # largest angle between a start and the constraints [rad]; a larger one is probably in degrees
-BACKTRACKS = 8  # attempts to find an allowed displacement, each shorter than the one before
+MAX_START_DISTANCE = 0.2  # largest distance of a start from the constraints [m]; a larger value is probably in mm
+MAX_START_ANGLE = 1.0  # largest angle between a start and the constraints [rad]; a larger value is probably in degrees
+BACKTRACKS = 8  # number of attempts to find an allowed displacement, each with a shorter displacement
 
 
 @dataclass(frozen=True)
 class Transition:
-    """Transition of a state to the state `to` when the distance of the first state falls below a threshold.
+    """Transition from a source state to the state `to` when the distance of the source falls below a threshold.
 
-    With a hysteresis, the template returns from `to` to the first state when the distance of the first state exceeds
+    With a hysteresis, the template returns from `to` to the source when the distance of the source exceeds
     below + hysteresis.
     """
 
@@ -39,25 +39,25 @@ class Transition:
 
 @dataclass(frozen=True)
 class TemplateState:
-    """One phase of a task: input mapping, active constraints and distance to the next phase."""
+    """Phase of a task: input mapping, active constraints and distance to the next phase."""
 
     name: str
     input_mapping: tuple[InputMapping, ...]
     active_constraints: tuple[ActiveConstraint, ...]  # applied in this order
     transition_distance: TransitionDistance
-    starts_at: float  # typical distance at the beginning; the phase's own progress is zero there [m] or [rad]
+    starts_at: float  # typical distance at the beginning, at which the phase's own progress is zero [m] or [rad]
     ends_at: float  # distance at which the phase is complete [m] or [rad]
     weight: float = 1.0  # progress per unit of distance [1/m] or [1/rad]
     transitions: tuple[Transition, ...] = ()
-    max_force_n: float | None = None  # largest force of the impedance [N]; None: that of the task
-    max_torque_nm: float | None = None  # largest torque of the impedance [Nm]; None: that of the task
-    # Largest speeds of the command, at most those of the template; None: those of the template.
+    max_force_n: float | None = None  # largest force of the impedance [N]; None: limit of the task
+    max_torque_nm: float | None = None  # largest torque of the impedance [Nm]; None: limit of the task
+    # Largest speeds of the command, at most the limits of the template; None: limits of the template.
     max_speed_m_per_s: float | None = None
     max_speed_rad_per_s: float | None = None
 
     @property
     def limits_wrench(self) -> bool:
-        """True if the state has a limit of force or torque of its own."""
+        """True if the state has its own limit of force or torque."""
         return self.max_force_n is not None or self.max_torque_nm is not None
 
     @property
@@ -68,7 +68,7 @@ class TemplateState:
 
     @cached_property
     def grouped_constraints(self) -> tuple[ActiveConstraint | ConstraintGroup, ...]:
-        """Active constraints in groups of consecutive ones that share a frame."""
+        """Active constraints in order; consecutive constraints in the same frame form a group."""
         return group_constraints(self.active_constraints)
 
     @cached_property
@@ -76,21 +76,27 @@ class TemplateState:
         """True if a constraint is linearized at the last command."""
         return any(isinstance(constraint, Outside) for constraint in self.active_constraints)
 
+    @cached_property
+    def contradiction(self) -> str | None:
+        """Sentence about active constraints that contradict each other; None if no contradiction is proven."""
+        contradictory = find_contradiction(self.active_constraints)
+        return f"{self.name}: {describe(self.active_constraints, contradictory)}" if contradictory else None
+
 
 @dataclass(frozen=True)
 class Command:
-    """Pose that the constraints allow for a request."""
+    """Allowed pose for a requested pose."""
 
     X_WE: RigidTransform  # pose of the end effector in the world
-    fraction: float  # part of the requested displacement that is executed: 1 all of it, 0 none
+    fraction: float  # executed part of the requested displacement, from 0 (none) to 1 (all)
 
 
 @dataclass(frozen=True)
 class SharedControlTemplate:
     """Prior knowledge of a task as a state machine with input mappings and active constraints.
 
-    Users and policies act through the same template. The argument `frames` of the methods holds the poses X_WF of the
-    template's object frames by name.
+    Users and policies act through the same template. The argument `frames` of the methods contains the poses X_WF of
+    the template's object frames by name.
 
     Attributes:
         name: Name of the template.
@@ -98,7 +104,7 @@ class SharedControlTemplate:
         frames: Names of the object frames.
         states: States in the order of the file, numbered from 0; at least one.
         initial_state: Number of the initial state.
-        max_speed_m_per_s, max_speed_rad_per_s: Largest speeds of the command; a state may have lower ones.
+        max_speed_m_per_s, max_speed_rad_per_s: Largest speeds of the command; a state may have lower limits.
         parameters: Values of the parameters in the expressions of the file, by name.
     """
 
@@ -124,29 +130,23 @@ class SharedControlTemplate:
 
     @cached_property
     def contradiction(self) -> str | None:
-        """Sentence about the first state whose active constraints contradict each other; None if none is proven to."""
-        for state in self.states:
-            found = find_contradiction(state.active_constraints)
-            if found:
-                return f"{state.name}: {describe(state.active_constraints, found)}"
-        return None
+        """Sentence about the first state with a proven contradiction of its active constraints; None without one."""
+        return next((state.contradiction for state in self.states if state.contradiction), None)
 
     def check_consistency(self) -> None:
-        """Refuse active constraints of a state that are proven to contradict each other.
+        """Check that no active constraints of a state are proven to contradict each other.
 
         Raises:
-            InputError: If there are such constraints.
+            InputError: If a contradiction is proven.
         """
         if self.contradiction is not None:
             raise InputError(f"the template {self.name}, state {self.contradiction}")
 
     def check_start(self, X_WE: RigidTransform, frames: Frames) -> None:
-        """Refuse a start too far outside of the active constraints to move inside.
-
-        The largest distance is `MAX_START_DISTANCE`, and the largest angle `MAX_START_ANGLE`.
+        """Check that a start is close enough to the active constraints to move inside.
 
         Raises:
-            InputError: If the start is farther outside.
+            InputError: If the start is farther outside than `MAX_START_DISTANCE` or `MAX_START_ANGLE`.
         """
         state = self.state_at(X_WE, frames)
         X_WP = self.project(state, X_WE, frames)
@@ -171,8 +171,8 @@ class SharedControlTemplate:
         Inputs are clipped to [−1, 1].
 
         Raises:
-            InputError: If there are not n inputs, `state` is not the number of a state, a frame is missing, or the
-                period is not positive.
+            InputError: If the number of inputs is wrong, `state` is not the number of a state, a frame is missing, or
+                the period is not positive.
         """
         self._check_arguments(state, frames, period_s)
         inputs = np.clip(inputs, -1.0, 1.0)
@@ -206,20 +206,22 @@ class SharedControlTemplate:
     ) -> Command:
         """Return an allowed pose that is reachable in one period and close to a request.
 
-        If the projected request exceeds the largest speeds, the requested displacement is scaled down as a whole, so
-        that the orientation does not lag behind the position. It could lag near the object, where an orientation that
-        depends on the position turns quickly. The displacement is also scaled down if one constraint undoes another.
-        After `BACKTRACKS` attempts, the last command is repeated if it is inside the constraints. Constraints that keep
-        the end effector outside of a shape are linearized at the last command, so that the line to the new command is
-        outside too. If the last command is inside the constraints, so is the new one. If the last command is outside
-        (at the start of an episode, or after an object moved), the commands move inside at the largest speed. The pose
-        is not finite if that of an object is not; callers check it.
+        If the projected request exceeds the largest speeds, the requested displacement is scaled down as a whole.
+        Otherwise the orientation would lag behind the position near an object, where an orientation that depends on the
+        position turns quickly. The displacement is also scaled down if one constraint undoes another.
+
+        If the last command is inside the constraints, the new command is inside too: if `BACKTRACKS` attempts fail, the
+        last command is repeated. If the last command is outside (at the start of an episode, or after an object moved),
+        the commands move inside at the largest speed. Constraints to positions outside of a shape are linearized at the
+        last command, so that the line to the new command is outside too.
+
+        If the pose of an object is not finite, the returned pose is not finite either; callers check it.
 
         Raises:
             InputError: If `state` is not the number of a state, a frame is missing, or the period is not positive.
         """
         self._check_arguments(state, frames, period_s)
-        # Scaled before the first projection: the projection of a distant request does not preserve its direction.
+        # Scaled before the first projection, because projecting a distant request would change its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
         constraints = self._constraints_at(state, X_WLast, frames)
         for _ in range(BACKTRACKS):
@@ -272,11 +274,9 @@ class SharedControlTemplate:
     @cached_property
     def _max_speeds(self) -> tuple[tuple[float, float], ...]:
         """Largest speed [m/s] and angular speed [rad/s] of the command in each state."""
-        own = self.max_speed_m_per_s, self.max_speed_rad_per_s
+        max_v, max_w = self.max_speed_m_per_s, self.max_speed_rad_per_s
         limits = ((state.max_speed_m_per_s, state.max_speed_rad_per_s) for state in self.states)
-        return tuple(
-            (own[0] if v is None else min(own[0], v), own[1] if w is None else min(own[1], w)) for v, w in limits
-        )
+        return tuple((max_v if v is None else min(max_v, v), max_w if w is None else min(max_w, w)) for v, w in limits)
 
     def _speed_ratio(self, state: int, X_WLast: RigidTransform, X_WE: RigidTransform, period_s: float) -> float:
         """Return the speed between two poses relative to a state's limit, the larger of translation and rotation."""
@@ -289,7 +289,10 @@ class SharedControlTemplate:
 
     @cached_property
     def _exits(self) -> tuple[tuple[tuple[int, float, int, float], ...], ...]:
-        """Exits of each state, forward ones first: state whose distance is tested, sign, next state, threshold."""
+        """Exits of each state, first transitions, then returns.
+
+        An exit is the state whose distance is tested, the sign of the test, the next state and the threshold.
+        """
         forward: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         back: list[list[tuple[int, float, int, float]]] = [[] for _ in self.states]
         for number, state in enumerate(self.states):
@@ -316,7 +319,7 @@ class SharedControlTemplate:
     def state_at(self, X_WE: RigidTransform, frames: Frames) -> int:
         """Return the state in which an episode begins at X_WE.
 
-        The state is `initial_state`, or the one reached from it by the transitions that fire at X_WE.
+        The state is `initial_state`, or it is reached from there by the transitions that fire at X_WE.
         """
         state = self.initial_state
         for _ in self.states:
@@ -327,7 +330,7 @@ class SharedControlTemplate:
         """Return the transition distance d_t of a state, [m] or [rad].
 
         Raises:
-            InputError: If it is not a number.
+            InputError: If the kind of distance returns something other than a number.
         """
         distance = self.states[state].transition_distance
         value = distance.value(X_WE, frames)
@@ -337,7 +340,7 @@ class SharedControlTemplate:
 
     @cached_property
     def _initial_progress(self) -> tuple[float, ...]:
-        """Progress at the beginning of each state, summed along first transitions; 0 if these do not lead to it."""
+        """Progress at the beginning of each state, summed along first transitions; 0 for unreached states."""
         progress = [0.0] * len(self.states)
         number, visited = self.initial_state, {self.initial_state}
         while self.states[number].transitions:
@@ -353,21 +356,21 @@ class SharedControlTemplate:
     def progress(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
         """Return the progress in the task.
 
-        It is the progress of previous phases plus the weighted decrease of this phase's distance. The previous phases
-        are those that lead to this one from the initial state by the first transition of each.
+        Progress is the progress of previous phases plus the weighted decrease of this phase's distance. The previous
+        phases are the sequence of first transitions from the initial state to this phase.
 
         An increase of progress is d_{t−1} − d_t of equation 3.2, multiplied by the weight of the phase. Progress is
-        continuous at a transition if, there, the distance of the phase equals its `ends_at` and that of the next phase
-        its `starts_at`.
+        continuous at a transition if the distance of the phase is `ends_at` and the distance of the next phase is its
+        `starts_at`.
         """
         phase = self.states[state]
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))
 
 
 def check_template(template: object, frames: object) -> None:
-    """Raise an InputError unless an argument is a template, and a second one holds poses of its objects by name.
+    """Raise an InputError unless `template` is a template and `frames` contains poses by name.
 
-    Poses of other objects are accepted, but not one of the world, which would have no effect.
+    Poses of other objects are accepted. A pose of the world is refused, because it would have no effect.
     """
     if not isinstance(template, SharedControlTemplate):
         raise InputError(f"a template is a SharedControlTemplate, as load_template returns, not {brief(template)}")

@@ -1,8 +1,8 @@
-"""Checks of a template beyond those that are made when its file is read.
+"""Checks of a template in addition to those when its file is read.
 
-The checks place the template's objects and the end effector at random near each other, and evaluate the template's
-input mappings, active constraints and transitions there. A fault that occurs in less than one of a few hundred poses
-may not be found. An error is proven, by a pose or by a contradiction; whatever a search did not find is a remark.
+The checks place the template's objects and the end effector at random poses near each other, and evaluate the
+template's input mappings, active constraints and transitions there. A fault that occurs in less than one of a few
+hundred poses may not be found. An error is proven by a pose or by a contradiction; an unsuccessful search is a remark.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
-from guiderail.models.templates.consistency import describe, find_contradiction
+from guiderail.models.templates.consistency import find_contradiction
 from guiderail.models.templates.constraints import ActiveConstraint, Cylinder, HalfSpace, TiltLimits
 from guiderail.models.templates.geometry import Frames, pose_distance
 from guiderail.models.templates.shape_constraints import InsideSphere
@@ -27,7 +27,7 @@ GREEDY_PERIOD = 0.05  # time step of a search [s]
 CONTROL_PERIOD = 0.01  # time step of a search close to the threshold of a transition [s]
 ARRIVALS = 5  # largest number of searches that approach each transition
 
-Scenes = Sequence[tuple[RigidTransform, Frames]]
+Scene = tuple[RigidTransform, Frames]  # pose of the end effector, and poses of the objects
 
 
 @dataclass(frozen=True)
@@ -51,16 +51,14 @@ def validate(template: SharedControlTemplate, seed: int = 0) -> list[Finding]:
     return sorted(findings, key=lambda finding: not finding.is_error)
 
 
-def _sample_scene(
-    template: SharedControlTemplate, rng: np.random.Generator
-) -> tuple[RigidTransform, dict[str, RigidTransform]]:
+def _sample_scene(template: SharedControlTemplate, rng: np.random.Generator) -> Scene:
     """Return a random pose of the end effector near upright objects at random poses."""
     frames = {}
     for name in template.frames:
         yaw = RotationMatrix.MakeZRotation(rng.uniform(-np.pi, np.pi))
         frames[name] = RigidTransform(yaw, rng.uniform(-0.3, 0.3, 3))
     X_WF = frames[template.frames[rng.integers(len(frames))]] if frames else RigidTransform()
-    # The distance is uniform, not the position, because more samples are needed near an object, where constraints meet.
+    # The distance is uniform, not the position, because more samples are needed near objects, where constraints change.
     p_FE = rng.normal(size=3)
     p_FE *= REACH * rng.uniform() / np.linalg.norm(p_FE)
     R_FE = RotationMatrix(Rotation.random(rng=rng).as_matrix())
@@ -88,12 +86,11 @@ def _find_unreachable(template: SharedControlTemplate) -> Iterator[Finding]:
             yield Finding(True, f"no transition leads to the state {state.name}; add one, or remove the state")
 
 
-def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+def _check_constraints(template: SharedControlTemplate, scenes: Sequence[Scene]) -> Iterator[Finding]:
     """Check that each constraint and the whole sequence are idempotent, and that no constraint undoes another."""
     for number, state in enumerate(template.states):
-        contradiction = find_contradiction(state.active_constraints)
-        if contradiction:
-            yield Finding(True, f"{state.name}: {describe(state.active_constraints, contradiction)}")
+        if state.contradiction:
+            yield Finding(True, state.contradiction)
             continue
         for i, constraint in enumerate(state.active_constraints):
             name = f"{state.name}: active constraint {i + 1} ({type(constraint).__name__})"
@@ -108,7 +105,7 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
             repeated = max(repeated, pose_distance(template.project(number, X_WP, frames), X_WP))
         for i in np.flatnonzero(outside).tolist():
             kind = type(state.active_constraints[i]).__name__
-            is_always = outside[i] == len(scenes)  # few poses, or none, satisfy all constraints
+            is_always = outside[i] == len(scenes)  # few or no poses satisfy all constraints
             share = "all" if is_always else f"{outside[i] / len(scenes):.0%} of the"
             yield Finding(
                 not is_always,
@@ -119,16 +116,16 @@ def _check_constraints(template: SharedControlTemplate, scenes: Scenes) -> Itera
             yield Finding(True, f"{state.name}: the constraints in their order are not idempotent ({repeated:.2g})")
 
 
-def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Iterator[Finding]:
+def _check_transitions(template: SharedControlTemplate, scenes: Sequence[Scene]) -> Iterator[Finding]:
     """Check that inputs lead to each transition and to the end, and that one control step leads into the next state.
 
-    A search begins in a sampled pose inside the constraints or, except in the initial state, in a pose in which the
-    state before hands over. The search ends at the threshold.
+    A search begins at a pose at which another state made a transition to this state, or at a sampled pose inside the
+    constraints if there is none. The search ends at the threshold.
     """
-    handovers: dict[int, list[tuple[RigidTransform, Frames]]] = {}
+    handovers: dict[int, list[Scene]] = {}
     for number in _in_order(template):
         state = template.states[number]
-        if find_contradiction(state.active_constraints):
+        if state.contradiction:
             continue
         inside = [(template.project(number, X, frames), frames) for X, frames in scenes]
         goals = [(f"the transition to {t.to}", t.below) for t in state.transitions]
@@ -143,7 +140,7 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
                 continue
             starts = _choose_starts(template, number, threshold, handovers.get(number, []), inside)
             arrivals, nearest = _search(template, number, threshold, starts)
-            # Sampled poses show nothing about a state to which no search has led.
+            # If no search has led to this state, sampled poses are no evidence of a fault.
             if starts and not arrivals and (number == template.initial_state or number in handovers):
                 yield Finding(
                     False,
@@ -161,7 +158,7 @@ def _check_transitions(template: SharedControlTemplate, scenes: Scenes) -> Itera
 
 
 def _in_order(template: SharedControlTemplate) -> list[int]:
-    """Return the numbers of all states, those that transitions lead to from the initial state first and in order."""
+    """Return the numbers of all states, first those that transitions reach from the initial state, in order."""
     order = [template.initial_state]
     for number in order:
         targets = (template.index(transition.to) for transition in template.states[number].transitions)
@@ -170,7 +167,7 @@ def _in_order(template: SharedControlTemplate) -> list[int]:
 
 
 def _is_excluded(state: TemplateState, threshold: float) -> bool:
-    """Return True if the active constraints are proven to keep the distance of a state above a threshold."""
+    """Return True if it is proven that the distance of a state is above a threshold within its active constraints."""
     goal: ActiveConstraint
     if threshold <= 0.0 and not state.transition_distance.can_be_negative:
         return True
@@ -190,27 +187,23 @@ def _is_excluded(state: TemplateState, threshold: float) -> bool:
 
 
 def _choose_starts(
-    template: SharedControlTemplate,
-    number: int,
-    threshold: float,
-    handovers: list[tuple[RigidTransform, Frames]],
-    inside: list[tuple[RigidTransform, Frames]],
-) -> list[tuple[RigidTransform, Frames]]:
-    """Return poses above a threshold: those of a handover, or else sampled ones, the nearest among them."""
-    given, sampled = (
+    template: SharedControlTemplate, number: int, threshold: float, handovers: list[Scene], inside: list[Scene]
+) -> list[Scene]:
+    """Return poses above a threshold: those of handovers or, if there are none, sampled poses and the nearest one."""
+    arrived, sampled = (
         [start for start in starts if template.distance(number, *start) >= threshold] for starts in (handovers, inside)
     )
-    if given:
-        return given[:ARRIVALS]
+    if arrived:
+        return arrived[:ARRIVALS]
     sampled.sort(key=lambda start: template.distance(number, *start))
     step = max(1, len(sampled) // (2 * ARRIVALS))
     return [*sampled[len(sampled) // 2 :: step][:ARRIVALS], *sampled[:1]]
 
 
 def _search(
-    template: SharedControlTemplate, number: int, threshold: float, starts: list[tuple[RigidTransform, Frames]]
-) -> tuple[list[tuple[RigidTransform, Frames]], float]:
-    """Return the poses below a threshold that searches from `starts` arrive at, and the least distance."""
+    template: SharedControlTemplate, number: int, threshold: float, starts: list[Scene]
+) -> tuple[list[Scene], float]:
+    """Return the poses below a threshold that searches from `starts` reach, and the least distance of all searches."""
     reach = GREEDY_PERIOD * max(template.max_speed_m_per_s, template.max_speed_rad_per_s)
     arrivals, nearest = [], np.inf
     for X, frames in starts:
@@ -250,7 +243,7 @@ def _greedy(
 
 
 def _check_arrivals(
-    template: SharedControlTemplate, number: int, target: int, arrivals: list[tuple[RigidTransform, Frames]]
+    template: SharedControlTemplate, number: int, target: int, arrivals: list[Scene]
 ) -> Iterator[Finding]:
     """Check that a transition fires at its threshold: one control step must lead into the next state's constraints."""
     waiting = sum(not template.can_enter(target, X, frames, CONTROL_PERIOD) for X, frames in arrivals)
