@@ -13,7 +13,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import FixedOffsetFrame, Frame, RigidBody
 from pydrake.systems.framework import Context
 
-from guiderail.models.common.parsing import add_model
+from guiderail.models.common.parsing import add_models
 from guiderail.models.objects.surfaces import Surface
 
 
@@ -89,7 +89,8 @@ class MovableWorkcell(ABC):
         return self._add(plant, self.workpiece, FixedOffsetFrame("grasp", tool_center, RigidTransform()))
 
     def _add(self, plant: MultibodyPlant, name: str, frame: FixedOffsetFrame) -> RigidBody:
-        body = plant.GetBodyByName(name, add_model(plant, self.sdf(name)))
+        (model,) = add_models(plant, self.sdf(name))
+        body = plant.GetBodyByName(name, model)
         plant.WeldFrames(plant.AddFrame(frame), body.body_frame())
         return body
 

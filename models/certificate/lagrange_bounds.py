@@ -18,7 +18,7 @@ from guiderail.models.certificate.loop import Bounds, CertifiedLoop, single_outp
 ROUNDS = 4  # number of constraints at nearby steps that tighten one bound
 MAX_DISTANCE, STRIDE = 48, 3  # largest distance of these steps from the step of the bound, and their spacing [steps]
 NUM_CANDIDATES = 6  # number of constraints tried in each round, those most correlated with the direction
-FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares one
+FACTORS = np.array([0.15, 0.3, 0.5, 0.75, 1.0])  # multipliers tried, relative to the least-squares multiplier
 
 
 @dataclass(frozen=True)

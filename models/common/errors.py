@@ -47,9 +47,10 @@ def naming_failures(action: str, *unchanged: type[Exception]) -> Iterator[None]:
 
     An `InputError` and errors of the types `unchanged` are raised unchanged.
     """
+    reraised: tuple[type[Exception], ...] = (InputError, *unchanged)
     try:
         yield
-    except (InputError, *unchanged):
+    except reraised:
         raise
     except (Exception, SystemExit) as error:
         frame = traceback.extract_tb(error.__traceback__)[-1]

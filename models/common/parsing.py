@@ -17,17 +17,6 @@ _VARIABLE = "DRAKE_ALLOW_NETWORK"
 _DIRECTIVES = (".yaml", ".yml")
 
 
-def add_model(plant: MultibodyPlant, path: Path | str) -> ModelInstanceIndex:
-    """Add the only model of a local SDF or URDF file to a plant.
-
-    Raises:
-        InputError: As `add_models`.
-        ValueError: If the file has several models or none.
-    """
-    (model,) = add_models(plant, path)
-    return model
-
-
 def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
     """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.dmd.yaml), to a plant.
 

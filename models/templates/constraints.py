@@ -55,7 +55,7 @@ class FrameConstraint(ActiveConstraint):
 
     @abstractmethod
     def project_in_frame(self, R_FE: np.ndarray, p_FE: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; an unchanged one is the argument itself."""
+        """Return the allowed rotation matrix (3, 3) and position (3,) [m]; an unchanged array is returned itself."""
 
     @override
     def project(self, X_WE: RigidTransform, frames: Frames) -> RigidTransform:

@@ -42,7 +42,7 @@ class Outside(PositionConstraint):
         return p_FE if distance >= 0.0 else p_FE + (shapes.CLEARANCE - distance) * normal
 
     def at(self, X_WLast: RigidTransform, frames: Frames) -> HalfSpace:
-        """Return the half-space to which the command after X_WLast is constrained."""
+        """Return the half-space of allowed positions for the command after X_WLast."""
         normal, offset = self.shape.half_space(position_in(self.frame, X_WLast, frames))
         return _Tangent(tuple(normal), offset + shapes.CLEARANCE, self.frame)
 

@@ -224,7 +224,7 @@ def _greedy(
     threshold: float,
     period: float = GREEDY_PERIOD,
 ) -> tuple[float, RigidTransform]:
-    """Return the least distance, and the last pose, of a greedy search that sets one input to ±1 at every step."""
+    """Search greedily, one input set to ±1 at every step; return the least distance and the last pose."""
     candidates = [sign * row for row in np.eye(template.inputs) for sign in (1.0, -1.0)]
     best = template.distance(number, X_WE, frames)
     for _ in range(GREEDY_STEPS):

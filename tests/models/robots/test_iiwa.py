@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.models.common.parsing import add_model
+from guiderail.models.common.parsing import add_models
 from guiderail.models.control.wrench import external_wrench
 from guiderail.models.robots.end_effectors import CONNECTOR_TOOL
 from guiderail.models.robots.iiwa import IIWA14
@@ -37,7 +37,7 @@ def test_wrist_wrench_at_rest_is_the_external_wrench():
 def test_wrist_wrench_is_zero_in_free_fall_with_spin():
     """A free body with an offset center of mass, compared with Drake's dynamics."""
     plant = MultibodyPlant(0.0)
-    model = add_model(plant, CONNECTOR_TOOL.model)
+    (model,) = add_models(plant, CONNECTOR_TOOL.model)
     plant.Finalize()
     body = plant.GetBodyByName("tool_body", model)
     context = plant.CreateDefaultContext()
