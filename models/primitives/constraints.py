@@ -10,16 +10,16 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.qp import UnsolvableError, solve_least_norm
 
 TOLERANCE = 1e-9
-"""Largest accepted violation of a command, a distance from the constraint's plane (1 nm if outputs are meters)."""
+"""Largest accepted constraint violation of a command [unit of the output]: 1 nm if outputs are in meters."""
 _EPS = float(np.finfo(float).eps)
-_ROUNDING = 64 * _EPS  # largest contradiction due to rounding of the rows, relative to c and to the output
+_ROUNDING = 64 * _EPS  # largest contradiction that counts as rounding, relative to |c| and to the terms of G y
 
 
 class LinearConstraints:
     """Constraints G y ≥ c, the same at every step or different from step to step.
 
-    Every row is divided by its norm, together with its bound c. Violations are therefore distances in the outputs'
-    unit, and neither results nor tolerances depend on the scale in which a constraint is given.
+    Each row and its bound c are divided by the row's norm. Violations are therefore distances in the outputs' unit, and
+    the scale of a row changes neither results nor tolerances.
 
     Args:
         G: Rows g_f, (F, O) or (N, F, O), finite [unit of c / unit of the output].
@@ -55,12 +55,12 @@ class LinearConstraints:
         """Return the constraints lower ≤ y ≤ upper.
 
         Args:
-            lower: Lower bounds, (O,) or (N, O); −inf at every step is no constraint.
-            upper: Upper bounds, (O,) or (N, O); inf at every step is no constraint.
+            lower: Lower bounds, (O,) or (N, O); −inf at every step for none.
+            upper: Upper bounds, (O,) or (N, O); inf at every step for none.
 
         Raises:
-            InputError: If shapes do not match, a lower bound exceeds its upper bound, or a bound is NaN, infinite at
-                some steps only, or infinite so that no output satisfies it.
+            InputError: If shapes do not match, a lower bound exceeds its upper bound, a bound is NaN or infinite at
+                some steps only, a lower bound is inf, or an upper bound is −inf.
         """
         lower, upper = as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound")
         try:
@@ -73,13 +73,13 @@ class LinearConstraints:
             if np.isnan(bounds).any():
                 at = tuple(np.argwhere(np.isnan(bounds))[0].tolist())
                 where = f"of output {at[0]}" if len(at) == 1 else f"of output {at[1]} at step {at[0]}"
-                raise InputError(f"the {name} bound {where} is NaN: give a number, or an infinite one for no bound")
+                raise InputError(f"the {name} bound {where} is NaN: give a number, or infinity for no bound")
         if lower.size == 0:
             raise InputError(f"box bounds need at least one output and one step, not the shape {lower.shape}")
         if (lower > upper).any():
             where = f" at step {np.argwhere(lower > upper)[0, 0]}" if lower.ndim == 2 else ""
             raise InputError(
-                f"the constraints{where} contradict each other: a lower bound exceeds its upper bound; loosen one"
+                f"the constraints{where} contradict each other: a lower bound exceeds its upper bound; loosen a bound"
             )
         # Rows y_0 ≥ lower_0, −y_0 ≥ −upper_0, y_1 ≥ lower_1, …, without those that are infinite at every step.
         c = np.stack([lower, -upper], axis=-1).reshape(*lower.shape[:-1], -1)
@@ -89,7 +89,7 @@ class LinearConstraints:
 
     @classmethod
     def none(cls, num_outputs: int) -> "LinearConstraints":
-        """Return a set of no constraints, F = 0."""
+        """Return an empty set of constraints, F = 0."""
         return cls(np.zeros((0, num_outputs)), np.zeros(0))
 
     @property
@@ -111,8 +111,8 @@ class LinearConstraints:
         """Check that the constraints fit a reference trajectory.
 
         Raises:
-            InputError: If the trajectory has another number of outputs, or another number of steps while the
-                constraints differ from step to step.
+            InputError: If the numbers of outputs differ, or if the constraints differ from step to step and the numbers
+                of steps differ.
         """
         if self.num_outputs != num_outputs:
             raise InputError(f"constraints are on {self.num_outputs} outputs, the reference has {num_outputs}")
@@ -120,7 +120,7 @@ class LinearConstraints:
             raise InputError(f"constraints are given for {self.num_steps} steps, the reference has {num_steps}")
 
     def window(self, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return G (n, F, O) and c (n, F) at steps (n,); a step outside of the motion counts as the nearest one."""
+        """Return G (n, F, O) and c (n, F) at steps (n,), which are clipped to the first and the last step."""
         steps = np.asarray(steps)
         if self.G.ndim == 2:
             G, c = (np.broadcast_to(values, (len(steps), *values.shape)) for values in (self.G, self.c))
@@ -144,7 +144,7 @@ class LinearConstraints:
         """Compute the output (O,) nearest to `output` (O,) within the constraints of a step.
 
         If the solver fails, the result is the first allowed point on the straight line from `output` to a point inside
-        the constraints. Every finite output therefore has a result.
+        the constraints. A result therefore exists for every finite output.
 
         Raises:
             InputError: If `output` does not have the shape (O,).
@@ -169,13 +169,14 @@ class LinearConstraints:
         G, c = (a[0] for a in self.window(np.array([step])))
         inside = self._interior if self.G.ndim == 2 else self._interior[min(max(step, 0), len(self._interior) - 1)]
         inside = np.where((G == 0.0).all(axis=0), output, inside)  # outputs without a constraint do not move
-        missing, gained = c - G @ output, G @ (inside - output)
-        share = float(np.max(missing[missing > 0.0] / np.maximum(gained, missing)[missing > 0.0]))
+        violation, decrease = c - G @ output, G @ (inside - output)
+        is_violated = violation > 0.0
+        share = float(np.max(violation[is_violated] / np.maximum(decrease, violation)[is_violated]))
         entry = output + share * (inside - output)
         return entry if self.violation(entry, step) <= TOLERANCE else inside
 
     def _normalize(self) -> None:
-        """Divide every row and its bound by the row's norm; rows of unit norm up to rounding keep their digits."""
+        """Divide each row and its bound by the row's norm, except rows whose norm is one up to rounding."""
         # Rows are first divided by their largest entry, because squares of extreme entries overflow or underflow.
         largest = np.abs(self.G).max(axis=-1, initial=0.0)
         scale = np.where(largest > 0.0, largest, 1.0)
@@ -201,12 +202,12 @@ class LinearConstraints:
             interior = _box_interior(*steps)
         else:
             flat = np.concatenate([steps[0].reshape(len(steps[0]), -1), steps[1]], axis=1)
-            _, first, which = np.unique(flat, axis=0, return_index=True, return_inverse=True)
-            points = {at: _max_margin_point(steps[0][at], steps[1][at]) for at in np.sort(first).tolist()}
-            interior = np.array([points[at] for at in first[which.ravel()].tolist()])
-        missing = steps[1] - np.einsum("nfo,no->nf", steps[0], interior)
+            _, first, inverse = np.unique(flat, axis=0, return_index=True, return_inverse=True)
+            points = {step: _max_margin_point(steps[0][step], steps[1][step]) for step in np.sort(first).tolist()}
+            interior = np.array([points[step] for step in first[inverse.ravel()].tolist()])
+        violation = steps[1] - np.einsum("nfo,no->nf", steps[0], interior)
         size = np.abs(steps[1]) + np.einsum("nfo,no->nf", np.abs(steps[0]), np.abs(interior))
-        is_contradiction = ~(missing <= _ROUNDING * size).all(axis=1)
+        is_contradiction = ~(violation <= _ROUNDING * size).all(axis=1)
         if is_contradiction.any():
             where = "" if self.G.ndim == 2 else f" at step {int(np.argmax(is_contradiction))}"
             raise InputError(
@@ -217,33 +218,33 @@ class LinearConstraints:
 
 
 def _box_interior(G: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """Return the centers (n, O) of boxes; of an output without two finite bounds, the allowed value nearest to zero."""
+    """Return points (n, O) inside boxes: centers, or, without two finite bounds, the allowed value nearest to zero."""
     lower = np.where(G > 0.0, c[..., None], -np.inf).max(axis=1, initial=-np.inf)
     upper = np.where(G < 0.0, -c[..., None], np.inf).min(axis=1, initial=np.inf)
-    both = np.isfinite(lower) & np.isfinite(upper)
+    is_bounded = np.isfinite(lower) & np.isfinite(upper)
     with np.errstate(invalid="ignore"):
-        return np.where(both, 0.5 * lower + 0.5 * upper, np.clip(0.0, lower, upper))
+        return np.where(is_bounded, 0.5 * lower + 0.5 * upper, np.clip(0.0, lower, upper))
 
 
 def _max_margin_point(G: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Return the point (O,) that maximizes the smallest margin G y − c, capped at max |c| (at 1 if c = 0)."""
     from scipy.optimize import linprog  # imported here because it takes half a second
 
-    outputs = G.shape[1]
+    num_outputs = G.shape[1]
     size = float(np.abs(c).max(initial=0.0)) or 1.0
     result = linprog(
-        np.append(np.zeros(outputs), -1.0),
+        np.append(np.zeros(num_outputs), -1.0),
         A_ub=np.column_stack([-G, (np.abs(G).max(axis=1) > 0.0).astype(float)]),
         b_ub=-c / size,
-        bounds=[(None, None)] * outputs + [(None, 1.0)],
+        bounds=[(None, None)] * num_outputs + [(None, 1.0)],
         # The smallest tolerances that HiGHS accepts.
         options={"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10},
     )
     if result.x is None:  # a row of zeros with a positive bound
-        return np.zeros(outputs)
-    best = np.asarray(size * result.x[:outputs])
+        return np.zeros(num_outputs)
+    best = np.asarray(size * result.x[:num_outputs])
     # The solver's point is accurate to its tolerance; the solution of its active constraints is accurate to rounding.
     active = np.flatnonzero(result.ineqlin.marginals < -1e-9)
     system = np.column_stack([G[active], -np.ones(len(active))])
-    correction = np.linalg.lstsq(system, c[active] - G[active] @ best, rcond=None)[0][:outputs]
+    correction = np.linalg.lstsq(system, c[active] - G[active] @ best, rcond=None)[0][:num_outputs]
     return max((best, best + correction), key=lambda y: float((G @ y - c).min()))

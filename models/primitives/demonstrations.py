@@ -12,14 +12,14 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
 from guiderail.models.primitives.full_turns import without_jumps
 
-MAX_MAGNITUDE = 1e100  # largest absolute value: covariances are products of two outputs
+MAX_MAGNITUDE = 1e100  # largest absolute value; covariances, which are products of two outputs, must not overflow
 
 
 class Demonstrations:
     """M recordings of O outputs over time, each with its own length and rate.
 
-    Repeated samples (same time, same outputs) are dropped. Angles and rotation vectors that jump by a full turn, as
-    between π and −π, are continued instead if their names say that they are angles (`without_jumps`).
+    Repeated samples (same time, same outputs) are dropped. Jumps by a full turn, such as from π to −π, are removed from
+    outputs that have the names of angles or of a rotation vector (`without_jumps`).
 
     Args:
         times: One clock (N,) for all demonstrations, or M clocks (N_m,), strictly increasing [s or phase].
@@ -27,9 +27,9 @@ class Demonstrations:
         names: Different names of the outputs with their units, such as "x [m]"; "y1", "y2", … by default.
 
     Raises:
-        InputError: If there is no demonstration, one has fewer than two points or no output, shapes or dimensions
-            differ, a number is not finite or above `MAX_MAGNITUDE`, time does not increase strictly, or `names` are not
-            O different short printable texts.
+        InputError: If there is no demonstration, a demonstration has fewer than two samples or no output, shapes or
+            numbers of outputs do not match, a number is not finite or above `MAX_MAGNITUDE`, time does not increase
+            strictly, or `names` are not O different short printable texts.
 
     Attributes:
         times, outputs: M arrays (N_m,) and (N_m, O).
@@ -88,7 +88,7 @@ class Demonstrations:
         self.outputs = without_jumps(self.outputs, self.names)
 
     def _drop_repeated_samples(self) -> None:
-        """Drop the copies of a sample that a recorder logs if it runs faster than its robot."""
+        """Drop samples that equal their predecessor, as logged by a recorder that runs faster than its robot."""
         times, outputs = [], []
         for t, y in zip(self.times, self.outputs, strict=True):
             is_new = np.ones(len(t), dtype=bool)
@@ -108,7 +108,7 @@ class Demonstrations:
         return self.outputs[0].shape[1]
 
     def first(self, count: int | None) -> "Demonstrations":
-        """Return the first `count` demonstrations, or all if it is None.
+        """Return the first `count` demonstrations, or all if `count` is None.
 
         Raises:
             InputError: If `count` is not a whole number from 1 to the number of demonstrations.
@@ -123,8 +123,8 @@ class Demonstrations:
     def resampled(self, num_steps: int | None = None) -> "Demonstrations":
         """Return all demonstrations on one uniform clock, by linear interpolation.
 
-        Each demonstration is scaled in time to the mean duration, because a primitive learns positions and not the
-        different speeds of a demonstrator. Demonstrations that have such a clock already are returned unchanged.
+        Each demonstration is scaled in time to the mean duration, because a primitive learns positions, not speeds.
+        Demonstrations that already have one uniform clock of N steps are returned unchanged.
 
         Args:
             num_steps: Number of steps N, at least 2; the largest number of samples of a recording by default.
@@ -167,13 +167,13 @@ class Demonstrations:
     def load(cls, path: str | Path) -> "Demonstrations":
         """Read a file that `save` or another program wrote.
 
-        An `.npz` file may also hold `times` (N,) or (M, N) with `outputs` (M, N, O). A `.csv` file with a first line of
-        `t` (or `time`, `timestamp`, `time [s]`) and the outputs' names is one demonstration; a folder of such files is
-        several. Time is in seconds. Arrays of Python objects are refused, so that reading a file never executes code.
+        An `.npz` file of another program contains `times` (N,) or (M, N), and `outputs` (M, N, O). If the first line of
+        a `.csv` file is `t` (or `time`, `timestamp`, `time [s]`) and the outputs' names, the file contains one
+        demonstration. A folder of such files contains one demonstration per file. Time is in seconds. Arrays of Python
+        objects are refused, so that reading a file never executes code.
 
         Raises:
-            InputError: If there is no such file, it is truncated, damaged or too large, or it does not hold
-                demonstrations.
+            InputError: If there is no such file, or it is truncated, damaged, too large or without demonstrations.
         """
         path = Path(path)
         times, outputs, names = io.read(path)
@@ -201,7 +201,7 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
     """Warp demonstrations in time onto the demonstration of median duration, by dynamic time warping.
 
     The cost of a match is the distance of the samples, with each output divided by its standard deviation over all
-    demonstrations. The warping path is monotonic. The result at each step is the mean of the samples that match it.
+    demonstrations. The warping path is monotonic. The warped output at each step is the mean of the matched samples.
 
     Args:
         demonstrations: Demonstrations of one motion.
@@ -240,8 +240,8 @@ def align_demonstrations(demonstrations: Demonstrations, band: float = 0.2) -> D
 def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tuple[int, int]]:
     """Return the first and the last sample of `other` (N, O) that match each sample of `target` (N, O)."""
     size = len(target)
-    # Only two rows of the cost matrix are kept. The predecessor of each match in the band is stored: 0 for the match of
-    # both previous samples, 1 for the previous sample of `target`, 2 for that of `other`.
+    # Only two rows of the cost matrix are stored, and for each match in the band its predecessor: 0 for the previous
+    # samples of both, 1 for the previous sample of `target` alone, 2 for the previous sample of `other` alone.
     predecessors = np.zeros((size, min(size, 2 * width + 1)), dtype=np.uint8)
     last = [0.0] + [np.inf] * size
     for i in range(size):
@@ -269,7 +269,7 @@ def _warping_path(target: np.ndarray, other: np.ndarray, width: int) -> list[tup
 
 
 def phases_of_steps(phases: Sequence[float] | np.ndarray, num_steps: int) -> np.ndarray:
-    """Return the index of the phase of each step of a motion, (num_steps,).
+    """Return the phase index of each step of a motion, (num_steps,).
 
     `phases` (K,) are the increasing starts of the phases, as fractions of the duration; the first one is 0.
     """
@@ -282,8 +282,8 @@ class DemonstratedBounds:
 
     names: tuple[str, ...]  # names of the outputs (O,)
     phases: np.ndarray  # start of each phase (K,), as a fraction of the duration from 0 to below 1
-    lower: np.ndarray  # lower bounds (K, O), infinite where an output is free
-    upper: np.ndarray  # upper bounds (K, O), infinite where an output is free
+    lower: np.ndarray  # lower bounds (K, O), −inf for an unbounded output
+    upper: np.ndarray  # upper bounds (K, O), inf for an unbounded output
     max_rates: np.ndarray  # largest demonstrated rate of each output (O,) [unit of the output/s]
 
     def contains(self, outputs: np.ndarray) -> np.ndarray:
@@ -301,7 +301,7 @@ def compute_bounds(
 ) -> DemonstratedBounds:
     """Compute bounds that every demonstration satisfies.
 
-    The samples at the border of two phases belong to the ranges of both, so that the bounds of the phases overlap.
+    Samples at the border of two phases count for both phases, so that the bounds of the phases overlap.
 
     Args:
         demonstrations: At least one demonstration.
@@ -318,7 +318,7 @@ def compute_bounds(
     steps = outputs.shape[1]
     phases = as_whole(phases, "the number of phases")
     if not 1 <= phases <= steps // 2:
-        raise InputError(f"there are from 1 to {steps // 2} phases in {steps} samples, not {phases}")
+        raise InputError(f"{steps} samples can be divided into 1 to {steps // 2} phases, not {phases}")
     if not all(0.0 <= as_number(value, "a margin") < np.inf for value in (margin, min_margin)):
         raise InputError(f"margins must be finite and not negative, not {margin} and {min_margin}")
     chosen = range(outputs.shape[2]) if bounded is None else _as_list(bounded, "bounded")

@@ -12,21 +12,21 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
-"""RMS distance, relative to an output's range, up to which any deviation is accepted: spreads may be tiny."""
+"""RMS distance relative to an output's range that is accepted for any deviation, as standard deviations may be tiny."""
 MAX_OUTSIDE = 1.0
-"""Distance of a reference outside of a constraint up to which any deviation is accepted [unit of the output]."""
+"""Constraint violation by a reference that is accepted for any standard deviation [unit of the output]."""
 MAX_RANGES = 30.0
-"""As `MAX_OUTSIDE`, relative to the largest range of an output: a wrong unit changes it by factors of 1000."""
+"""As `MAX_OUTSIDE`, relative to the largest range of an output; a wrong unit changes this ratio by factors of 1000."""
 _EVALUATED = 16  # number of steps at which the deviation is measured
 
 
 def measure_deviation(
     reference: ReferenceTrajectory, kernel: Kernel, lambda_: float, beta: float, horizon: int
 ) -> tuple[float, float]:
-    """Compute the RMS distance of a motion from its reference mean, in two units, from a few of its steps.
+    """Compute the RMS distance of a primitive's motion from its reference mean, in two units.
 
-    The motion is that of a primitive without actions, history and constraints, with the arguments of `LcNsKmp`. λ and β
-    depend on the unit of the outputs: values for meters are wrong for millimeters.
+    The motion is evaluated at a few steps, without actions, history and constraints. The arguments are those of
+    `LcNsKmp`. λ and β depend on the unit of the outputs: values for meters are wrong for millimeters.
 
     Returns:
         The distance in standard deviations of the reference, and the largest distance of an output relative to the
@@ -46,7 +46,7 @@ def outputs_at(
 ) -> np.ndarray:
     """Compute the outputs (n, O) at `steps` (n,) without actions, history and constraints: k* (K + ħΣ)⁻¹ μ, ħ = λ + β.
 
-    The window of a step begins at that step. `hbar` is ħ; the other arguments are those of `LcNsKmp`.
+    The window of a step begins at the step. `hbar` is ħ; the other arguments are those of `LcNsKmp`.
     """
     outputs, at = reference.num_outputs, np.arange(horizon + 1)
     window = np.minimum(steps[:, None] + at, reference.num_steps - 1)
@@ -68,7 +68,7 @@ def squared_distances(covariances: np.ndarray, errors: np.ndarray) -> np.ndarray
 
 
 def describe_deviation(deviation: float, miss: float) -> str:
-    """Return a message about a deviation above one, with the remedy."""
+    """Return a message with the remedy for a deviation above one; the arguments are results of `measure_deviation`."""
     return (
         f"without actions the primitive is {deviation:.3g} standard deviations away from its demonstrations (RMS), and "
         f"{miss:.2g} of an output's range: check the unit of the outputs (defaults are for meters and seconds), or "
@@ -84,12 +84,12 @@ def check_deviation(
     horizon: int,
     max_deviation: float = MAX_DEVIATION,
 ) -> float:
-    """Return the first number of `measure_deviation`, in standard deviations; warn if it exceeds one.
+    """Return the deviation of `measure_deviation` [standard deviations], and warn if it exceeds one.
 
-    The arguments are those of `measure_deviation`, and `max_deviation` is the largest accepted first number.
+    The arguments are those of `measure_deviation`, and the largest accepted deviation.
 
     Raises:
-        InputError: If the first number exceeds `max_deviation`, and the second one `MAX_MISS`.
+        InputError: If the deviation exceeds `max_deviation` and the distance relative to the range exceeds `MAX_MISS`.
     """
     deviation, miss = measure_deviation(reference, kernel, lambda_, beta, horizon)
     if not deviation <= 1.0:
@@ -103,14 +103,14 @@ def check_deviation(
 def check_constraints(
     reference: ReferenceTrajectory, constraints: LinearConstraints, max_deviation: float = MAX_DEVIATION
 ) -> None:
-    """Check that constraints are not far from a reference, as they are if one of the two has a wrong unit.
+    """Check that a reference is not far outside of constraints, as happens if one of the two has a wrong unit.
 
-    A reference at rest has no scale to compare with and is accepted.
+    A reference at rest is accepted, because it has no range to compare with.
 
     Raises:
-        InputError: If the mean of the reference is outside of a constraint by more than `MAX_OUTSIDE`, by more than
-            `max_deviation` (at least `MAX_DEVIATION`) standard deviations, and by more than `MAX_RANGES` times the
-            largest range of an output.
+        InputError: If the mean of the reference violates a constraint by more than all of `MAX_OUTSIDE`,
+            `max_deviation` (at least `MAX_DEVIATION`) standard deviations, and `MAX_RANGES` times the largest range of
+            an output.
     """
     G, c = constraints.window(np.arange(reference.num_steps))
     outside = c - np.einsum("nfo,no->nf", G, reference.means)

@@ -7,11 +7,11 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.kernels import Kernel
 
-# Conditioning on a history with a standard deviation √ρ far below the kernel's, which is 1, loses digits in double
-# precision. Extended precision keeps sKGRL accurate at ρ = 1e-10, and costs a millisecond once for a whole trajectory.
+# If the history's standard deviation √ρ is far below the kernel's, which is 1, conditioning loses digits in double
+# precision. In extended precision sKGRL is accurate at ρ = 1e-10, for a millisecond more per trajectory.
 _Extended = np.longdouble
-# Least ratio of a point's variance given the previous points to the kernel's variance there. Below it, the point cannot
-# have an action of its own.
+# Smallest ratio of a point's variance, given the previous points, to its prior variance. Below this ratio, the point
+# cannot have an action of its own.
 _MIN_INDEPENDENCE = 1e-9
 
 
@@ -31,11 +31,14 @@ def window_features(
 ) -> WindowFeatures:
     """Condition the kernel on the history and factor the conditional kernel.
 
-    The history's covariance is ρI for every output, so that all outputs share one P×P problem. The history is kept out
+    The history's covariance is ρI for every output, so that all outputs share one P×P problem. The history is not part
     of the demonstrations' matrix, because a dense (K + ħΣ)⁻¹ of both would lose accuracy.
 
-    Inputs of the history are (P,) or (P, I) and may be empty, those of the window (H+1,) or (H+1, I). `history_noise`
-    is ħρ with ħ = λ + β and the variance ρ of the history; it is positive if there is a history.
+    Args:
+        kernel: Kernel.
+        history_inputs: Inputs of the history, (P,) or (P, I), possibly none.
+        future_inputs: Inputs of the window, (H+1,) or (H+1, I).
+        history_noise: ħρ with ħ = λ + β and the variance ρ of the history, positive if there is a history.
 
     Raises:
         InputError: If `history_noise` is too small for the length of the history.
@@ -49,11 +52,12 @@ def window_interpolation(
 ) -> np.ndarray:
     """Compute the map (H+1, J) from actions at J different points of the window to all its points, given the history.
 
-    The map is K̂ K̲⁻¹ (thesis, equation 4.17). K̂ is conditioned on the history, and K̲, between the J points, is not.
-    `points` (J,) are indices of points of the window; the other arguments are those of `window_features`.
+    The map is K̂ K̲⁻¹ (thesis, equation 4.17). K̂ is the kernel between the window and the J points, conditioned on the
+    history. K̲ is the kernel between the J points, not conditioned. `points` (J,) are indices into the window; the other
+    arguments are those of `window_features`.
 
     Raises:
-        InputError: As `window_features`, or if points are so close that K̲ is singular.
+        InputError: As `window_features`, or if points are so close to each other that K̲ is singular.
     """
     if len(points) == len(future_inputs) and not len(history_inputs):
         return np.eye(len(points))[:, points]  # actions at all points: nothing to interpolate
@@ -92,7 +96,7 @@ def _conditioned(
 
 
 class KernelBasis:
-    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on few inputs that span the others.
+    """Explicit features f(ζ) of a kernel, f(ζ)ᵀ f(ζ') = k(ζ, ζ'), based on a few of its inputs (pivots).
 
     Args:
         kernel: Kernel k.
@@ -124,7 +128,7 @@ class KernelBasis:
         inputs = inputs.astype(_Extended)
         F = self._extended_features(inputs)
         residual = self.residual(inputs, F)
-        # Larger than the tolerance of `_pivoted_cholesky`: no data determines the weight of a feature below 3e-8.
+        # Larger than the tolerance of `_pivoted_cholesky`: data hardly depend on the weight of a feature below 3e-8.
         tolerance = 1e-15
         before = self.size
         while len(inputs) and residual.max() > tolerance:
@@ -147,7 +151,7 @@ class KernelBasis:
 
 
 def _cholesky(A: np.ndarray) -> np.ndarray:
-    """Compute the lower Cholesky factor in the precision of A (LAPACK stops at double)."""
+    """Compute the lower Cholesky factor in the precision of A (LAPACK is limited to double precision)."""
     L = np.zeros_like(A)
     for j in range(len(A)):
         column = A[j:, j] - L[j:, :j] @ L[j, :j]

@@ -1,8 +1,7 @@
 """Selection of mixture, kernel and regularization by leave-one-out cross-validation.
 
-A kernel that is too wide cuts corners, a kernel that is too narrow does not smooth the motion, and a regularization in
-the wrong unit pulls everything towards zero. All three increase the error with which a demonstration is reproduced from
-the others.
+A kernel that is too wide cuts corners. A kernel that is too narrow does not smooth the motion. A regularization in the
+wrong unit pulls the motion towards zero. All three increase the error of reproducing one demonstration from the others.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +20,10 @@ from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.mixture import information_criteria
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
+MIN_DEMONSTRATIONS = 3
+"""Smallest number of demonstrations for `fit`."""
 MIN_SHARE = 0.95
-"""Share of the steps that must be within one standard deviation for a motion to follow the demonstrations."""
+"""Smallest share of steps within one standard deviation at which a motion follows the demonstrations."""
 # Length scales to try, relative to the motion's duration, for motions from a single bend to details of a few steps.
 _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 # Values of ħ = λ + β to try, for outputs of unit size.
@@ -38,8 +39,7 @@ class Candidate:
     length_scale: float  # ℓ of the kernel [unit of the input]
     lambda_: float  # λ = β
     # RMS Mahalanobis distance between a left-out demonstration and its reproduction from the others, in standard
-    # deviations of the demonstrations; infinite if the motion fitted to all of them leaves their spread, unless that of
-    # every candidate does.
+    # deviations of the demonstrations; infinite if `share` is below `MIN_SHARE` and below that of another candidate.
     error: float
     worse: float  # mean excess over the best candidate's squared error, in standard errors over the demonstrations
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
@@ -70,13 +70,9 @@ class Selection:
         return self.share >= MIN_SHARE
 
     def primitive(self, **arguments: Any) -> LcNsKmp:
-        """Build the selected primitive; `arguments` of `LcNsKmp` add to the selection or replace parts of it."""
+        """Build the selected primitive; `arguments` of `LcNsKmp` complete or replace the selected ones."""
         selected = {"kernel": self.kernel, "lambda_": self.lambda_, "beta": self.beta}
         return LcNsKmp(self.reference, **{**selected, **arguments})
-
-
-MIN_DEMONSTRATIONS = 3
-"""Least number of demonstrations for `fit`."""
 
 
 def fit(
@@ -95,10 +91,10 @@ def fit(
     """Select components, kernel and regularization by leave-one-out cross-validation.
 
     The selected number of components has the least Bayesian information criterion. Kernel and regularization are taken
-    from a grid relative to the motion's duration and size. Candidates qualify if their error is within a standard error
-    of the best one and their motion without actions stays within the demonstrations' spread. Of these, the strongest
-    regularization is selected, and for it the widest kernel: as smooth as the demonstrations allow. If no motion stays
-    within the spread, the candidate with the largest `share` is selected.
+    from a grid relative to the motion's duration and size. A candidate qualifies if its error is within a standard
+    error of the best error and its motion without actions stays within the demonstrations' spread (`MIN_SHARE`). The
+    strongest regularization that qualifies is selected, and for this regularization the widest kernel: the motion is as
+    smooth as the demonstrations allow. If no candidate qualifies, the one with the largest `share` is selected.
 
     Args:
         demonstrations: At least three demonstrations.
@@ -117,7 +113,7 @@ def fit(
             number of at least 0, or another argument is out of range.
     """
     if not is_whole(horizon, 0):
-        raise InputError(f"the horizon is a number of steps, not {brief(horizon)}")
+        raise InputError(f"the horizon must be a whole number of steps, at least 0, not {brief(horizon)}")
     horizon = int(horizon)
     if demonstrations.num_demonstrations < MIN_DEMONSTRATIONS:
         raise InputError(
@@ -133,8 +129,8 @@ def fit(
     components = min(criteria, key=lambda count: criteria[count])
 
     reference = ReferenceTrajectory.from_demonstrations(resampled, components, seed, floor=floor)
-    others = (Demonstrations(times, np.delete(outputs, m, axis=0)) for m in range(len(outputs)))
-    folds = [ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor) for fold in others]
+    remaining = (Demonstrations(times, np.delete(outputs, m, axis=0)) for m in range(len(outputs)))
+    folds = [ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor) for fold in remaining]
     make = partial(make_kernel, kernel, parameters=kernel_parameters)
     candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
     selected = _select(candidates)
@@ -159,8 +155,8 @@ def fit(
 def share_within_spread(primitive: LcNsKmp) -> float:
     """Compute the share of steps at which the motion without actions is within one standard deviation of the mean.
 
-    One standard deviation is the ellipsoid of the reference's covariance, correlations included. Below `MIN_SHARE`, the
-    kernel is too wide for the demonstrations or the regularization too strong; `fit` selects both.
+    One standard deviation is the ellipsoid of the reference's covariance. If the share is below `MIN_SHARE`, the kernel
+    is too wide for the demonstrations or the regularization is too strong; `fit` selects both.
     """
     return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
 
@@ -211,7 +207,7 @@ def _validate(
     grid: Sequence[tuple[float, float]],
     make: Callable[[float], Kernel],
 ) -> tuple[Candidate, ...]:
-    """Return all candidates with their errors; the error is infinite if the motion leaves the spread."""
+    """Return the candidates of a grid with their errors (see `Candidate`)."""
     steps = np.unique(np.linspace(0, reference.num_steps - 1, _EVALUATED).astype(int))
     kernels = [make(length_scale) for length_scale, _ in grid]
     motions = [outputs_at(reference, k, hbar, horizon, steps) for k, (_, hbar) in zip(kernels, grid, strict=True)]
@@ -236,13 +232,10 @@ def _validate(
 
 
 def _select(candidates: Sequence[Candidate]) -> Candidate:
-    """Select the strongest regularization among the best candidates, and for it the widest kernel.
-
-    If no candidate stays within the spread, select the one with the largest share.
-    """
-    best = [c for c in candidates if c.worse <= 1.0 and c.share >= MIN_SHARE]
-    if best:
-        return min(best, key=lambda c: (-c.lambda_, -c.length_scale))
+    """Select a candidate as described in `fit`."""
+    qualified = [c for c in candidates if c.worse <= 1.0 and c.share >= MIN_SHARE]
+    if qualified:
+        return max(qualified, key=lambda c: (c.lambda_, c.length_scale))
     return max(candidates, key=lambda c: (c.share, -c.error))
 
 
@@ -266,4 +259,4 @@ def _explain(
     )
     if share >= MIN_SHARE:
         return text + ": no smoother candidate is as good."
-    return text + f", less than {MIN_SHARE:.0%}: record more demonstrations, or ones that differ less in their timing."
+    return text + f", less than {MIN_SHARE:.0%}: record more demonstrations, or more similar ones in their timing."

@@ -1,4 +1,4 @@
-"""Full turns of angles and rotation vectors, by which outputs of the same orientation differ."""
+"""Removal of full-turn jumps from angles and rotation vectors: a full turn changes numbers but not orientations."""
 
 from __future__ import annotations
 
@@ -17,26 +17,25 @@ _ANGLE_NAMES = {
     ("rz", "ry", "rx"): "euler_zyx",
     ("r_x", "r_y", "r_z"): "rotation_vector",
 }
-
-
-_SURE = 1.0  # largest rotation [rad] between two samples at which a change of about a full turn is a jump
+_MAX_ROTATION = 1.0  # largest rotation between two samples at which a change of about a full turn is a jump [rad]
 
 
 def orientation_of_names(names: Sequence[str]) -> Orientation | None:
-    """Return the representation of the orientation that belongs to the names of six outputs.
+    """Return the representation of the orientation in six outputs with the given names.
 
-    Accepted names are those of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
-    `guiderail dataset import` writes them. The result is None for other names or another number of names.
+    Names of orientations are those of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
+    `guiderail dataset import` writes them. The result is None for other names and for another number of names.
     """
     plain = _plain(names)
     return cast("Orientation | None", _ANGLE_NAMES.get(plain[3:])) if len(plain) == 6 else None
 
 
 def without_jumps(outputs: Sequence[np.ndarray], names: Sequence[str]) -> tuple[np.ndarray, ...]:
-    """Remove full turns by which angles and rotation vectors jump from sample to sample, or between the first samples.
+    """Remove full-turn jumps of angles and rotation vectors between samples, and between the arrays' first samples.
 
-    Outputs are angles if their unit is rad. The last three of six outputs are a rotation vector if their names say so
-    (`orientation_of_names`, and "rx", "ry", "rz"). Outputs without a jump are returned unchanged.
+    An output is an angle if its name contains the unit "[rad]". The last three of six outputs are Euler angles or a
+    rotation vector if they have such names (`orientation_of_names`, or "rx", "ry", "rz" for a rotation vector). Outputs
+    without a jump are returned unchanged.
 
     Args:
         outputs: M arrays (N_m, O); their first samples are compared with that of the first array.
@@ -55,7 +54,7 @@ def without_jumps(outputs: Sequence[np.ndarray], names: Sequence[str]) -> tuple[
                 changed = np.column_stack([y[:, :3], continued_vectors(y[:, 3:], first[3:])])
         elif any(is_angle):
             steps = np.diff(y, axis=0, prepend=first[None])
-            turns = np.where(np.abs(np.abs(steps) - 2 * math.pi) <= _SURE, np.sign(steps), 0.0) * is_angle
+            turns = np.where(np.abs(np.abs(steps) - 2 * math.pi) <= _MAX_ROTATION, np.sign(steps), 0.0) * is_angle
             if turns.any():
                 changed = y - 2 * math.pi * np.cumsum(turns, axis=0)
         result.append(changed)
@@ -63,14 +62,14 @@ def without_jumps(outputs: Sequence[np.ndarray], names: Sequence[str]) -> tuple[
 
 
 def continued_angles(angles: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Remove full-turn jumps from angles (N, 3), on the branch of `near`."""
+    """Remove full-turn jumps from angles (N, 3), starting on the branch nearest to `near` (3,), zero if None [rad]."""
     angles = np.unwrap(angles, axis=0)
     start = np.zeros(3) if near is None else near
     return angles - 2 * np.pi * np.round((angles[0] - start) / (2 * np.pi))
 
 
 def continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to its predecessor."""
+    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to the last one, first `near`."""
     vectors = np.array(vectors)
     last = np.zeros(3) if near is None else near
     for i, r in enumerate(vectors):
@@ -84,10 +83,10 @@ def continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarra
 
 def _has_jump(vectors: np.ndarray, near: np.ndarray) -> bool:
     """Return True if a rotation vector (N, 3) is a full turn away from its predecessor, the first one from `near`."""
-    before = np.concatenate([near[None], vectors[:-1]])
-    is_far = np.abs(np.linalg.norm(vectors - before, axis=1) - 2 * math.pi) <= _SURE
-    pairs = zip(vectors[is_far], before[is_far], strict=True)
-    return any(np.linalg.norm(continued_vectors(one[None], last)[0] - last) <= _SURE for one, last in pairs)
+    previous = np.concatenate([near[None], vectors[:-1]])
+    is_far = np.abs(np.linalg.norm(vectors - previous, axis=1) - 2 * math.pi) <= _MAX_ROTATION
+    pairs = zip(vectors[is_far], previous[is_far], strict=True)
+    return any(np.linalg.norm(continued_vectors(r[None], last)[0] - last) <= _MAX_ROTATION for r, last in pairs)
 
 
 def _plain(names: Sequence[str]) -> tuple[str, ...]:

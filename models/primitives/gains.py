@@ -1,8 +1,8 @@
 """Gains from a policy's action in [−1, 1] to null-space units, per output.
 
-The null-space projector is about the size of the posterior's variance: if demonstrations vary by millimeters, a raw
-action of size one barely moves the output. Without active constraints the map from the history to the next point is
-linear. Two numbers that describe a gain are computed from this map exactly, for a given action repeat:
+The null-space projector is about as large as the posterior variance. If demonstrations vary by millimeters, a raw
+action of size one therefore barely moves the output. Without active constraints, the map from history and action to the
+next point is linear. Two measures of a gain are computed exactly from this map, for a given action repeat:
 
 - authority: displacement by a constant action of ±1, in demonstration standard deviations;
 - exploration RMS: root mean square of the displacement by uniform white actions in ±1, in the same unit.
@@ -23,7 +23,7 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
     """Compute the displacement (O,) of each output by a constant raw action of one in the same output.
 
     The displacement [unit of the output] is the RMS over the motion. `outputs` are indices or a mask of the explored
-    outputs, all by default; the displacement of the others is returned as zero.
+    outputs, all by default. The result is zero for the outputs that are not explored.
 
     Raises:
         InputError: If there is no explored output, an index does not exist, or a mask does not have O entries.
@@ -38,10 +38,10 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 def authority_gains(primitive: LcNsKmp, action_scale: float = 1.0, outputs: np.ndarray | None = None) -> np.ndarray:
     """Compute gains (O,) with which a constant action of ±1 moves outputs by √3 κ demonstration standard deviations.
 
-    The RMS of uniform actions in ±1 is 1/√3. With the factor √3 they cause an RMS of κ standard deviations if outputs
-    are not coupled and a command depends on one action only, as in KGRL. Displacement and deviation are RMS over the
-    whole motion. Regions in which the demonstrations vary widely therefore have the most influence. The result does
-    not depend on the action repeat, because a constant action is the same for every action repeat.
+    The RMS of uniform actions in ±1 is 1/√3. The factor √3 therefore leads to an RMS displacement of κ standard
+    deviations by uniform actions, if outputs are not coupled and a command depends on one action only, as in KGRL.
+    Displacement and standard deviation are RMS over the whole motion, so that regions in which the demonstrations vary
+    widely have the most influence. The result does not depend on the action repeat, because the action is constant.
 
     Args:
         primitive: Primitive to calibrate.
@@ -65,8 +65,8 @@ def rms_gains(
 ) -> np.ndarray:
     """Compute gains (O,) with which uniform white actions in ±1 cause an RMS of κ demonstration standard deviations.
 
-    Exploration strategies must agree in this RMS before their smoothness is compared. Outputs are coupled through the
-    demonstrations' correlations, so one system of equations determines all gains.
+    The smoothness of exploration strategies can only be compared at equal RMS. Outputs are coupled through the
+    demonstrations' correlations, so that one system of equations determines all gains.
 
     Args:
         primitive: Primitive to calibrate.
@@ -75,8 +75,8 @@ def rms_gains(
         outputs: Indices or mask of the explored outputs, all by default; the others get a gain of zero.
 
     Raises:
-        InputError: As `authority_gains`, if `action_repeat` is out of range, or if no gains reach κ in all outputs
-            because of their correlations.
+        InputError: As `authority_gains`; also if `action_repeat` is out of range, or the outputs are so correlated that
+            no gains reach κ in all of them.
     """
     check_action_scale(action_scale)
     explored = np.flatnonzero(_explored_mask(primitive, outputs))
@@ -84,7 +84,7 @@ def rms_gains(
     _check_response(primitive, np.sqrt(power.diagonal()))
     squared = np.linalg.solve(power, (action_scale * deviation(primitive.reference)[explored]) ** 2)
     if (squared <= 0).any():
-        raise InputError("the outputs are too correlated to explore all of them alike: name fewer in outputs=")
+        raise InputError("the outputs are too correlated for an equal RMS in all of them: name fewer in outputs=")
     gains = np.zeros(primitive.num_outputs)
     gains[explored] = np.sqrt(squared)
     return gains
@@ -93,7 +93,7 @@ def rms_gains(
 def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 1) -> np.ndarray:
     """Compute the RMS displacement (O,) by white actions times gains (O,), in demonstration standard deviations.
 
-    The actions are uniform in ±1, and each lasts `action_repeat` control steps.
+    The actions are uniform in ±1. Each action lasts `action_repeat` control steps.
 
     Raises:
         InputError: If `action_repeat` is not a whole number of at least 1, or `gains` are not O numbers.
@@ -117,8 +117,8 @@ def residual_gains(
     """Compute the displacement (O,) of a residual command by an action of one, equal for all outputs of a group.
 
     The displacement [unit of the output] is √3 κ times the RMS of the demonstrations' standard deviations over the
-    motion and the group. A null-space action of one displaces the command as much on average, but differently over time
-    and direction.
+    motion and the group. A null-space action of one causes the same displacement on average, but a displacement that
+    depends on time and direction.
 
     Args:
         reference: Reference trajectory of the demonstrations.
@@ -200,10 +200,7 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
 
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
-    """Compute the mean square displacement (O, O) of output i by uniform white actions in output j.
-
-    The actions are in ±1, with gain 1.
-    """
+    """Compute the mean square displacement (O, O) of output i by uniform white raw actions in ±1 in output j."""
     if not is_whole(action_repeat, 1):
         raise InputError(f"action_repeat is a number of control steps, at least 1, not {brief(action_repeat)}")
     action_repeat = int(action_repeat)

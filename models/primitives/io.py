@@ -1,8 +1,8 @@
-"""Readers and writers of demonstration files: `.npz`, which is small, and `.csv`, which any program can write.
+"""Readers and writers of demonstration files: small `.npz` files, and `.csv` files, which any program can write.
 
 Reading takes bounded time and memory for any content, and never executes code. NumPy's reader allocates the size that a
-header claims; headers are therefore checked here against the size of the array before it is read. CSV files are read by
-the standard library's strict reader: `pandas.read_csv` fills short rows and accepts text after a closing quote.
+header claims. Headers are therefore compared with the size of the array before the array is read. CSV files are read by
+the standard library's strict reader, because `pandas.read_csv` fills short rows and accepts text after a closing quote.
 """
 
 import csv
@@ -21,18 +21,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import in_order, read_bytes, write_atomically
 
-MAX_NUMBERS = 2_000_000  # numbers in one file, such as four minutes of six outputs at a kilohertz
-MAX_DEMONSTRATIONS = 1_000
-MAX_LINES = 400_000  # lines of one text file, or samples of one folder: six minutes at a kilohertz
-MAX_FILE_SIZE = 32_000_000  # size of one file, or of all files of a folder [bytes]
-# Largest step to the last number of a file without a last line end, relative to the largest step before it.
+MAX_NUMBERS = 2_000_000  # largest number of values in a file, enough for four minutes of six outputs at 1 kHz
+MAX_DEMONSTRATIONS = 1_000  # largest number of demonstrations in a file or a folder
+MAX_LINES = 400_000  # largest number of lines of a text file or samples of a folder, enough for six minutes at 1 kHz
+MAX_FILE_SIZE = 32_000_000  # largest size of a file, or of all files of a folder [bytes]
+# Largest accepted step to the last number of a file without a final line end, relative to the largest step before.
 MAX_LAST_STEP = 3.0
-_MAX_LINE_LENGTH = 100_000  # [characters]
+_MAX_LINE_LENGTH = 100_000  # largest length of a line [characters]
 _MAX_HEADER_SIZE = 1_000  # largest header of an array [bytes]; NumPy writes 118
-_MAX_NAMES_SIZE = 1_000_000  # [bytes]
+_MAX_NAMES_SIZE = 1_000_000  # largest size of the array of names [bytes]
 _MAX_DIRECTORY_SIZE = 100_000  # largest directory of an archive [bytes]
 
 # Name of the clock's column in a file of one demonstration, with or without a unit.
@@ -138,9 +139,9 @@ def _read_npz(data: bytes) -> Recording:
 
 
 def _check_directory(data: bytes) -> None:
-    """Raise an InputError for data that are not a whole archive, and for an archive of many arrays.
+    """Raise an InputError if data are not a complete archive, or if the archive's directory is too large.
 
-    Every entry of an archive's directory costs time and memory.
+    Every entry of the directory costs time and memory.
     """
     if data[:6] == b"\x93NUMPY":
         raise InputError("it is a single array (.npy): save `times` and `outputs` with numpy.savez")
@@ -179,7 +180,7 @@ def _read_archive(archive: zipfile.ZipFile) -> Recording:
 
 
 def _split(archive: zipfile.ZipFile, headers: dict[str, _Header], names: list[str] | None) -> Recording:
-    """Read the concatenated samples of all demonstrations and split them."""
+    """Read the concatenated samples of all demonstrations and split them by demonstration."""
     lengths, times, outputs = (headers[key] for key in ("lengths", "times", "outputs"))
     if lengths.dtype.kind not in "iu" or len(lengths.shape) != 1:
         raise InputError(f"'lengths' must be whole numbers (M,), not {lengths.dtype} {lengths.shape}")
@@ -258,8 +259,7 @@ def _check_count(count: int) -> None:
 
 
 def _read_csv(data: bytes) -> Recording:
-    # Python's float reads more than other programs do: digits of other scripts, and 1_000.
-    is_plain = data.isascii() and b"_" not in data
+    parse = float if data.isascii() and b"_" not in data else parse_number  # `float` is faster
     rows = csv.reader(_lines(data), strict=True)
     values = array("d")
     try:
@@ -273,10 +273,8 @@ def _read_csv(data: bytes) -> Recording:
                 continue
             if len(row) != len(header):
                 raise InputError(f"line {rows.line_num} has {len(row)} fields, the header has {len(header)}")
-            if not is_plain and not all(field.isascii() and "_" not in field for field in row):
-                raise InputError(f"line {rows.line_num} holds something other than numbers")
             try:
-                values.extend(map(float, row))
+                values.extend(map(parse, row))
             except ValueError as error:
                 raise InputError(f"line {rows.line_num} holds something other than numbers: {error}") from error
             if len(values) > MAX_NUMBERS:
@@ -285,8 +283,8 @@ def _read_csv(data: bytes) -> Recording:
         raise InputError(f"it is not a table of numbers: {error}") from error
     samples = np.frombuffer(values, dtype=float).reshape(-1, len(header))
     if not data.endswith((b"\n", b"\r")):
-        of_last = slice(None) if not is_numbered or not len(samples) else samples[:, 0] == samples[-1, 0]
-        _check_last_value(samples[of_last, -1])
+        is_last = samples[:, 0] == samples[-1, 0] if is_numbered and len(samples) else slice(None)
+        _check_last_value(samples[is_last, -1])
     if not is_numbered:
         return Recording([samples[:, 0]], [samples[:, 1:]], header[1:])
     parts = _split_samples(samples)
@@ -294,9 +292,10 @@ def _read_csv(data: bytes) -> Recording:
 
 
 def _check_last_value(values: np.ndarray) -> None:
-    """Raise an InputError if the last number of a file without a last line end seems to be cut.
+    """Raise an InputError if the last of the values (N,) of a file without a final line end seems to be truncated.
 
-    Some programs write no last line end; so the number is refused only if it jumps from the values (N,) before it.
+    Some programs write no final line end. The last number is therefore refused only if its step from the number before
+    is more than `MAX_LAST_STEP` times the largest other step.
     """
     with np.errstate(invalid="ignore"):  # a later check refuses NaN and infinite numbers
         steps = np.abs(np.diff(values))
@@ -308,13 +307,13 @@ def _check_last_value(values: np.ndarray) -> None:
 
 
 def find_repeated(names: Iterable[str]) -> str:
-    """Return the first name that repeats an earlier one, or an empty text; several columns may have no name."""
+    """Return the first name that equals an earlier one, or an empty text; empty names are not compared."""
     names = list(names)
     return next((name for number, name in enumerate(names) if name and name in names[:number]), "")
 
 
 def _check_clock(header: list[str], column: int) -> None:
-    """Raise an InputError if `column` of a header is not a clock in seconds or no output follows it."""
+    """Raise an InputError if `column` of a header is not a clock in seconds, or if no output follows the clock."""
     clock = _TIME.fullmatch(header[column]) if len(header) >= 2 + column else None
     if clock is None:
         raise InputError("the first line must be demonstration,time,<outputs> or time,<outputs>")
@@ -335,7 +334,7 @@ def _lines(data: bytes) -> Iterator[str]:
 
 
 def _split_samples(samples: np.ndarray) -> list[np.ndarray]:
-    """Return the rows of each demonstration, by its number in the first column."""
+    """Split samples by the number of the demonstration in their first column."""
     labels = samples[:, 0]
     if not (np.isfinite(labels).all() and (labels == np.round(labels)).all() and (np.abs(labels) < 2**53).all()):
         raise InputError("the column 'demonstration' must hold whole numbers")
@@ -347,7 +346,7 @@ def _split_samples(samples: np.ndarray) -> list[np.ndarray]:
 
 
 def _read_folder(folder: Path) -> Recording:
-    """Read every `.csv` file of a folder, sorted by name with the numbers in the names by value."""
+    """Read every `.csv` file of a folder in the order of the names, in which numbers are sorted by value."""
     times: list[np.ndarray] = []
     outputs: list[np.ndarray] = []
     names: Sequence[str] | None = None

@@ -16,28 +16,28 @@ from guiderail.models.common.registry import Registry, check_callable, did_you_m
 class Kernel(Protocol):
     """Positive definite function of two inputs, evaluated on whole arrays at once."""
 
-    #: True if k depends on ζ − ζ' only: a uniform clock then has the same kernel matrix in every window.
+    #: True if k depends on ζ − ζ' only; on a uniform clock, the kernel matrix is then the same in every window.
     stationary: bool
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return k (N, M) between the rows of `a` (N,) or (N, I) and `b` (M,) or (M, I), in their precision."""
+        """Return k (N, M) between rows of `a` (N,) or (N, I) and `b` (M,) or (M, I), in the arguments' precision."""
         ...
 
 
 KERNELS: Registry[Callable[..., Kernel]] = Registry(
     "kernel", package=__package__, decorator="register_kernel", entry_points="guiderail.kernels", check=check_callable
 )
-"""Registry of kernels; their names are the values of an environment's option `kernel`.
+"""Registry of kernels; the names are the values of an environment's option `kernel`.
 
-An entry is called with `length_scale=` and its own further parameters, all of them numbers, and returns a kernel.
+An entry is called with `length_scale=` and its further parameters, all of them numbers, and returns a kernel.
 """
 register_kernel = KERNELS.register
 DEFAULT_KERNEL = "squared_exponential"
 DEFAULT_LENGTH_SCALE = 0.5
-_SMALLEST, _LARGEST = 1e-100, 1e100  # bounds of a length scale: far beyond them, kernels overflow or are NaN
+_SMALLEST, _LARGEST = 1e-100, 1e100  # bounds of a length scale; far outside of them, kernels overflow or are NaN
 _CHECKED = 48  # number of inputs at which `check_kernel` evaluates a kernel
-_SHIFTS = (0.37, -0.83, 2.9)  # shifts of the inputs of a stationary kernel in `check_kernel`, in their range
-_ROUNDING = 1e-9  # largest rounding error of a kernel in double precision, relative to its largest value
+_SHIFTS = (0.37, -0.83, 2.9)  # shifts of inputs by which `check_kernel` tests stationarity, relative to their range
+_ROUNDING = 1e-9  # largest accepted rounding error of a kernel, relative to its largest value
 
 
 def make_kernel(
@@ -53,8 +53,8 @@ def make_kernel(
         parameters: Further parameters of the kernel by name.
 
     Raises:
-        InputError: If there is no such kernel, a parameter is missing or not one of the kernel's, or a value is not one
-            number or out of range.
+        InputError: If there is no such kernel, a parameter is missing or unknown, or a value is not a number or is out
+            of range.
     """
     factory = KERNELS.get(name)
     parameters = parameters or {}
@@ -82,18 +82,18 @@ def _build(factory: Callable[..., Kernel], length_scale: float, parameters: tupl
 
 
 def kernel_name(kernel: Kernel) -> str | None:
-    """Return the name that the class of `kernel` is registered by, or None."""
+    """Return the name under which the class of `kernel` is registered, or None."""
     return KERNELS.name_of(type(kernel))
 
 
 def check_kernel(kernel: Any, inputs: np.ndarray) -> None:
     """Check that a kernel is positive definite on a subset of `inputs` (n,) or (n, I), and stationary as declared.
 
-    The subset is at most 48 inputs: the first ones, and others at equal distances.
+    The subset has at most 48 inputs: the first inputs, and further inputs at equal distances.
 
     Raises:
-        InputError: If `kernel` is no kernel; if a matrix that it returns has the wrong shape or type, is not finite,
-            not symmetric or not positive definite; or if it is declared stationary and is not.
+        InputError: If `kernel` is not a kernel; if its matrix has the wrong shape or type, is not finite, not symmetric
+            or not positive definite; or if the kernel is declared stationary and is not.
     """
     if isinstance(kernel, type) or not callable(kernel):
         raise InputError(f"a kernel is an object such as SquaredExponential(0.5), not {brief(kernel)}")
@@ -121,7 +121,7 @@ def check_kernel(kernel: Any, inputs: np.ndarray) -> None:
         )
     part = _checked_matrix(kernel, name, x[:2], x).astype(float)
     if not np.allclose(part, K[:2], rtol=0.0, atol=rounding * largest):
-        raise InputError(f"{name} has other values for a part of the inputs: k(a, b) must depend on a and b only")
+        raise InputError(f"{name} changes if evaluated at fewer inputs: k(a, b) must depend on a and b only")
     if kernel.stationary:
         extent = np.where(np.ptp(x, axis=0) > 0.0, np.ptp(x, axis=0), 1.0)
         for shift in _SHIFTS:
@@ -134,7 +134,7 @@ def check_kernel(kernel: Any, inputs: np.ndarray) -> None:
 
 
 def _checked_matrix(kernel: Kernel, name: str, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the kernel between inputs; raise an InputError unless it is a matrix of finite real numbers."""
+    """Return the kernel matrix of two arrays of inputs; raise an InputError unless it has finite real numbers."""
     with naming_failures(f"evaluating {name}"):
         K: Any = kernel(a, b)
     shape = (len(a), len(b))
@@ -183,13 +183,8 @@ class Matern52(_StationaryKernel):
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
     Random motions with this covariance are only twice differentiable. The kernel suits motions for which the squared
-    exponential kernel is too smooth, such as motions with a contact in the middle.
-
-    Args:
-        length_scale: Length scale ℓ, in the unit of the input, positive.
-
-    Raises:
-        InputError: If the length scale is not in [1e-100, 1e100].
+    exponential kernel is too smooth, such as motions with a contact in the middle. The argument is that of
+    `SquaredExponential`.
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:

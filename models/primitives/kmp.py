@@ -21,14 +21,14 @@ class _Point:
 class Kmp:
     """Kernelized movement primitive with E(ζ) = k*(K + λΣ)⁻¹μ and cov(ζ) = N/λ_c (k** − k*(K + λ_cΣ)⁻¹k*ᵀ).
 
-    k* and k** are the kernel between a query ζ and the N points, and at ζ itself. K, Σ and μ are the kernel, the
-    covariances and the means of the points. N counts via-points too.
+    k* is the kernel between a query ζ and the N points, and k** the kernel at ζ itself. K, Σ and μ are the kernel, the
+    covariances and the means of the points. N includes the via-points.
 
-    `LcNsKmp` solves for a window of steps; this class uses the whole reference at once, for primitives driven by a
-    state instead of time, and for via-points. The solution is stored as weights of the kernel's features. The number of
-    features is the numerical rank of K, which can be much smaller than N. A QR decomposition gives the weights. The
-    triangular factor of the reference is stored: a change of a via-point only appends O rows for each via-point to it,
-    unless a via-point far from the reference adds features.
+    `LcNsKmp` solves for a window of steps. This class uses the whole reference at once, for via-points and for
+    primitives whose input is a state instead of time. The solution is stored as weights of the kernel's features, which
+    are computed by a QR decomposition. The number of features is the numerical rank of K, which can be much smaller
+    than N. The triangular factor of the reference is stored. When a via-point changes, only O rows per via-point are
+    appended to this factor, unless a via-point far from the reference adds features.
 
     Args:
         inputs: Times or states, (N,) or (N, I).
@@ -125,7 +125,7 @@ class Kmp:
         return identifier
 
     def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Replace a via-point by one with another input (I,), mean (O,) and covariance (O, O).
+        """Change input (I,), mean (O,) and covariance (O, O) of a via-point.
 
         Raises:
             InputError: As `add_via_point`, or if there is no such via-point.
@@ -146,7 +146,7 @@ class Kmp:
 
     def _check_identifier(self, identifier: int) -> None:
         if identifier not in self._via:
-            raise InputError(f"there is no via-point {identifier}: there are {sorted(self._via)}")
+            raise InputError(f"there is no via-point {identifier}: choose from {sorted(self._via)}")
 
     def _check_point(self, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> _Point:
         point, mean = np.atleast_1d(as_numbers(input_, "a via-point's input")), as_numbers(mean, "a via-point's mean")
@@ -206,9 +206,9 @@ def _append(
     if not len(rows):
         return triangle, right
     stacked = np.vstack([np.column_stack([triangle, right]), np.column_stack([rows, targets])])
-    both = np.asarray(np.linalg.qr(stacked, mode="r"))
+    factor = np.asarray(np.linalg.qr(stacked, mode="r"))
     size = triangle.shape[1]
-    return both[:size, :size], both[:size, size]
+    return factor[:size, :size], factor[:size, size]
 
 
 def _rows(inputs: np.ndarray) -> np.ndarray:

@@ -155,7 +155,7 @@ def test_fit_refuses_too_few_demonstrations():
     with pytest.raises(InputError, match="at least three"):
         fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
     for wrong in (-1, 2.5, np.nan, np.inf):
-        with pytest.raises(InputError, match="the horizon is a number of steps"):
+        with pytest.raises(InputError, match="the horizon must be a whole number of steps"):
             fit(correlated(count=4, steps=80), horizon=wrong)
     with pytest.raises(InputError, match="at least 12 steps"):
         fit(Demonstrations(t[:5], [t[:5, None], 2 * t[:5, None], 3 * t[:5, None]]))
