@@ -259,4 +259,4 @@ def _explain(
     )
     if share >= MIN_SHARE:
         return text + ": no smoother candidate is as good."
-    return text + f", less than {MIN_SHARE:.0%}: record more demonstrations, or more similar ones in their timing."
+    return text + f", less than {MIN_SHARE:.0%}: record more demonstrations, or some whose timing differs less."

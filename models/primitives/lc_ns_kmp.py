@@ -1,10 +1,10 @@
 """Linearly constrained null-space kernelized movement primitives, LC-NS-KMP (thesis, sections 4.3 and 5.3).
 
-A prediction solves problem 4.5 for a window of the P last outputs and the H+1 next reference points. The solution
-follows the demonstrations as closely as their covariance requires, passes through the history, is displaced by a
-null-space action at the executed point, and satisfies the linear constraints at every future point. Special cases are
-NS-KMP without constraints (equation 4.4), LC-KMP with β = 0 (4.2), KMP without constraints and with β = 0 (2.17), and
-the primitive of sKGRL with a history (5.1 to 5.3).
+A prediction solves problem 4.5 for a window of the P last outputs (the history) and the H+1 next reference points. The
+solution follows the demonstrations as closely as their covariance requires, and passes through the history. A
+null-space action displaces it at the executed point. It satisfies the linear constraints at every future point. Special
+cases are NS-KMP without constraints (equation 4.4), LC-KMP with β = 0 (4.2), KMP without constraints and with β = 0
+(2.17), and the primitive of sKGRL with a history (5.1 to 5.3).
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ if TYPE_CHECKING:
 class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
-    The kernel's input is the reference's time, so every matrix depends on the step alone. Each step is factored at its
-    first use. A prediction takes two small matrix products; a QP is solved only if the result violates a constraint.
+    The kernel's input is the reference's time, so that every matrix depends on the step alone. Each step is factored at
+    its first use. A prediction then takes two small matrix products; a QP is solved only if the result violates a
+    constraint.
 
     Args:
         reference: Means and covariances of the demonstrations, N steps of O outputs.
@@ -49,12 +50,12 @@ class LcNsKmp:
         history_variance: Variance ρ of the past outputs [output²], positive.
         constraints: Constraints G y ≥ c at every future point; none by default.
         solver: "daqp", "piqp" or "osqp".
-        cache_bytes: Memory limit of the factored steps [bytes]; beyond it, the steps factored first are dropped.
-        max_deviation: Largest accepted `deviation`, unless the motion is within `MAX_MISS` (`check_deviation`).
+        cache_bytes: Memory limit of the factored steps [bytes]. Above the limit, the steps factored first are dropped.
+        max_deviation: Largest accepted `deviation` of a motion that is not within `MAX_MISS` (`check_deviation`).
 
     Raises:
-        InputError: If an argument is out of range, sizes do not match, the history's variance is too small for its
-            length, or `check_kernel`, `check_deviation` or `check_constraints` raises it.
+        InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for its
+            length; also as `check_kernel`, `check_deviation` and `check_constraints`.
 
     Warns:
         UserWarning: If `deviation` exceeds one.
@@ -122,7 +123,7 @@ class LcNsKmp:
 
     @property
     def num_steps(self) -> int:
-        """Number of steps N; later steps repeat step N−1, so the motion stays at its end."""
+        """Number of steps N; later steps are equal to step N−1: the motion stays at its end."""
         return self.reference.num_steps
 
     def predict(
@@ -132,12 +133,12 @@ class LcNsKmp:
 
         Args:
             step: Step n ≥ 0; past the end, the last step.
-            null_space_action: ξ̂ (O,), in the outputs' units times a gain (see the module `gains`); zero by default.
+            null_space_action: ξ̂ (O,), the policy's action times a gain (see the module `gains`); zero by default.
             history: Outputs at step−P … step−1, oldest first, (P, O); None if P = 0.
 
         Raises:
             InputError: If an argument has the wrong shape or is not finite, or the step is negative or not whole.
-            UnsolvableError: If no window within the constraints was found; repeat the last safe command.
+            UnsolvableError: If no window within the constraints was found. Repeat the last safe command.
         """
         factor = (self._cache.get(step) if type(step) is int else None) or self._factor(step)
         return self._finish(factor, self._stack(null_space_action, history))
@@ -181,7 +182,7 @@ class LcNsKmp:
         history_source: Literal["commanded", "measured"] = "commanded",
         motion: MotionConstraintFilter | None = None,
     ) -> PrimitiveStepper:
-        """Start an episode that computes one command per control step without a diagram.
+        """Start an episode without a diagram, and return the stepper that computes its commands.
 
         Arguments and errors are those of `PrimitiveStepper`: `pose` is (O,) or (P, O), and `gain` is (O,).
         """
@@ -222,7 +223,7 @@ class LcNsKmp:
         past = inputs[:0] if history_inputs is None else as_numbers(history_inputs, "history_inputs")
         window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
         if past.shape != (self.history, *inputs.shape[1:]):
-            raise InputError(f"history_inputs must be {self.history} inputs like the others, not {past.shape}")
+            raise InputError(f"history_inputs must be {self.history} inputs of a shape like inputs, not {past.shape}")
         if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
             raise InputError("inputs, means and covariances must be finite")
         features = window_features(self.kernel, past, inputs, self._history_noise)
@@ -274,8 +275,8 @@ class LcNsKmp:
     ) -> Modification:
         """Compute the window at a step under null-space actions at several of its points (equations 4.17 and 4.18).
 
-        With one action at `step` itself this is the window of `predict` (equation 4.21). Between the points, actions
-        are interpolated by the function through all of them that has the smallest norm in the kernel's Hilbert space.
+        With one action at `step` itself, this is the window of `predict` (equation 4.21). Between the points, actions
+        are interpolated by the function of smallest norm in the kernel's Hilbert space.
 
         Args:
             step: Executed point n ≥ 0; past the end, the last step.
@@ -284,8 +285,8 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`; also if `at` has a step twice or a step outside of the window, or its steps are so
-                close that their kernel matrix is singular.
+            InputError: As `predict`; also if a step in `at` is repeated or outside of the window, or the steps are so
+                close to each other that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
         factor, step = self._factor(step), min(int(step), self.num_steps - 1)
@@ -296,8 +297,8 @@ class LcNsKmp:
     ) -> Modification:
         """Compute the whole motion under null-space actions at several of its points (equations 4.17 and 4.18).
 
-        This solves problem 4.5 once, over all N steps; `predict` solves it for each window. The result is smooth over
-        the whole motion and within the constraints at every step. The problem is factored at the first call.
+        Problem 4.5 is solved once, over all N steps, whereas `predict` solves it for each window. The result is smooth
+        over the whole motion and within the constraints at every step. The problem is factored at the first call.
 
         Args:
             at: Different steps (J,) from 0 … N−1, in any order; none for the motion without actions.
@@ -348,7 +349,7 @@ class LcNsKmp:
         return Modification(np.arange(step, step + horizon + 1), trajectory, alpha)
 
     def linear_response(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return R_h (O, PO), N (O, O) and r (O,) of the unconstrained output R_h h + N ξ̂ + r of a step."""
+        """Return R_h (O, PO), N (O, O) and r (O,) of a step's unconstrained output R_h h + N ξ̂ + r."""
         factor = self._factor(step)
         split = self.history * self.num_outputs
         return factor.output_map[:, :split], factor.output_map[:, split:], factor.output_offset
@@ -356,7 +357,7 @@ class LcNsKmp:
     def free_constraints(self, step: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the map (m, PO+O) from [history, ξ̂] to the constrained directions, and their lower and upper bounds.
 
-        A window whose directions are within their bounds (m,) needs no correction.
+        A window needs no correction if its directions are within their bounds (m,).
         """
         factor = self._factor(step)
         return factor.constraint_map, factor.lower, factor.upper
@@ -366,7 +367,7 @@ class LcNsKmp:
         return self._factor(step).output_sizes()
 
     def factor_all(self) -> int:
-        """Factor every step in advance; return `cached_bytes`, which does not count steps that were dropped."""
+        """Factor every step in advance, and return `cached_bytes`."""
         for step in range(self.num_steps):
             self._factor(step)
         return self.cached_bytes
@@ -385,7 +386,7 @@ class LcNsKmp:
             if past.shape != self._history_shape:
                 raise InputError(f"the history has shape {self._history_shape}, oldest output first, not {past.shape}")
             x = np.concatenate((past.ravel(), action))
-        # One reduction instead of isfinite().all(): any NaN, infinity or overflow makes the product not finite.
+        # One reduction instead of isfinite().all(): the product is not finite if x has NaN, infinity or large numbers.
         if not math.isfinite(x.dot(x)):
             raise InputError("history and null-space action must be finite, also when squared")
         return x
@@ -396,7 +397,7 @@ class LcNsKmp:
         """Check the arguments of a batch; return x (B, (P + 1) O) and the steps (B,), clipped to the last one."""
         at = as_numbers(steps, "steps")
         if at.ndim > 1 or not (at >= 0).all() or (at % 1 != 0).any():
-            raise InputError(f"steps are whole numbers from 0 on, one for each prediction, not {brief(steps)}")
+            raise InputError(f"steps are whole numbers, at least 0, one for each prediction, not {brief(steps)}")
         actions = None if null_space_actions is None else as_doubles(null_space_actions, "null-space actions")
         past = np.zeros(0) if histories is None else as_doubles(histories, "histories")
         batched = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
@@ -420,7 +421,7 @@ class LcNsKmp:
         return x, np.broadcast_to(np.minimum(at, self.num_steps - 1).astype(int), size)
 
     def _checked_step(self, step: int) -> int:
-        """Return a step, clipped to the last one; raise an `InputError` unless it is a whole number from 0 on."""
+        """Return a step, clipped to the last one; raise an InputError unless it is a whole number of at least 0."""
         if (number := step if type(step) is int else as_whole(step, "a step")) < 0:
             raise InputError(f"step counts from 0, not {step}")
         return min(number, self.num_steps - 1)
@@ -461,7 +462,7 @@ class LcNsKmp:
         if self._shared_features is not None:
             return self._shared_features
         can_share = self.kernel.stationary and self.reference.uniform
-        # Shared features are always computed at step 0, because results must not depend on the order of calls.
+        # Shared features are always computed at step 0, so that results do not depend on the order of calls.
         past, future = self._inputs(0 if can_share else step, self.horizon)
         features = window_features(self.kernel, past, future, self._history_noise)
         if can_share:
@@ -469,7 +470,7 @@ class LcNsKmp:
         return features
 
 
-# Weak references, so that an unused primitive releases its factored steps, which take megabytes.
+# Weak references: an unused primitive releases its factored steps, which take megabytes.
 _SHARED: WeakValueDictionary[tuple[Any, ...], LcNsKmp] = WeakValueDictionary()
 
 
@@ -478,8 +479,8 @@ def get_shared_primitive(
 ) -> LcNsKmp:
     """Return the existing primitive with these arguments if there is one, otherwise a new one.
 
-    Primitives can be shared because their state, the factored steps, does not change results. The caller must not
-    modify the primitive.
+    Primitives can be shared, because their factored steps do not change results. The caller must not modify the
+    primitive.
 
     Args:
         reference: As in `LcNsKmp`.

@@ -22,12 +22,12 @@ from guiderail.models.common.errors import InputError, brief
 if TYPE_CHECKING:
     from sklearn.mixture import GaussianMixture
 
-# Mixtures of the demonstrations in the package, `python -m research.generate mixtures`. With them, training on these
-# demonstrations imports no scikit-learn: it starts 0.7 s earlier and needs 70 MiB less memory.
+# Mixtures of the demonstrations in the package, written by `python -m research.generate mixtures`. With them, training
+# on these demonstrations does not import scikit-learn, starts 0.7 s earlier and needs 70 MiB less memory.
 STORED_PATH = Path(__file__).with_name("mixtures.npz")
-# Variance added to every component, relative to the data's variance: EM needs it where demonstrations coincide.
+# Variance added to every component, relative to the data's variance. EM needs it where demonstrations coincide.
 _REGULARIZATION = 1e-6
-_MAX_COMPONENTS = 20
+_MAX_COMPONENTS = 20  # largest number of components that is tried by default
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def _stored() -> dict[str, Mixture]:
 
 
 def digest(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> str:
-    """Return the digest of the arguments of `fit_mixture`, which names a stored mixture."""
+    """Return the digest of the arguments of `fit_mixture`, the key of a stored mixture."""
     data = np.concatenate([times, outputs.ravel()]).astype(float).tobytes()
     return hashlib.blake2b(data + f"{outputs.shape} {components} {seed}".encode(), digest_size=16).hexdigest()
 
@@ -69,15 +69,15 @@ def fit_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, 
 def fit_new_mixture(times: np.ndarray, outputs: np.ndarray, components: int | None, seed: int) -> Mixture:
     """Fit C components to M demonstrations by expectation maximization, initialized with C equal slices of time.
 
-    With this initialization the components stay in order along the motion. With a random one, several of them share a
-    wide region and blur a narrow one.
+    With this initialization the components remain in order along the motion. With a random initialization, several
+    components share a wide region while a narrow region is blurred.
 
     Args:
         times: Common clock (N,) [s].
         outputs: Outputs (M, N, O).
         components: Number of components C, from 1 to half the number of steps. By default the number with the least
-            Bayesian information criterion, at most 20; the search stops once two numbers in a row are worse than the
-            best before.
+            Bayesian information criterion, at most 20; the search stops after two consecutive numbers that are worse
+            than the best earlier one.
         seed: Seed of scikit-learn's generator, from 0 to 2^32 − 1.
 
     Raises:
@@ -95,8 +95,8 @@ def information_criteria(
 ) -> dict[int, float]:
     """Compute the Bayesian information criterion of mixtures by number of components; less is better.
 
-    `candidates` are increasing; the search stops once two in a row are worse than the best before. The other
-    arguments and the errors are those of `fit_mixture`.
+    `candidates` are increasing; the search stops after two consecutive numbers that are worse than the best earlier
+    one. The other arguments and the errors are those of `fit_mixture`.
     """
     return {count: criterion for count, (_, criterion) in _fit_candidates(times, outputs, candidates, seed).items()}
 
@@ -104,7 +104,7 @@ def information_criteria(
 def _fit_candidates(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, tuple[GaussianMixture, float]]:
-    """Return mixtures and their criteria by number of components; the search stops after two that are worse."""
+    """Return mixtures and their criteria by number of components; see `information_criteria`."""
     candidates, seed = [as_whole(count, "components") for count in candidates], as_whole(seed, "seed")
     if not 0 <= seed < 2**32:
         raise InputError(f"seed must be from 0 to 2^32 − 1, not {brief(seed)}")
@@ -126,8 +126,8 @@ def _fit_candidates(
 def regress(mixture: Mixture, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Compute Gaussian mixture regression on times (N,) [s].
 
-    Conditioned on time, each component is a line with a constant covariance. The results are the means (N, O) and the
-    covariances (N, O, O) of their mixture, weighted by the likelihood of the time under each component.
+    Conditioned on time, each component has a mean that is linear in time and a constant covariance. The components are
+    weighted by the likelihood of the time. The results are means (N, O) and covariances (N, O, O) of the mixture.
     """
     offset = (times[:, None] - mixture.center[0]) / mixture.scale[0] - mixture.means[:, 0]  # (N, C)
     variance, across = mixture.covariances[:, 0, 0], mixture.covariances[:, 1:, 0]
@@ -150,8 +150,8 @@ def _standardize(times: np.ndarray, outputs: np.ndarray) -> tuple[np.ndarray, np
     data = np.column_stack([np.tile(times, len(outputs)), outputs.reshape(-1, outputs.shape[-1])])
     center, deviation = data.mean(axis=0), data.std(axis=0)
     # The standard deviation of a constant output is only a rounding error.
-    moves = deviation > 1e-12 * np.abs(data).max(axis=0)
-    scale = np.where(moves, deviation, 1.0)
+    varies = deviation > 1e-12 * np.abs(data).max(axis=0)
+    scale = np.where(varies, deviation, 1.0)
     return (data - center) / scale, center, scale
 
 
@@ -172,6 +172,6 @@ def _fit(data: np.ndarray, phase: np.ndarray, components: int, seed: int) -> Gau
         precisions_init=np.array([np.linalg.inv(np.cov(part.T) + floor) for part in parts]),
     )
     with warnings.catch_warnings():
-        # EM that starts near its optimum is accurate enough long before scikit-learn's tolerance is met.
+        # EM starts near its optimum, and is accurate enough long before scikit-learn's tolerance is reached.
         warnings.simplefilter("ignore", ConvergenceWarning)
         return mixture.fit(data)

@@ -26,10 +26,10 @@ POSE_NAMES: dict[str, tuple[str, ...]] = {
 
 
 def check_orientation(orientation: object) -> Orientation:
-    """Return the name of an orientation unchanged.
+    """Check the name of an orientation's representation, and return it.
 
     Raises:
-        InputError: If there is no such orientation.
+        InputError: If there is no such representation.
     """
     if not (isinstance(orientation, str) and orientation in POSE_NAMES):
         raise InputError(f"there is no orientation {brief(orientation)}: choose {' or '.join(POSE_NAMES)}")
@@ -53,9 +53,9 @@ def pose_outputs(
         target_quaternion_wxyz: R_WT (4,).
         orientation: "euler_zyx", the thesis's [ψz ψy ψx], singular at ψy = ±90°; or "rotation_vector", which is
             regular there.
-        near: Orientation (3,) [rad], zero by default. Of the representations of the first sample, which differ by full
-            turns, the one nearest to `near` is returned. Demonstrations of one motion must share a branch: otherwise
-            their mean is meaningless.
+        near: Orientation (3,) [rad], zero by default. Outputs that differ by full turns represent the same orientation;
+            the first outputs are those nearest to `near`. Demonstrations of one motion need the same `near`, because
+            the mean of outputs that differ by full turns is meaningless.
 
     Raises:
         InputError: If shapes do not match, a quaternion is zero, a number is not finite, or Euler angles are singular.

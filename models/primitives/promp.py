@@ -10,7 +10,7 @@ from guiderail.models.common.arrays import as_numbers, as_whole, find_asymmetric
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 
-NUM_BASIS = 60  # default number of basis functions, if the number of steps is at least four times as large
+NUM_BASIS = 60  # default number of basis functions for motions of at least four times as many steps
 RIDGE = 1e-8  # regularization of the weights, relative to the largest eigenvalue of the features
 
 
@@ -18,11 +18,11 @@ RIDGE = 1e-8  # regularization of the weights, relative to the largest eigenvalu
 class ProMp:
     """Distribution of motions y(s) = (I ⊗ φ(s)ᵀ) w + ε over the phase s, with w ~ N(μ_w, Σ_w) and ε ~ N(0, Σ_y).
 
-    φ(s) are K normalized Gaussian bumps at equal distances from phase 0 to 1.
+    φ(s) are K normalized Gaussian basis functions at equal distances from phase 0 to 1.
 
     Attributes:
-        mean: μ_w, the weights of the first output, then those of the next, (O·K,) [unit of the output].
-        covariance: Σ_w (O·K, O·K), positive semidefinite: its rank is less than the number of demonstrations.
+        mean: μ_w (O·K,), the K weights of the first output, then those of the second, … [unit of the output].
+        covariance: Σ_w (O·K, O·K), positive semidefinite; its rank is less than the number of demonstrations.
         noise: Σ_y (O, O), covariance of the residuals of the least-squares fit.
     """
 
@@ -39,8 +39,8 @@ class ProMp:
             num_basis: K; by default `NUM_BASIS`, but at most a fourth of the number of steps, and at least 2.
 
         Raises:
-            InputError: If the clocks differ, or K is not a whole number, or less than 2 or more than half the number of
-                steps (2 is accepted for any number of steps).
+            InputError: If the clocks differ, or K is not a whole number from 2 to half the number of steps (2 is always
+                accepted).
         """
         steps = len(demonstrations.times[0])
         if any(not np.array_equal(t, demonstrations.times[0]) for t in demonstrations.times):
@@ -67,7 +67,7 @@ class ProMp:
     def conditioned(self, phase: float, output: np.ndarray, covariance: np.ndarray) -> ProMp:
         """Return the motions that pass through a via-point, by Gaussian conditioning of the weights.
 
-        The motion changes along the demonstrated variations only. The demonstrations' noise does not change.
+        The motion changes along the demonstrated variations only. The covariance Σ_y of the noise does not change.
 
         Args:
             phase: Phase of the via-point, in [0, 1].
@@ -110,7 +110,7 @@ class ProMp:
 
 
 def _features(phases: np.ndarray, count: int) -> np.ndarray:
-    """Return normalized Gaussian bumps (n, K) at phases (n,); their standard deviation equals their spacing."""
+    """Return normalized Gaussian basis functions (n, K) at phases (n,); their spacing is one standard deviation."""
     offsets = (np.asarray(phases, dtype=float)[:, None] - np.linspace(0.0, 1.0, count)) * (count - 1)
     bumps = np.exp(-0.5 * offsets**2)
     return bumps / bumps.sum(axis=1, keepdims=True)

@@ -6,25 +6,28 @@ the unconstrained window y, the same problem is min ½‖v‖² subject to Ḡ�
 constraints can be scaled to unit rows, so that a solver's tolerance is a tolerance on the output itself.
 
 The package `qpsolvers` is not used. Its constraints are one-sided, which doubles the rows (DAQP takes 1.8 times as
-long). It neither retries with a second tolerance or a margin, nor checks an inaccurate result.
+long). It does not retry with another tolerance or a margin, and it does not check an inaccurate result.
 """
 
 from collections.abc import Callable
-from contextlib import suppress
 from functools import cache
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError, import_extra
 
-RELAXATIONS = (1e-10, 1e-9)
-"""Relaxations of the bounds, tried in turn until the solver succeeds, relative to the largest required correction."""
+RELAXATIONS = (0.0, 1e-10, 1e-9)
+"""Relaxations of the bounds, tried in turn until the solver succeeds, relative to the largest required correction.
+
+Equal lower and upper bounds, such as those of an output that must not move, are equations to a solver. Rounding errors
+make many such equations contradict each other. The caller checks the result against the bounds.
+"""
 
 Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class UnsolvableError(RuntimeError):
-    """Error if no solution within tolerance is found; the caller must repeat its last safe command."""
+    """No solution within tolerance is found; the caller must repeat its last safe command."""
 
 
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,14 +80,14 @@ def _osqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.nd
     )
     result = solver.solve(raise_error=False)
     # An inaccurate result, or one at the iteration limit, may still be accurate enough.
-    solved = result.info.status_val == 1
-    if not solved and not (result.info.status_val in (2, 7) and _is_inside(rows @ result.x, lower, upper)):
+    status = result.info.status_val
+    if status != 1 and not (status in (2, 7) and _is_inside(rows @ result.x, lower, upper)):
         raise UnsolvableError(f"OSQP ended with '{result.info.status}'")
     return result.x, result.y
 
 
 def _is_inside(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
-    """Return True if the bounds hold up to 1e-6; the caller checks the command itself against the bounds."""
+    """Return True if values are within bounds up to 1e-6; the caller checks the command itself against the bounds."""
     return bool((values >= lower - 1e-6).all() and (values <= upper + 1e-6).all())
 
 
@@ -95,7 +98,7 @@ def find_solver(name: str) -> Solver:
     """Return a solver by its name.
 
     Raises:
-        InputError: If there is no solver with this name.
+        InputError: If there is no such solver.
     """
     if name not in SOLVERS:
         raise InputError(f"there is no solver '{name}': choose one of {', '.join(SOLVERS)}")
@@ -114,8 +117,8 @@ def solve_least_norm(
         solver: One of `SOLVERS`.
 
     Returns:
-        v (r,), and the multipliers (m,) with v = −rowsᵀ multipliers: positive where `upper` is active, negative where
-        `lower` is.
+        v (r,), and the multipliers (m,) with v = −rowsᵀ multipliers: positive at an active upper bound, negative at an
+        active lower bound.
 
     Raises:
         UnsolvableError: If the solver finds no solution.
@@ -123,26 +126,13 @@ def solve_least_norm(
     # The problem is homogeneous: at unit scale the solver's absolute tolerance is relative to the correction.
     scale = max(lower.max(), -upper.min())
     lower, upper = lower / scale, upper / scale
-    try:
-        v, multipliers = solver(rows, lower, upper)
-    except UnsolvableError:
-        v, multipliers = _solve_relaxed(rows, lower, upper, solver)
-    return scale * v, scale * multipliers
-
-
-def _solve_relaxed(
-    rows: np.ndarray, lower: np.ndarray, upper: np.ndarray, solver: Solver
-) -> tuple[np.ndarray, np.ndarray]:
-    """Solve the problem with relaxed bounds.
-
-    Equal lower and upper bounds, such as those of an output that must not move, are equations to a solver, and rounding
-    errors make many such equations contradict each other. The caller checks the result against the bounds.
-    """
-    *first, last = RELAXATIONS
-    for relaxation in first:
-        with suppress(UnsolvableError):
-            return solver(rows, lower - relaxation, upper + relaxation)
-    return solver(rows, lower - last, upper + last)
+    for relaxation in RELAXATIONS:
+        try:
+            v, multipliers = solver(rows, lower - relaxation, upper + relaxation)
+            return scale * v, scale * multipliers
+        except UnsolvableError as error:
+            failure = error
+    raise failure
 
 
 _identity = cache(np.eye)  # shared: building one for each QP costs as much as solving it

@@ -17,8 +17,7 @@ from guiderail.models.primitives.kernels import Kernel, check_kernel
 from guiderail.models.primitives.mixture import fit_mixture, regress
 from guiderail.models.primitives.promp import ProMp
 
-# Smallest eigenvalue of a correlation matrix that is regular in double precision.
-_SINGULAR = 1e-13
+_SINGULAR = 1e-13  # largest eigenvalue of a correlation matrix that is singular in double precision
 VIA_POINT_VARIANCE = 1e-4  # variance of a via-point, relative to the kernel's; contradicting via-points are averaged
 
 
@@ -77,21 +76,21 @@ class ReferenceTrajectory:
     ) -> ReferenceTrajectory:
         """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR), or fit a ProMP.
 
-        The covariance of a single demonstration is only that of motions which the mixture averages out, such as a
-        circling search; `prior_std` adds the variance that other demonstrations would have shown.
+        The covariance of a single demonstration only contains motions that the mixture averages out, such as a circling
+        search. `prior_std` adds the variance that further demonstrations would have.
 
         Args:
             demonstrations: Demonstrations, resampled to one uniform clock of N steps if they do not have it already.
             components: Number of components C of the mixture; chosen by the Bayesian information criterion by default.
             seed: Seed of the mixture's initialization.
             num_steps: Number of steps N, at least 2; the largest number of samples of a demonstration by default.
-            floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output],
-                such as the resolution of a sensor or a controller if demonstrations differ by less.
+            floor: Standard deviation, (O,) or scalar, whose square is added to every variance [unit of the output]. If
+                demonstrations differ by less than the resolution of a sensor or a controller, give this resolution.
             prior_std: Standard deviations (O,) of a single demonstration, a scalar, or rows as in `interpolate_prior`;
                 required for one demonstration, refused for several.
             model: "gmr", or "promp" with the default number of basis functions (`ProMp`).
-            gap_scale: Factor of the standard deviation in a gap of all recordings, positive. Below 1, exploration in
-                the gap is narrower; above 1, it is wider. At each step the factor is `gap_scale` to the power of
+            gap_scale: Factor of the standard deviation in a gap of all recordings, positive. Exploration in the gap is
+                narrower below 1 and wider above 1. At each step the factor is `gap_scale` to the power of
                 `unobserved_share`.
             kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
 
@@ -142,7 +141,7 @@ class ReferenceTrajectory:
 
         Raises:
             InputError: If the times do not increase, the floor has the wrong shape or is negative, or a covariance is
-                singular: give a floor.
+                singular without a floor.
         """
         times = as_numbers(times, "times")
         if times.ndim != 1 or len(times) < 2 or not times[-1] > times[0]:
@@ -156,11 +155,11 @@ class ReferenceTrajectory:
 
             Σ⁻¹ = (1 − a) Σ₁⁻¹ + a Σ₂⁻¹,    Σ⁻¹ μ = (1 − a) Σ₁⁻¹ μ₁ + a Σ₂⁻¹ μ₂
 
-        The more certain one dominates (Paraschos et al., 2013).
+        The reference of smaller covariance dominates (Paraschos et al., 2013).
 
         Args:
             other: Reference with the same times and outputs.
-            share: a in [0, 1], one number or (N,): 0 gives this reference, 1 the other.
+            share: a in [0, 1], one number or (N,): 0 for this reference, 1 for `other`.
 
         Raises:
             InputError: If times or numbers of outputs differ, or the share is out of range.
@@ -172,9 +171,9 @@ class ReferenceTrajectory:
             raise InputError(f"the share of a blend is one number in [0, 1], or one for each of {self.num_steps} steps")
         a = np.broadcast_to(a, self.num_steps)[:, None, None]
         # With M = (1 − a) Σ₂ + a Σ₁ the covariance is Σ₁ M⁻¹ Σ₂ = Σ₂ M⁻¹ Σ₁, and a share of 0 or 1 is exact.
-        both = (1.0 - a) * other.covariances + a * self.covariances
-        first = np.linalg.solve(both, self.covariances).transpose(0, 2, 1)
-        second = np.linalg.solve(both, other.covariances).transpose(0, 2, 1)
+        M = (1.0 - a) * other.covariances + a * self.covariances
+        first = np.linalg.solve(M, self.covariances).transpose(0, 2, 1)
+        second = np.linalg.solve(M, other.covariances).transpose(0, 2, 1)
         means = (1.0 - a[..., 0]) * np.einsum("nop,np->no", second, self.means)
         means += a[..., 0] * np.einsum("nop,np->no", first, other.means)
         covariances = first @ other.covariances
@@ -209,8 +208,8 @@ class ReferenceTrajectory:
     def resampled(self, period: float, time_scale: float = 1.0) -> ReferenceTrajectory:
         """Return this trajectory with a `period` [s] between steps and `time_scale` times its duration.
 
-        Means and covariances are interpolated linearly over the clock. The number of steps is the new duration, which
-        counts a mean time step after the last time, divided by the period, rounded.
+        Means and covariances are interpolated linearly over the clock. The new duration includes a mean time step after
+        the last time. The number of steps is this duration divided by the period, rounded.
 
         Raises:
             InputError: If an argument is not positive, or fewer than two steps remain.
@@ -266,13 +265,13 @@ def interpolate_prior(prior_std: float | Sequence[float] | np.ndarray, num_steps
     """Return the standard deviations (N, O) of a single demonstration over its steps [unit of the output].
 
     Args:
-        prior_std: One number, O numbers, or rows of a phase and O numbers, one after another. The phase is the fraction
-            of the duration, from 0 to 1; between two rows the standard deviations are interpolated linearly.
+        prior_std: One number, O numbers, or rows of a phase and O numbers, concatenated. The phase is a fraction of the
+            duration, from 0 to 1. Between two rows, the standard deviations are interpolated linearly.
         num_steps: Number of steps N.
         num_outputs: Number of outputs O.
 
     Raises:
-        InputError: If a value is no number, the number of values does not fit, phases do not increase or are not in
+        InputError: If a value is not a number, the number of values is wrong, phases do not increase or are not in
             [0, 1], or a standard deviation is not positive and finite.
     """
     numbers = np.ravel(as_numbers(prior_std, "prior_std"))
@@ -306,7 +305,7 @@ def unobserved_share(
 
     Args:
         reference: Reference of the demonstrations.
-        recordings: Demonstrations as they were recorded, before `Demonstrations.resampled` fills their gaps.
+        recordings: Recorded demonstrations, not resampled, because `Demonstrations.resampled` fills their gaps.
         kernel: Kernel over the reference's times; `SquaredExponential()` by default.
     """
     from guiderail.models.primitives.kernels import SquaredExponential
@@ -314,10 +313,10 @@ def unobserved_share(
 
     kernel, times = SquaredExponential() if kernel is None else kernel, reference.times
     phases = np.concatenate([(t - t[0]) / (t[-1] - t[0]) for t in recordings.times])
-    seen = np.unique(np.rint(phases * (reference.num_steps - 1)).astype(int))
-    kmp = Kmp(times[seen], reference.means[seen], reference.covariances[seen], kernel)
+    observed = np.unique(np.rint(phases * (reference.num_steps - 1)).astype(int))
+    kmp = Kmp(times[observed], reference.means[observed], reference.covariances[observed], kernel)
     prior = np.array([kernel(t[None], t[None])[0, 0] for t in times])
-    variances = np.einsum("noo->no", kmp.covariance(times)) / len(seen)
+    variances = np.einsum("noo->no", kmp.covariance(times)) / len(observed)
     return np.clip(variances / prior[:, None], 0.0, 1.0)
 
 
@@ -328,8 +327,8 @@ def pass_through(reference: ReferenceTrajectory, points: Sequence[float], kernel
 
     Args:
         reference: Reference of the demonstrations.
-        points: The step and the output of each via-point, 1 + O numbers, one via-point after another.
-        kernel: Covariance of the process.
+        points: Step and output of each via-point, 1 + O numbers, concatenated.
+        kernel: Covariance function of the process.
 
     Raises:
         InputError: If `points` are not rows of a step and O finite numbers, there is no such step, or `check_kernel`

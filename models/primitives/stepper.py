@@ -1,4 +1,4 @@
-"""Stepping of a movement primitive: its commands in an episode without a diagram, and a rule for its progress."""
+"""Stepper of a movement primitive, which computes the commands of an episode without a diagram, and its progress."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ class Command:
         output: Command (O,).
         violation: Largest violation of the constraints, max(c − G y), or of the motion's constraints if there is a
             motion filter; negative if all constraints are slack, −inf without constraints.
-        is_fallback: True if no window within the constraints was found, or if the motion filter had to brake or, in the
-            first step, to exceed its largest acceleration. Without a window, the primitive's output is the point
-            nearest to the last command within the constraints of its step.
+        is_fallback: True if no window within the constraints was found, or if the motion filter had to brake, or if the
+            first command exceeds the filter's largest acceleration. Without a window, the command is the point nearest
+            to the last command within the constraints of the step.
     """
 
     output: np.ndarray
@@ -44,15 +44,15 @@ class PrimitiveStepper:
         pose: Measured output (O,) that fills the history, or the last outputs, oldest first: (P, O), or (2, O) for a
             motion filter if P < 2. The first mean of the reference by default.
         gain: Raw null-space action per unit of the action (O,); ones by default.
-        history_source: "commanded" outputs continue the motion smoothly; "measured" ones suit a robot that tracks well
-            or is pushed by an operator.
-        motion: Filter of the commands by constraints of the motion; none by default. The filter starts at the pose:
-            at rest, or with the velocity of the last two outputs if `pose` holds several. If the motion cannot brake
-            within the filter's largest acceleration before it leaves the constraints, the first command exceeds that
+        history_source: "commanded" for a smooth motion; "measured" for a robot that tracks well or is pushed by an
+            operator.
+        motion: Filter of the commands by constraints of the motion; none by default. The filter starts at the pose. It
+            starts at rest, or with the velocity of the last two outputs if `pose` has several. If the motion cannot
+            brake within the largest acceleration before it leaves the constraints, the first command exceeds this
             acceleration.
 
     Raises:
-        InputError: If an argument has the wrong shape or is not finite, or `motion` is no filter of O outputs.
+        InputError: If an argument has the wrong shape or is not finite, or `motion` is not a filter of O outputs.
 
     Attributes:
         primitive: Primitive.
@@ -96,7 +96,7 @@ class PrimitiveStepper:
             pose: Measured output (O,); required for a measured history.
 
         Raises:
-            InputError: If an argument has the wrong shape or is not finite, or a measured history has no pose.
+            InputError: If an argument has the wrong shape or is not finite, or the pose is missing.
         """
         step, raw, history = self.request(action, pose)
         try:
@@ -105,9 +105,9 @@ class PrimitiveStepper:
             return self.finish(None)
 
     def request(self, action: ArrayLike, pose: ArrayLike | None = None) -> tuple[int, np.ndarray, np.ndarray | None]:
-        """Return the arguments of `LcNsKmp.predict` for the next step, so that several episodes can form a batch.
+        """Return the arguments of `LcNsKmp.predict` for the next step; with them, several episodes can form a batch.
 
-        `action` (O,) and `pose` (O,) are those of `step`. Call `finish` with the predicted output.
+        `action` (O,) and `pose` (O,) are those of `step`. Then call `finish` with the predicted output.
 
         Raises:
             InputError: As `step`.
@@ -120,7 +120,7 @@ class PrimitiveStepper:
         return self.num_steps, self.gain * action, self._history if self.primitive.history else None
 
     def finish(self, output: np.ndarray | None) -> Command:
-        """Complete the step: return the command for a predicted output (O,), or for None if no output was found."""
+        """Complete the step, and return the command for a predicted output (O,), or for None if no output was found."""
         constraints = self.primitive.constraints
         is_fallback = output is None
         self._last = constraints.nearest(self._last, self.num_steps) if output is None else output
@@ -137,10 +137,11 @@ class PrimitiveStepper:
         return command
 
     def _recent(self, pose: ArrayLike, *, has_filter: bool) -> np.ndarray:
-        """Return the outputs of `pose`, oldest first: (1, O), (P, O), or (2, O) for a motion filter if P < 2."""
-        given, history = as_numbers(pose, "pose"), self.primitive.history
-        is_several = given.ndim == 2 and len(given) in ({history or 2, max(history, 2)} if has_filter else {history})
-        return np.array([self._checked(each, "pose") for each in (given if is_several else [pose])])
+        """Return the outputs in `pose`, oldest first: (1, O), (P, O), or (2, O) for a motion filter if P < 2."""
+        outputs, history = as_numbers(pose, "pose"), self.primitive.history
+        lengths = {history or 2, max(history, 2)} if has_filter else {history}
+        has_several = outputs.ndim == 2 and len(outputs) in lengths
+        return np.array([self._checked(output, "pose") for output in (outputs if has_several else [pose])])
 
     def _append(self, output: np.ndarray) -> None:
         if self.primitive.history:
@@ -157,27 +158,27 @@ class PrimitiveStepper:
 class StateProgress:
     """Progress that waits while the robot does not follow its commands.
 
-    Progress s is a step of the reference. In control step k it increases by one if the measured pose is near the last
+    Progress s is a step of the reference. In control step k, it increases by one if the measured pose is near the last
     command, and is constant otherwise (phase stopping, after Ijspeert et al., 2002):
 
         s_{k+1} = s_k + 1  if ‖y − x‖ ≤ tolerance  or  k + 1 − s_k > max_lag,  else  s_k
 
     Here y is the last command and x the measured pose. For poses (6,), position and angles must each be within their
-    tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. A contact that keeps the robot
-    from its command by design, such as pressing in a search, therefore delays the motion by at most `max_lag` steps.
-    The tolerance should cover the deviations that contact and tracking cause while nothing blocks the robot.
+    tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. An intended contact, such as in
+    a search, can therefore delay the motion by at most `max_lag` steps. The tolerance should cover the deviations that
+    contact and tracking cause while nothing blocks the robot.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
     tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
-    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (An option
-    # of environments has the same name and is a time in seconds.)
+    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. The option `max_lag` of
+    # an environment is a time in seconds.
     max_lag: int
 
     def __post_init__(self) -> None:
-        if len(self.tolerance) != 2 or not all(0.0 < one < np.inf for one in self.tolerance):
+        if len(self.tolerance) != 2 or not all(0.0 < value < np.inf for value in self.tolerance):
             raise InputError(f"the tolerance of progress is two positive numbers, not {brief(self.tolerance)}")
         if not is_whole(self.max_lag, 0):
             raise InputError(f"max_lag must be a whole number of steps, at least 0, not {brief(self.max_lag)}")

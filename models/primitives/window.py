@@ -1,4 +1,4 @@
-"""Factored optimization problem of one window of an LC-NS-KMP, and the predictions that it gives."""
+"""Factored optimization problem of one window of an LC-NS-KMP, and results of predictions."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.features import WindowFeatures
 from guiderail.models.primitives.qp import Solver, UnsolvableError, solve_least_norm
 
-# Smallest singular value of the unit constraint rows, relative to the largest; smaller ones are rounding errors.
+# Smallest singular value of the unit constraint rows, relative to the largest; smaller values are rounding errors.
 _NEGLIGIBLE = 1e-13
 _CHUNK = 256  # number of predictions evaluated at a time, so that their constraints stay in the processor's cache
 _OPPOSITE = 4 * float(np.finfo(float).eps)  # largest entry of the sum of two unit rows that count as opposite
@@ -20,7 +20,7 @@ _OPPOSITE = 4 * float(np.finfo(float).eps)  # largest entry of the sum of two un
 
 @dataclass(frozen=True)
 class Window:
-    """Reference and constraints G y ≥ c at the executed point, which comes first, and at the horizon after it."""
+    """Reference and constraints G y ≥ c at the executed point, which is the first, and at the H points after it."""
 
     means: np.ndarray  # reference means (H+1, O)
     covariances: np.ndarray  # reference covariances (H+1, O, O), positive definite
@@ -75,8 +75,8 @@ class StepFactor:
 
     With y = W̄h + F̄w for standard normal weights w, problem 4.5 is a regularized least-squares problem in w. The QR
     factor of this problem gives S = (Σ⁻¹ + ħK⁻¹)⁻¹ = L Lᵀ, with ħ = λ + β and K = F̄F̄ᵀ, without forming Σ⁻¹ or K⁻¹
-    (equation 4.12 for weights). The window is affine in x, and so are the executed point and the constrained
-    directions. Only the maps of these two are stored; the rest of the window is computed again on request.
+    (equation 4.12 for weights). The window is affine in x. Only the maps from x to the executed point and to the
+    constrained directions are stored; the rest of the window is computed again on request.
 
     Args:
         window: Reference and constraints.
@@ -92,9 +92,9 @@ class StepFactor:
         constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled so that a correction of norm one
             changes it by at most one.
         lower, upper: Bounds (m,) of the constrained directions, minus their offset and scaled in the same way.
-        constraint_rows: Unit rows (m, r), the map from a correction v to the constrained directions; zero where no
-            correction changes the direction. Set by `factor_corrections`, like the next one.
-        correction_map: Map (O, r) from a correction v to the executed point.
+        constraint_rows: Map (m, r) from a correction v to the constrained directions, rows of unit norm; a row is zero
+            if no correction changes its direction. Set by `factor_corrections`.
+        correction_map: Map (O, r) from a correction v to the executed point. Set by `factor_corrections`.
     """
 
     def __init__(self, window: Window, features: WindowFeatures, lambda_: float, beta: float):
@@ -154,7 +154,7 @@ class StepFactor:
         self._uncorrected = A, solution.L[:outputs]
 
     def factor_corrections(self) -> None:
-        """Factor the corrections of the window; the first call of `correct` does this too."""
+        """Factor the corrections of the window, unless this was done; `correct` also calls it."""
         if self._uncorrected is None:
             return
         (A, L), self._uncorrected = self._uncorrected, None
@@ -181,7 +181,7 @@ class StepFactor:
         try:
             return solve_least_norm(self.constraint_rows, lower, upper, solver)
         except UnsolvableError:
-            # If a correction hardly moves the output, rounding errors of the scaled bounds can make them contradictory.
+            # If a correction hardly moves the output, rounding errors can make the scaled bounds contradict each other.
             loose = 0.5 * TOLERANCE * self._scale
             return solve_least_norm(self.constraint_rows, lower - loose, upper + loose, solver)
 
@@ -189,7 +189,8 @@ class StepFactor:
         """Return a mask (B,), true where every constraint is slack for x (B, PO+O)."""
         if len(x) < _CHUNK:
             return self._is_inside(x)
-        # Single precision takes half the time. Its result is used unless a bound is nearer than the rounding error.
+        # Single precision takes half the time. Bounds are tightened by the rounding error, and predictions that are not
+        # slack are evaluated again in double precision.
         rounding = 2.0**-23 * (x.shape[1] + 4)
         sizes = np.abs(self.constraint_map) @ np.maximum(x.max(axis=0), -x.min(axis=0))
         finite = (np.where(np.isfinite(bound), np.abs(bound), 0.0) for bound in (self.lower, self.upper))
@@ -217,7 +218,7 @@ class StepFactor:
         return np.linalg.norm(self._solve().L[: self._window.means.shape[1]], axis=1)
 
     def multipliers(self, signed: np.ndarray) -> np.ndarray:
-        """Return α (H+1, F) ≥ 0 for multipliers (m,) that are positive at an upper and negative at a lower bound."""
+        """Return α (H+1, F) ≥ 0 for signed multipliers (m,), positive at an upper and negative at a lower bound."""
         signed = (signed * self._scale).reshape(-1, len(self._directions))
         alpha, has_opposite = np.zeros(self.multipliers_shape), self._opposites >= 0
         alpha[:, self._directions] = np.maximum(-signed, 0)
@@ -229,7 +230,7 @@ class StepFactor:
         return float((self._window.c[0] - self._window.G[0] @ output).max())
 
     def trajectory(self, x: np.ndarray, v: np.ndarray | None) -> np.ndarray:
-        """Return the whole window (H+1, O), corrected by v if it is given."""
+        """Return the whole window (H+1, O), corrected by v unless v is None."""
         solution = self._solve()
         latent = solution.latent_mean + solution.latent_map @ x
         if v is not None:
@@ -241,7 +242,7 @@ class StepFactor:
         """Compute the window under null-space actions at several points (equation 4.18, multipliers of 4.17).
 
         Args:
-            x: History and zeros instead of the null-space action (PO+O,), because `action` replaces it.
+            x: History, and zeros in place of the null-space action (PO+O,); `action` replaces the null-space action.
             action: Actions interpolated to every point of the window, K̂ K̲⁻¹ ξ̂ given the history, (H+1, O).
             solver: Solver of the least-norm problem.
 
@@ -267,7 +268,7 @@ class StepFactor:
         return y + (solution.L @ (self._basis @ v)).reshape(action.shape), signed
 
     def max_violation(self, trajectory: np.ndarray) -> float:
-        """Return max(c − G y) over a whole window (H+1, O), −inf without constraints."""
+        """Return max(c − G y) over a whole window (H+1, O); −inf without constraints."""
         missing = self._window.c - np.einsum("nfo,no->nf", self._window.G, trajectory)
         return float(missing.max(initial=-np.inf))
 
@@ -278,19 +279,19 @@ class StepFactor:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the stored arrays [bytes], without kernel features and constraints, which steps usually share."""
+        """Memory of the stored arrays [bytes] except kernel features and constraints, which steps usually share."""
         arrays = (*vars(self).values(), self._window.means, self._window.covariances)
         return sum(value.nbytes for value in arrays if isinstance(value, np.ndarray))
 
 
 def _pair_opposites(G: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pair the rows of G (n, F, O) that are each other's negative at every step, as the two sides of a box are.
+    """Pair the rows of G (n, F, O) that are opposite at every step, like the two sides of a box.
 
     The comparison has a tolerance, because normalization rounds rows of different scales differently.
 
     Returns:
-        For each direction: its row of G, which has the lower bound, and the opposite row, which has the upper bound;
-        −1 if there is no opposite row.
+        For each direction, the index of its row of G with the lower bound, and the index of the opposite row with the
+        upper bound, −1 if there is none.
     """
     directions, opposites = [], []
     paired: set[int] = set()
@@ -315,10 +316,10 @@ class Prediction:
         output: Output to execute (O,).
         factor: Factored problem of the step's window.
         x: History and null-space action of the prediction ((P + 1) O,).
-        correction: Smallest correction v (r,) with which the window satisfies the constraints, or None if it satisfies
-            them uncorrected. It moves output i by at most ‖v‖ times `LcNsKmp.output_sizes`[i].
+        correction: Smallest correction v (r,) with which the window satisfies the constraints; None if none is needed.
+            It moves output i by at most ‖v‖ times `LcNsKmp.output_sizes`[i].
         signed_multipliers: Multipliers (m,) of `LcNsKmp.free_constraints`, positive at an upper and negative at a lower
-            bound, or None.
+            bound; None without a correction.
     """
 
     output: np.ndarray
@@ -350,9 +351,9 @@ class BatchPrediction:
     """Outputs of a primitive for several steps, actions and histories.
 
     Attributes:
-        outputs: Outputs to execute (B, O); NaN where `is_solved` is false.
-        is_constrained: True where the window violates a constraint without a correction (B,).
-        is_solved: False where no window within the constraints was found (B,); repeat the last safe command there.
+        outputs: Outputs to execute (B, O), NaN where `is_solved` is false.
+        is_constrained: Mask (B,), true where the window violates a constraint without a correction.
+        is_solved: Mask (B,), false where no window within the constraints was found; repeat the last safe command.
     """
 
     outputs: np.ndarray
