@@ -12,9 +12,9 @@ from guiderail.models.common.arrays import cross
 from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.wrench import WrenchBound, bounded_wrench
 
-_REGULARIZATION = 1e-9 * np.eye(6)  # keeps the inertia of a singular arm finite
+_REGULARIZATION = 1e-9 * np.eye(6)  # added to Λ⁻¹, so that the inertia of a singular arm is finite
 
-# Towards a singular posture, the effective mass at the tool, usually 1 to 50 kg, grows in the lost direction. Up to
+# Near a singular posture, the effective mass at the tool, usually 1 to 50 kg, grows in the lost direction. Up to
 # LIGHT [kg], only the impedance acts in this direction; above HEAVY [kg], only the posture's torque.
 LIGHT, HEAVY = 300.0, 3000.0
 _ROUNDING = 1e-9  # a wrench that a bound changes by more than this is saturated [N, Nm]
@@ -33,9 +33,9 @@ class JointTorques:
 def spring_wrench(K: np.ndarray, p_error: np.ndarray, eta: float, epsilon: np.ndarray) -> np.ndarray:
     """Compute the wrench (6,) of the potential ½ eᵀ K e with e = [p_error, 2ε].
 
-    The rotational part is E(η, ε)ᵀ times that of K e with E = η I + [ε]× (Caccavale, Natale, Siciliano, Villani 1999).
-    The wrench is the gradient of the potential, so that the spring is passive. For small errors, 2ε is the rotation
-    vector and the wrench is K e.
+    The rotational part is E(η, ε)ᵀ times the rotational part of K e, with E = η I + [ε]× (Caccavale, Natale, Siciliano,
+    Villani 1999). The wrench is the gradient of the potential, so that the spring is passive. For small errors, 2ε is
+    the rotation vector and the wrench is K e.
 
     Args:
         K: Stiffness (6, 6) [N/m, Nm/rad], symmetric, positive definite.
@@ -62,7 +62,7 @@ def damping_matrix(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: flo
 
 
 def _root_of_inverse(Lambda_inverse: np.ndarray) -> np.ndarray:
-    """Compute the inverse (6, 6) of the lower triangular factor R of Λ⁻¹ = R Rᵀ; then Λ = R⁻ᵀ R⁻¹."""
+    """Compute R⁻¹ (6, 6) of the lower triangular factor R with Λ⁻¹ = R Rᵀ; then Λ = R⁻ᵀ R⁻¹."""
     # LAPACK is called directly: NumPy's overhead exceeds the computation for matrices of six rows.
     R, failed = lapack.dpotrf(Lambda_inverse, lower=1)
     if failed:
@@ -87,9 +87,8 @@ def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
     """Compute Λ (6, 6) without the directions that a singular arm has lost.
 
     With rotations scaled by `LEVER`, each eigenvalue is a mass m [kg]. It is multiplied by a factor that falls smoothly
-    with log m, from 1 at `LIGHT` to 0 at `HEAVY`. For a regular arm the result equals Λ. In lost directions, the
-    posture's torque then acts on the tool. The argument is Λ⁻¹ = J M⁻¹ Jᵀ (6, 6), positive definite, [translational,
-    rotational].
+    with log m, from 1 at `LIGHT` to 0 at `HEAVY`. For a regular arm the result equals Λ. With this inertia, the
+    posture's torque moves the tool in lost directions. The argument is Λ⁻¹ = J M⁻¹ Jᵀ (6, 6), positive definite.
     """
     eigenvalues, directions = np.linalg.eigh(_SCALE[:, None] * Lambda_inverse * _SCALE)
     masses = 1.0 / eigenvalues
@@ -117,15 +116,15 @@ def impedance_torques(
 ) -> JointTorques:
     """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
-    Without a bound, the sum of spring and damper is clipped per axis: the tool never pushes beyond the limits, and can
-    still follow a fast command, for which spring and damper cancel. With a bound, `bounded_wrench` limits the sum.
+    Without a bound, the sum of spring and damper is clipped per axis. The tool never pushes beyond the limits, but can
+    follow a fast command, for which spring and damper cancel. With a bound, `bounded_wrench` limits the sum.
     N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the tool.
 
     Args:
         K: Stiffness (6, 6) [N/m, Nm/rad] in the axes of the stiffness frame.
         damping_ratio: Damping ratio ζ of every mode.
         wrench_limits: Limits (6,) along the axes of the stiffness frame [N, Nm].
-        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None: the same frame.
+        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None if they are equal.
         p_error: Position error (3,) [m], as in `spring_wrench`.
         eta: Scalar part of the orientation error, as in `spring_wrench`.
         epsilon: Vector part (3,) of the orientation error, as in `spring_wrench`.
@@ -135,7 +134,7 @@ def impedance_torques(
         posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].
         gravity_torque: Gravity compensation (n,) [Nm].
         torque_limits: Torque limits (n,) [Nm].
-        bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
+        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`.
 
     Raises:
         LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.
@@ -178,17 +177,17 @@ def impedance_torques(
 
 
 def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:
-    """Return the effective mass [kg] at the tool, free to rotate, in the direction of its velocity (3,) [m/s]."""
+    """Return the effective mass [kg] of the tool, free to rotate, in the direction of its velocity (3,) [m/s]."""
     square = float(velocity @ velocity)
     return square / float(velocity @ Lambda_inverse[:3, :3] @ velocity) if square > 0.0 else 0.0
 
 
 def _is_regular(R_inverse: np.ndarray) -> bool:
-    """Return True if the trace of the scaled inertia, and so its largest eigenvalue, is less than `LIGHT`."""
+    """Return True if the trace of the scaled inertia, an upper bound of its eigenvalues, is less than `LIGHT`."""
     scaled = R_inverse / _SCALE
     return float(np.vdot(scaled, scaled)) < LIGHT
 
 
 def _clipped(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
-    # Twice as fast as np.clip for a few numbers; this runs at every step of a plant.
+    # Twice as fast as np.clip for a few numbers; this function runs at every step of a plant.
     return np.minimum(np.maximum(values, -limits), limits)

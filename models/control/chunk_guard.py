@@ -1,4 +1,4 @@
-"""Guard of action chunks: keeps commanded poses within bounds, velocity and jerk limits, by projection or slowdown."""
+"""Filter of action chunks by bounds, velocity and jerk limits of the commanded poses, by projection or slowdown."""
 
 from __future__ import annotations
 
@@ -16,45 +16,45 @@ from guiderail.models.primitives.qp import UnsolvableError, find_solver, solve_l
 MODES = ("projection", "slowdown")
 RATES = (1.0, 0.8, 0.6, 0.4, 0.2, 0.1, 0.05, 0.02, 0.01, 0.0)  # relative speeds along the chunk that a slowdown tries
 SAMPLES = 10  # samples of the path per step of a chunk
-MIN_STEPS = 4  # least number of steps of a chunk, which must end at rest
+MIN_STEPS = 4  # smallest number of steps of a chunk, which must end at rest
 MARGIN = 1e-4  # share of each limit that is reserved for the solver's rounding errors
 
 
 @dataclass(frozen=True)
 class GuardedChunk:
-    """Chunk within the limits."""
+    """Chunk within the limits, or a fallback."""
 
     outputs: np.ndarray  # outputs (K, O)
-    # Speed along the path of the requested chunk, relative to the requested speed; 1 in the mode "projection", and 0
-    # for a fallback.
+    # Speed along the path of the requested chunk, relative to the requested speed: 1 in the mode "projection", 0 for a
+    # fallback.
     rate: float
     is_fallback: bool  # True if no chunk within the limits was found; `outputs` is then the rest of the previous result
 
 
 class ChunkGuard:
-    """Filter that keeps a policy's chunks, and the steps between chunks, within bounds, velocity and jerk limits.
+    """Filter of a policy's chunks by bounds, velocity and jerk limits, which also hold between chunks.
 
-    With y₋₂ … y₀ the last executed outputs and y₁ … y_K the chunk, the result is the nearest chunk (in units of the
+    The last executed outputs are y₋₂ … y₀, and the chunk is y₁ … y_K. The result is the nearest chunk (in units of the
     velocity limit) with
 
         G y_k ≥ c,   |y_k − y_{k−1}| ≤ v T,   |y_k − 3 y_{k−1} + 3 y_{k−2} − y_{k−3}| ≤ j T³,   at rest at its end,
 
     for every output. Because a chunk ends at rest inside the bounds, its remaining steps, followed by its last output,
-    are always within the limits; they are commanded if the solver finds no chunk. The mode "slowdown" preserves the
-    path: it advances along the chunk at the greatest of `RATES` whose projection stays within a tolerance of the path.
+    are always within the limits. They are commanded if the solver finds no chunk. The mode "slowdown" preserves the
+    path: the result advances along the chunk at the largest of `RATES` at which the projection is within a tolerance of
+    the path.
 
-    The limits couple the steps of an output; a constraint on several outputs couples these outputs. Each group of
-    coupled outputs has a quadratic program of its own.
+    The limits couple the steps of an output; a constraint on several outputs couples these outputs. A separate
+    quadratic program is solved for each group of coupled outputs.
 
     Args:
         constraints: Bounds G y ≥ c of the outputs, the same at every step.
         velocity: Velocity limits v (O,) [unit/s], positive.
         jerk: Jerk limits j (O,) [unit/s³], positive.
         period: T, control period [s], positive.
-        start: Output (O,) at rest inside the constraints, from which the motion starts; see `reset` and
-            `reset_near`.
+        start: Output (O,) inside the constraints, from which the motion starts at rest; see `reset` and `reset_near`.
         mode: "projection" or "slowdown".
-        tolerance: Distance from the path (O,) that a slowdown accepts [unit], positive; a tenth of v T by default.
+        tolerance: Accepted distance (O,) from the path in a slowdown [unit], positive; a tenth of v T by default.
 
     Raises:
         InputError: If an argument has the wrong shape or is out of range, the constraints change from step to step, or
@@ -75,14 +75,14 @@ class ChunkGuard:
         outputs = constraints.num_outputs
         limits = [as_numbers(velocity, "velocity limits"), as_numbers(jerk, "jerk limits")]
         limits += [] if tolerance is None else [as_numbers(tolerance, "tolerance")]
-        if any(one.shape != (outputs,) or not (np.isfinite(one) & (one > 0)).all() for one in limits):
+        if any(limit.shape != (outputs,) or not (np.isfinite(limit) & (limit > 0)).all() for limit in limits):
             raise InputError(f"limits of velocity and jerk, and the tolerance, are {outputs} positive numbers each")
         if constraints.num_steps is not None:
-            raise InputError("a guard has the same constraints at every step")
+            raise InputError("a chunk guard needs constraints that are the same at every step")
         if not (np.isfinite(period) and period > 0):
-            raise InputError(f"a control period is positive, not {period}")
+            raise InputError(f"a control period must be positive, not {period}")
         if mode not in MODES:
-            raise InputError(f"a guard's mode is {' or '.join(MODES)}, not {brief(mode)}")
+            raise InputError(f"the mode of a chunk guard is {' or '.join(MODES)}, not {brief(mode)}")
         self.constraints, self.period, self._mode = constraints, period, mode
         self._step, self._jerk = limits[0] * period, limits[1] * period**3
         self._tolerance = 0.1 * self._step if tolerance is None else limits[2]
@@ -93,20 +93,20 @@ class ChunkGuard:
         self.reset(start)
 
     def reset(self, start: np.ndarray) -> None:
-        """Start again at rest at an output (O,) inside the constraints.
+        """Restart at rest at an output (O,) inside the constraints.
 
         Raises:
             InputError: If the output has the wrong shape, is not finite or violates a constraint.
         """
         start, outputs = as_numbers(start, "the start"), self.constraints.num_outputs
         if start.shape != (outputs,) or not self.constraints.violation(start) <= TOLERANCE:
-            raise InputError(f"a guard starts from {outputs} numbers inside the constraints, not {brief(start)}")
+            raise InputError(f"a chunk guard starts from {outputs} numbers inside the constraints, not {brief(start)}")
         self._past, self._plan = np.tile(start, (3, 1)), start[None]
 
     def reset_near(self, measured: np.ndarray) -> None:
-        """Start again at rest at a measured output (O,), inside the constraints or one step outside of them.
+        """Restart at rest at a measured output (O,), inside the constraints or at most one step outside.
 
-        The first command leads inside within the limits of velocity and jerk.
+        The first command is inside the constraints, and is reached within the limits of velocity and jerk.
 
         Raises:
             InputError: As `nearest_start`.
@@ -115,11 +115,11 @@ class ChunkGuard:
         self._past = np.tile(as_numbers(measured, "the measured start"), (3, 1))
 
     def nearest_start(self, measured: np.ndarray) -> np.ndarray:
-        """Return the output (O,) inside the constraints to which the first step leads from rest at a measured one.
+        """Return the output (O,) inside the constraints that is nearest to a measured output (O,).
 
         Raises:
-            InputError: If the measured output has the wrong shape or is not finite, or one step within the limits does
-                not lead inside.
+            InputError: If the measured output has the wrong shape or is not finite, or is so far outside that a step
+                from rest within the limits of velocity and jerk does not reach the constraints.
         """
         measured, outputs = as_numbers(measured, "the measured start"), self.constraints.num_outputs
         if measured.shape != (outputs,) or not np.isfinite(measured).all():
@@ -131,7 +131,7 @@ class ChunkGuard:
             number = int(np.argmax(distance / reach))
             raise InputError(
                 f"number {number} of the measured start is {distance[number]:.4g} outside of the bounds, and one step "
-                f"within the limits leads at most {reach[number]:.4g} inside: move the robot, or widen the bounds"
+                f"within the limits moves it by at most {reach[number]:.4g}: move the robot, or widen the bounds"
             )
         return inside
 
@@ -140,7 +140,7 @@ class ChunkGuard:
 
         Args:
             chunk: Requested outputs (K, O), finite, from the next control step on; K is at least `MIN_STEPS`.
-            num_executed: Steps of the result that are executed before the next call, from 0 to K; all by default.
+            num_executed: Number of steps of the result that are executed before the next call, 0 to K; all by default.
 
         Raises:
             InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite, or
@@ -160,7 +160,7 @@ class ChunkGuard:
         Args:
             chunk: Requested outputs (K, O), from the next control step on.
             past: Last three executed outputs (3, O).
-            plan: Rest of the previous result (n, O), n at least 1; returned if no chunk within the limits is found.
+            plan: Rest of the previous result (n, O), n at least 1, which is the fallback.
 
         Raises:
             InputError: If the chunk has the wrong shape, fewer than four steps, or values that are not finite.
@@ -180,7 +180,7 @@ class ChunkGuard:
         return GuardedChunk(limited, rate, False)
 
     def _slow_down(self, chunk: np.ndarray, past: np.ndarray) -> tuple[np.ndarray | None, float]:
-        """Return the projection of the chunk at the greatest rate that preserves its path, and that rate."""
+        """Return the projection of the chunk at the largest rate that preserves the path, and this rate."""
         points = np.concatenate([past[-1:], chunk])
         projected = None
         for rate in RATES:
@@ -212,7 +212,7 @@ class ChunkGuard:
         """Return the correction (K, n) of the outputs of a group (n,).
 
         Raises:
-            UnsolvableError: If the solver finds none.
+            UnsolvableError: If the solver finds no correction.
         """
         steps, size = len(chunk), len(group)
         velocity, jerk, rest = _differences(steps)
@@ -247,7 +247,7 @@ class ChunkGuard:
         return self._step[group] * v.reshape(steps, size)
 
     def is_within(self, chunk: np.ndarray, past: np.ndarray | None = None) -> bool:
-        """Return True if a chunk (K, O) is within all limits after a past (3, O), by default the executed outputs."""
+        """Return True if a chunk (K, O) is within all limits after `past` (3, O), the executed outputs by default."""
         motion = np.concatenate([self._past if past is None else past, chunk])
         return bool(
             (np.abs(np.diff(motion, axis=0)[2:]) <= self._step).all()

@@ -1,4 +1,4 @@
-"""Filters of commanded positions that depend on the last command: a control barrier function, and ATACOM.
+"""Filters of commanded positions relative to the last command: a control barrier function, and ATACOM.
 
 Each filter bounds the change of a command from one control step to the next by constraints with rows of unit norm,
 h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. If a desired command is
@@ -19,7 +19,7 @@ _TOLERANCE = 1e-9  # largest violation that counts as rounding [unit of a positi
 
 
 class CommandLaw(Protocol):
-    """Law that maps the last command and a desired one to a safe one."""
+    """Law that computes a safe command from the last and the desired command."""
 
     num_outputs: int
 
@@ -28,10 +28,7 @@ class CommandLaw(Protocol):
         ...
 
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the state (S,) that follows the state `last`, and True if the law intervened.
-
-        `desired` is the desired command (O,).
-        """
+        """Return the state (S,) after the state `last`, for a desired command (O,), and True if the law intervened."""
         ...
 
 
@@ -46,11 +43,11 @@ class _LastCommand:
 class BarrierFilter(_LastCommand):
     """Discrete-time control barrier function on commands (Agrawal and Sreenath, 2017).
 
-    The safe command is the nearest to the desired one for which no barrier decreases by more than a fraction γ:
+    The safe command is the command nearest to the desired one for which no barrier decreases by more than a fraction γ:
 
         h(y_{k+1}) ≥ (1 − γ) h(y_k)
 
-    The barrier of a keep-out box is that of its face with the most clearance at the last command (nonsmooth:
+    The barrier of a keep-out box is the barrier of the face with the largest clearance at the last command (nonsmooth:
     Glotfelter, Cortés and Egerstedt, 2017). With γ = 1 the filter is a projection.
 
     Args:
@@ -73,7 +70,8 @@ class BarrierFilter(_LastCommand):
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if it differs from the desired one.
 
-        The last command is repeated if no allowed command is found, as can happen while the last one is not allowed.
+        If no allowed command is found, the last command is repeated. This can happen while the last command is not
+        allowed itself.
         """
         if not is_finite(desired):
             return last.copy(), True
@@ -92,19 +90,17 @@ class BarrierFilter(_LastCommand):
 class TangentSpaceFilter(_LastCommand):
     """Motion of commands in the tangent space of the constraint manifold (ATACOM; Liu et al., 2022 and 2024).
 
-    Each constraint G y − s = c has a slack s ≥ 0, which is driven by a velocity of its own, ṡ = (s / σ) μ. A step
-    v = desired − last is projected to the null space of the Jacobian [−G, diag(s / σ)] in y and μ:
+    Each constraint G y − s = c has a slack s ≥ 0 with the velocity ṡ = (s / σ) μ. A step v = desired − last is
+    projected to the null space of the Jacobian [−G, diag(s / σ)] in y and μ:
 
         y_{k+1} = y_k + v − Gᵀ (G Gᵀ + diag(s / σ)²)⁻¹ G v
 
-    Far from a constraint this is the desired command; at a constraint the command only moves along the constraint.
-    A satisfied constraint that the step moves away from is left out, so that the command can leave it. The projection
-    is only accurate near the start of a step; a step that would cross a constraint is therefore shortened to end at it.
-    Only this, and a repeated command, count as an intervention; the projection, which changes every step towards a
-    constraint, does not.
+    Far from a constraint, the result is the desired command; at a constraint, the command only moves along the
+    constraint. A satisfied constraint is left out if the step moves away from it. The projection is only accurate near
+    the start of a step. A step that would cross a constraint is therefore shortened to end at the constraint.
 
     Args:
-        keep_out: Boxes and constraints, with their margin. A box is replaced by its face with the most clearance.
+        keep_out: Boxes and constraints, with their margin. A box is replaced by the face with the largest clearance.
         width: σ, slack at which motion towards a constraint is halved, positive [unit of a position].
 
     Raises:
@@ -123,8 +119,8 @@ class TangentSpaceFilter(_LastCommand):
     def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if the step was shortened or the last command repeated.
 
-        The projection, which changes every step towards a constraint, does not count as an intervention. The violation
-        c − G y of a constraint is corrected by the same pseudoinverse, as in ATACOM.
+        The projection does not count as an intervention, because it changes every step towards a constraint. The
+        violation c − G y of a constraint is corrected by the same pseudoinverse, as in ATACOM.
         """
         if not is_finite(desired):
             return last.copy(), True

@@ -3,10 +3,10 @@
 import numpy as np
 
 LEVER = 0.25  # distance from the tool center that converts rotational to translational quantities [m]
-# Smallest undamped singular value, tool velocity per joint velocity [m]; usual postures have 0.1 or more.
+# Smallest singular value that is not damped, tool velocity per joint velocity [m]; 0.1 or more in usual postures.
 REGULAR = 0.03
-STILL = 1e-3  # desired tool speed up to which any motion is accepted [m/s]
-TOOL_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])  # factors of a velocity [rotational, translational]
+STILL = 1e-3  # desired tool speed below which any motion counts as following [m/s]
+TOOL_SCALE = np.array([LEVER, LEVER, LEVER, 1.0, 1.0, 1.0])  # scale of a tool velocity [rotational, translational]
 
 
 def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray) -> tuple[np.ndarray, bool]:
@@ -23,7 +23,7 @@ def damped_joint_velocities(J: np.ndarray, V: np.ndarray, preferred: np.ndarray)
         preferred: Preferred joint velocities (n,) [rad/s].
 
     Returns:
-        The joint velocities (n,), and True if J is regular: then nothing is damped and J v = V.
+        The joint velocities (n,), and True if J is regular. In this case nothing is damped, and J v = V.
     """
     U, sigma, WT = np.linalg.svd(TOOL_SCALE[:, None] * J, full_matrices=False)
     is_regular = bool(sigma[-1] >= REGULAR)

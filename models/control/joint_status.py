@@ -17,8 +17,8 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
 
         τ = −M(q) v (1 − exp(−h / T)) / h
 
-    Held for a period h [s], the torque τ (n,) [Nm] multiplies the joint velocities v (n,) [rad/s] by exp(−h / T), with
-    the mass matrix M (n, n) and the decay time T [s].
+    If the torque τ (n,) [Nm] is constant for a period h [s], it multiplies the joint velocities v (n,) [rad/s] by
+    exp(−h / T). M (n, n) is the mass matrix, and T the decay time [s].
     """
     return (M @ v) * (np.expm1(-period / decay_time) / period)
 
@@ -78,7 +78,7 @@ class JointStatus:
     positions: np.ndarray  # joint positions, (n,) [rad]
     velocities: np.ndarray  # joint velocities, (n,) [rad/s]
     external_torque: np.ndarray  # external joint torques, (n,) [Nm]
-    conflicts: int = 0  # number of messages so far that contradict their predecessors, such as those of a second robot
+    conflicts: int = 0  # number of messages so far that contradict their predecessors, as with two robots on a channel
     foreign_commands: int = 0  # number of commands so far that cannot be from the program that commands the arm
 
     def __deepcopy__(self, memo: object) -> "JointStatus":
@@ -113,7 +113,7 @@ MALFORMED_STATUS = JointStatus(np.nan, np.empty(0), np.empty(0), np.empty(0))
 
 
 def parse_status(value: object) -> JointStatus | None:
-    """Return a driver's status with floating-point arrays of its own; None if there is no status.
+    """Return a driver's status with copies of its arrays as floats; None if there is no status.
 
     A status is malformed (`MALFORMED_STATUS`) if it is of another type, or if one of its values is not a real number,
     such as text, None or a complex number. Neither sizes nor finiteness of positions, velocities and torques are
@@ -140,10 +140,10 @@ def parse_status(value: object) -> JointStatus | None:
 
 
 def _to_numbers(value: object) -> np.ndarray:
-    """Return a new array of floats; raise an error if there is anything but real numbers."""
+    """Return a new array of floats; raise a TypeError if a value is not a real number."""
     array = np.array(value)
     if array.dtype.kind not in "iuf":
-        raise TypeError(f"{array.dtype} is no type of real numbers")
+        raise TypeError(f"{array.dtype} is not a type of real numbers")
     return array.astype(float)
 
 
@@ -166,7 +166,7 @@ class StatusLimits:
     # commands during this time.
     settling_time: float = 0.25
     clock_drift: float = 1e-3  # largest drift between the two clocks [s/s]; a slower drift is no fault
-    max_check_interval: float = 0.03  # largest wall-clock time between two checks, above it a deadline is missed [s]
+    max_check_interval: float = 0.03  # largest wall-clock time between two checks before a deadline is missed [s]
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
@@ -200,10 +200,10 @@ class LastStatus:
 
 
 def check_content(status: JointStatus | None, num_joints: int) -> Fault:
-    """Check types, sizes and finiteness of a status, or None before the first message, without other statuses.
+    """Check types, sizes and finiteness of one status; None before the first message.
 
     Returns:
-        The first fault, or `Fault.NONE`; a status that `parse_status` refuses is `Fault.MALFORMED`.
+        The first fault, or `Fault.NONE`. The fault of a status that `parse_status` refuses is `Fault.MALFORMED`.
     """
     status = parse_status(status)
     if status is None:
@@ -216,10 +216,10 @@ def check_content(status: JointStatus | None, num_joints: int) -> Fault:
 
 
 def check_status(status: JointStatus | None, last: LastStatus, now: float, limits: StatusLimits) -> Fault:
-    """Check the newest status, or None before the first message, against the last one at the local time `now` [s].
+    """Check the newest status (None before the first message) against the last one at the local time `now` [s].
 
     Returns:
-        The first fault, beginning with those of `check_content`, or `Fault.NONE`.
+        The first fault, or `Fault.NONE`; the faults of `check_content` come first.
     """
     num_joints = len(limits.velocity)
     fault = check_content(status, num_joints)

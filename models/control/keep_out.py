@@ -13,7 +13,7 @@ class KeepOut:
     """Axis-aligned boxes that must not be entered and linear constraints, both with a margin.
 
     A desired position is projected onto the constraints, and out of a box through the nearest face. The motion towards
-    the result stops before it would enter a box, so that a large step cannot jump through a wall.
+    the projected position ends before a box, so that a large step cannot jump through a wall.
 
     Args:
         lower: Lower corners of the boxes (B, O).
@@ -22,14 +22,14 @@ class KeepOut:
         margin: Distance from boxes and constraints [unit of a position], finite and not negative.
 
     Raises:
-        InputError: If shapes do not match, a box is empty, the constraints change from step to step or contradict each
-            other with the margin, or the margin is out of range.
+        InputError: If shapes do not match, a box is empty, the margin is out of range, or the constraints change from
+            step to step or contradict each other with the margin.
 
     Attributes:
-        margin: Distance from boxes and constraints.
+        margin: Distance from boxes and constraints [unit of a position].
     """
 
-    _GAP = 1e-6  # distance from a box at which a motion stops, so that rounding cannot put it inside
+    _GAP = 1e-6  # distance from a box at which a motion stops, so that rounding cannot put the position inside
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, constraints: LinearConstraints, margin: float):
         self._lower = np.atleast_2d(np.asarray(lower, dtype=float))
@@ -37,7 +37,7 @@ class KeepOut:
         if self._lower.shape != self._upper.shape or not (self._lower < self._upper).all():
             raise InputError("each box needs a lower corner below its upper corner")
         if constraints.num_outputs != self._lower.shape[1] or constraints.num_steps is not None:
-            raise InputError(f"constraints must be constant and on {self._lower.shape[1]} outputs, as the boxes are")
+            raise InputError(f"constraints must be constant and on {self._lower.shape[1]} outputs, like the boxes")
         if not 0 <= margin < math.inf:
             raise InputError(f"a margin must be finite and 0 or more, not {margin}")
         self.margin = float(margin)
@@ -69,10 +69,10 @@ class KeepOut:
         return target, was_in_box
 
     def half_spaces(self, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return half-spaces G y ≥ c that exclude the boxes with their margin, selected at a position (O,).
+        """Return half-spaces G y ≥ c, G (F, O) with rows of unit norm and c (F,), for a position (O,).
 
-        They are the constraints and, for each box, the half-space outside the face with the most clearance. The rows of
-        G (F, O) have unit norm; c is (F,).
+        The half-spaces are the constraints and, for each box, the half-space outside of the face with the largest
+        clearance at the position, both with the margin.
         """
         below, above = self._lower - position, position - self._upper
         clearance = np.hstack([below, above])
@@ -99,7 +99,7 @@ class KeepOut:
         """Return the nearest point on a face of the boxes that contain `desired`, and True if there is such a box."""
         point, was_in_box, margin = desired.tolist(), False, self.margin
         for lower, upper in self._boxes:
-            # (depth below the face, axis, coordinate just outside of the face)
+            # Each face: depth of the point behind the face, axis, coordinate just outside of the face.
             faces = [
                 face
                 for axis, x in enumerate(point)
@@ -118,21 +118,21 @@ class KeepOut:
         """Return the fraction of the line from `start` (O,) to `end` (O,) that lies before a box."""
         free = 1.0
         for lower, upper in self._boxes:
-            # A robot that is already closer to a box than the margin, or inside it (after a push), may leave but not
-            # come closer: the margin is reduced to its clearance.
+            # If the start is closer to a box than the margin, or inside of it (after a push), the margin is reduced to
+            # the clearance of the start: the motion may leave the box but not come closer.
             clearance = max(max(a - x, x - b) for a, b, x in zip(lower, upper, start, strict=True))
             margin = min(clearance, self.margin)
             enter, leave = -math.inf, math.inf
             for a, b, x, y in zip(lower, upper, start, end, strict=True):
                 a, b, displacement = a - margin, b + margin, y - x
                 if displacement == 0:
-                    # The line is parallel to two faces: always between them, or never.
+                    # The line is parallel to two faces: all of it is between them, or none.
                     if not a < x < b:
                         leave = -math.inf
                     continue
                 first, second = (a - x) / displacement, (b - x) / displacement
                 enter, leave = max(enter, min(first, second)), min(leave, max(first, second))
-            # The start is outside the box: a negative `enter` is a rounding error, or the box is behind the start.
+            # The start is outside of the box. A negative `enter` is a rounding error, or the box is behind the start.
             if -1e-9 <= enter < min(leave, free):
                 free = max(enter, 0.0)
         return free

@@ -1,4 +1,4 @@
-"""Constraints on a commanded motion that are not linear in the command alone: shapes, speed, acceleration and jerk."""
+"""Constraints of a commanded motion (shapes, speed, acceleration and others), and a filter that satisfies them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 from guiderail.models.primitives.constraints import TOLERANCE
 from guiderail.models.primitives.qp import solve_least_norm
 
-# Distances from a shape and from the plane of a linear constraint: first the distance at which the QP aims, then the
-# smaller distance that every command keeps. The difference allows for the solver's tolerance.
+# Distances from a shape and from the plane of a linear constraint: the distance that the QP requires, and the smaller
+# distance that every command has. The difference allows for the solver's tolerance.
 _SHAPE, _PLANE = (CLEARANCE, 0.5 * CLEARANCE), (0.0, -0.5 * TOLERANCE)
-# Largest difference between an entry of a desired command and of the last command [unit of the output]. Larger
-# differences are clipped: the command is the desired one plus a move, and a sum of two large numbers is inexact.
+# Largest difference of an output between the desired and the last command [unit of the output]. Larger differences are
+# clipped, because the command is the desired one plus a move, and the sum of two large numbers is inexact.
 _REACH = 1e4
 _ROUNDING = 5e-7  # share of the width of the speed and acceleration box by which a solution may exceed the box
 _CUTS = 4  # number of linearizations of the `inside` shapes
@@ -30,7 +30,7 @@ _BISECTIONS = 12  # number of bisections between the braking command and the nea
 
 
 class StateConstraints(Protocol):
-    """Constraints that are linearized at a command and checked at the next one, such as joint limits of an arm."""
+    """Constraints that are linearized at the last command and checked at the next one, such as joint limits."""
 
     def linearize(self, output: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rows G (F, O) of unit norm and c (F,) of G y ≥ c near an output (O,)."""
@@ -58,15 +58,15 @@ class MotionConstraints:
     """
 
     linear: LinearConstraints  # G y ≥ c on every command (O,), the same at every step
-    outside: Sequence[ConvexShape] = ()  # shapes that the commanded positions, the first D outputs, stay outside of
-    inside: Sequence[ConvexShape] = ()  # shapes that the commanded positions stay inside of
+    outside: Sequence[ConvexShape] = ()  # shapes that the commanded positions (the first D outputs) must not enter
+    inside: Sequence[ConvexShape] = ()  # shapes that the commanded positions must not leave
     max_speed: ArrayLike | None = None  # largest speed of each output, (O,) [unit/s]; infinite by default
     max_acceleration: ArrayLike | None = None  # largest acceleration, (O,) [unit/s²]; infinite by default
     state: Sequence[StateConstraints] = ()  # further constraints, such as joint limits
 
     def __post_init__(self) -> None:
         if self.linear.num_steps is not None:
-            raise InputError("shapes, speed and acceleration need linear constraints that do not change")
+            raise InputError("shapes, speed and acceleration need linear constraints that do not change from step to step")
         if any(shape.num_dims > self.num_outputs for shape in (*self.outside, *self.inside)):
             raise InputError(f"a shape has more dimensions than a command has outputs, {self.num_outputs}")
         for name in ("max_speed", "max_acceleration"):
@@ -86,45 +86,49 @@ class MotionConstraints:
         """None: the constraints are the same at every step."""
         return None
 
-    def violations(self, output: np.ndarray, step: int = 0) -> Violations:
-        """Return the largest violation of each kind of constraint by one command (O,); negative inside.
+    def violations(self, output: np.ndarray) -> Violations:
+        """Return the largest violation of each kind of constraint by a command (O,).
 
-        A violation is NaN if a constraint's own violation is NaN, as for a command with NaN.
+        A violation is NaN if that of one constraint is NaN, as for a command with NaN.
         """
         shapes = [-shape.distance(output[: shape.num_dims]) for shape in self.outside]
         shapes += [shape.distance(output[: shape.num_dims]) for shape in self.inside]
         state = [constraint.violation(output) for constraint in self.state]
-        return Violations(self.linear.violation(output, step), _largest(shapes), _largest(state))
+        return Violations(self.linear.violation(output), _largest(shapes), _largest(state))
 
     def violation(self, output: np.ndarray, step: int = 0) -> float:
-        """Return the largest of the `violations` of a command (O,), with angles as arc lengths of radius `LEVER`."""
-        linear, shapes, state = self.violations(output, step)
+        """Return the largest of the `violations` of a command (O,), with angles as arc lengths of radius `LEVER`.
+
+        `step` has no effect; `LinearConstraints.violation` has the same argument.
+        """
+        linear, shapes, state = self.violations(output)
         return _largest([linear, shapes, LEVER * state])
 
 
 def _largest(violations: list[float]) -> float:
-    """Return the largest violation, −inf if there is none; NaN if one is NaN, which Python's `max` may ignore."""
+    """Return the largest violation, −inf if there is none, NaN if any is NaN (Python's `max` may ignore it)."""
     return float(np.max(violations, initial=-np.inf))
 
 
 class MotionConstraintFilter:
-    """Filter that finds the nearest command within `MotionConstraints` from which the motion can still stop.
+    """Filter that computes the nearest command within `MotionConstraints` from which the motion can still stop.
 
-    In each step all constraints are replaced by linear ones. The `outside` shapes become half-spaces, linearized at the
-    last command, so that the true constraint also holds between two commands. Speed and acceleration become boxes
+    In each step all constraints are replaced by linear constraints. The `outside` shapes become half-spaces, linearized
+    at the last command, so that the true constraint also holds between two commands. Speed and acceleration become
+    boxes
 
         |y − p| ≤ v h        |y − 2 p + p'| ≤ a h²
 
     for the last two commands p and p'. The nearest command is the solution of a QP. It is executed if the motion can
-    brake from there, on a straight line at the largest deceleration, within the constraints. Otherwise, the farthest
-    safe command on the line from the braking command to the nearest one is executed. Braking was verified one step
-    earlier, so that a safe command always exists. Without a largest acceleration, braking repeats the last command.
+    then brake within the constraints, on a straight line at the largest deceleration. Otherwise, the farthest safe
+    command on the line from the braking command to the nearest command is executed. A safe command always exists,
+    because braking was verified one step earlier. Without a largest acceleration, braking repeats the last command.
 
     If the start is outside of the constraints (after a push, or because the constraints moved), the commands move back
-    inside; from then on every command satisfies all constraints.
+    inside. Once inside, every command satisfies all constraints.
 
-    A motion that starts with a velocity (see `start`) is stopped before the constraints, even if this exceeds the
-    largest acceleration in the first step. If it is faster than the largest speed, it slows down within the largest
+    A motion that starts with a velocity (see `start`) stops before the constraints, even if the first step must exceed
+    the largest acceleration for it. A motion that starts faster than the largest speed slows down within the largest
     acceleration.
 
     Args:
@@ -136,7 +140,7 @@ class MotionConstraintFilter:
 
     Attributes:
         num_outputs: Number of outputs O.
-        constraints: The constraints.
+        constraints: Constraints.
     """
 
     def __init__(self, constraints: MotionConstraints, period: float):
@@ -151,10 +155,11 @@ class MotionConstraintFilter:
         self._identity = np.eye(self.num_outputs)
 
     def start(self, pose: np.ndarray, displacement: np.ndarray | None = None) -> np.ndarray:
-        """Return the state (2 O,) at a pose (O,): the last command and its displacement (O,) in one step, 0 by default.
+        """Return the state (2 O,) of a motion that starts at a pose (O,): last command and displacement in one step.
 
-        If a motion cannot brake within the largest acceleration before it leaves the constraints, its displacement is
-        multiplied by a share below 1 with which it can. Only this first change exceeds the largest acceleration.
+        The displacement (O,) is zero by default. If the motion cannot brake within the largest acceleration before it
+        leaves the constraints, its displacement is reduced by a factor until it can. Only this first change exceeds the
+        largest acceleration.
         """
         if displacement is None:
             return np.concatenate([pose, np.zeros(self.num_outputs)])
@@ -181,13 +186,13 @@ class MotionConstraintFilter:
         G, c = self._linearize(last, rest)
         slack = np.minimum(G @ last, G @ rest) - c
         is_shape = np.arange(len(c)) < len(self.constraints.outside) + len(self.constraints.inside)
-        aim, keep = (np.where(is_shape, *pair) for pair in zip(_SHAPE, _PLANE, strict=True))
-        required = c + np.minimum(keep, slack)
+        aim, margin = (np.where(is_shape, *pair) for pair in zip(_SHAPE, _PLANE, strict=True))
+        required = c + np.minimum(margin, slack)
         lower = np.minimum(np.maximum(last - self._max_step, last + velocity - self._max_change), brake)
         upper = np.maximum(np.minimum(last + self._max_step, last + velocity + self._max_change), brake)
         goals = [c + aim]
-        if (is_outside := slack < keep).any():
-            # First goal: move towards a violated constraint almost as fast as possible; second: do not violate it more.
+        if (is_outside := slack < margin).any():
+            # First goal: approach violated constraints almost as fast as possible. Second goal: violate them no more.
             best = np.where(G > 0.0, G, 0.0) @ _finite(upper) + np.where(G < 0.0, G, 0.0) @ _finite(lower)
             towards = 0.9 * np.minimum(best, c + aim) + 0.1 * (c + slack)
             goals = [np.where(is_outside, towards, c + aim), required]
@@ -198,18 +203,18 @@ class MotionConstraintFilter:
         if (np.maximum(lower - nearest, nearest - upper) > _ROUNDING * (upper - lower)).any():
             nearest = np.minimum(np.maximum(nearest, lower), upper)
         inside = [(shape, max(-_SHAPE[1], shape.distance(rest[: shape.num_dims]))) for shape in self.constraints.inside]
-        further = [(one, max(0.0, one.violation(rest))) for one in self.constraints.state]
+        states = [(limits, max(0.0, limits.violation(rest))) for limits in self.constraints.state]
 
         def is_safe(command: np.ndarray) -> bool:
-            """Return True if the constraints hold from the last command via `command` to where braking ends."""
+            """Return True if the path via `command` to the end of braking satisfies the constraints."""
             displacement = command - last
             rest_share = self._braking(displacement)[1]
             end = command + rest_share * displacement
-            each_state = (command, end) if rest_share else (command,)
+            checked = (command, end) if rest_share else (command,)
             return (
                 bool((G @ end >= required).all())
                 and all(shape.distance(end[: shape.num_dims]) <= bound for shape, bound in inside)
-                and all(one.violation(each) <= bound for one, bound in further for each in each_state)
+                and all(limits.violation(output) <= bound for limits, bound in states for output in checked)
             )
 
         if is_safe(nearest):
@@ -222,9 +227,9 @@ class MotionConstraintFilter:
         return np.concatenate([command, command - last]), safe == 0.0
 
     def _can_brake(self, pose: np.ndarray, displacement: np.ndarray) -> bool:
-        """Return True if braking from a pose (O,) keeps the constraints, or does not violate them more than the pose.
+        """Return True if braking from a pose (O,) satisfies the constraints, or violates them no more than the pose.
 
-        `displacement` (O,) is that of the step before.
+        `displacement` (O,) is the displacement of the previous step.
         """
         brake, rest = (pose + share * displacement for share in self._braking(displacement))
         constraints, rounding = self.constraints, -_PLANE[1]
@@ -237,33 +242,32 @@ class MotionConstraintFilter:
             if not bound - min(normal @ first, normal @ last) <= max(-shape.distance(first), rounding):
                 return False
         for shape in constraints.inside:
-            # The distance is convex: along a line that does not end inside, it decreases only if it does so at the end.
+            # The distance is convex: if it decreases at the end of a line, it decreases along the whole line.
             distance, normal = shape.surface(rest[: shape.num_dims])
             if not (distance <= rounding or normal @ displacement[: shape.num_dims] <= 0.0):
                 return False
         return all(
-            one.violation(each) <= max(one.violation(pose), rounding)
-            for one in constraints.state
-            for each in (brake, rest)
+            limits.violation(output) <= max(limits.violation(pose), rounding)
+            for limits in constraints.state
+            for output in (brake, rest)
         )
 
     def _braking(self, velocity: np.ndarray) -> tuple[float, float]:
-        """Return the braking displacements, of the next step and until rest, as shares of the last displacement (O,).
+        """Return the braking displacements in the next step and until rest, as shares of the last displacement (O,).
 
-        The shares of the steps are 1 − φ, 1 − 2 φ, …; φ is the largest number that the acceleration limits of all
-        outputs allow.
+        The shares of the steps are 1 − φ, 1 − 2 φ, …, with the largest φ within the acceleration limits of all outputs.
         """
         share = math.inf
         if self._has_acceleration:
             pairs = zip(self._max_change.tolist(), velocity.tolist(), strict=True)
-            share = min((change / abs(moving) for change, moving in pairs if moving), default=math.inf)
+            share = min((change / abs(v) for change, v in pairs if v), default=math.inf)
         if share >= 1.0:
             return 0.0, 0.0
         steps = math.floor(1.0 / share)
         return 1.0 - share, steps - 0.5 * share * steps * (steps + 1)
 
     def _linearize(self, last: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return constraints G y ≥ c, G (F, O) and c (F,), for the path from the last command to where braking ends."""
+        """Return constraints G y ≥ c, G (F, O) and c (F,), for the path from the last command to the end of braking."""
         constraints = self.constraints
         shapes = (*constraints.outside, *constraints.inside)
         rows, bounds = np.zeros((len(shapes), self.num_outputs)), np.zeros(len(shapes))
@@ -271,27 +275,25 @@ class MotionConstraintFilter:
             sign, D = 1.0 if k < len(constraints.outside) else -1.0, shape.num_dims
             half_space = shape.separate(last[:D], rest[:D]) if sign > 0.0 else shape.half_space(last[:D])
             rows[k, :D], bounds[k] = sign * half_space[0], sign * half_space[1]
-        further = [one.linearize(last) for one in constraints.state]
-        G, c = zip((rows, bounds), (constraints.linear.G, constraints.linear.c), *further, strict=True)
+        states = [limits.linearize(last) for limits in constraints.state]
+        G, c = zip((rows, bounds), (constraints.linear.G, constraints.linear.c), *states, strict=True)
         return np.concatenate(G), np.concatenate(c)
 
     def _nearest(
         self, desired: np.ndarray, G: np.ndarray, c: np.ndarray, lower: np.ndarray, upper: np.ndarray
     ) -> np.ndarray | None:
-        """Return the command (O,) nearest to the desired one with G y ≥ c, in the box and in the shapes, or None."""
+        """Return the command (O,) nearest to the desired one with G y ≥ c, in box and `inside` shapes, or None."""
         cuts_G, cuts_c, command = G, c, desired
         for _ in range(_CUTS):
             missing = cuts_c - cuts_G @ desired
             below, above = lower - desired, upper - desired
             if max(missing.max(initial=-1.0), below.max(), -above.min()) > 0.0:
-                is_box = np.isfinite(below)  # then the upper side is finite too
+                is_box = np.isfinite(below)  # the upper side is then finite too
                 rows = np.concatenate([cuts_G, self._identity[is_box]])
-                bounds = (
-                    np.concatenate([missing, below[is_box]]),
-                    np.append(np.full(len(missing), np.inf), above[is_box]),
-                )
+                low = np.append(missing, below[is_box])
+                high = np.append(np.full(len(missing), np.inf), above[is_box])
                 try:
-                    move, _ = solve_least_norm(rows, *bounds)
+                    move, _ = solve_least_norm(rows, low, high)
                 except UnsolvableError:
                     return None if cuts_c is c else command
                 command = desired + move
@@ -303,7 +305,7 @@ class MotionConstraintFilter:
         return command
 
     def _cut(self, command: np.ndarray) -> list[tuple[np.ndarray, float]]:
-        """Return half-spaces that contain the `inside` shapes and exclude a command outside them."""
+        """Return (row, bound) of half-spaces that contain the `inside` shapes but not a command outside of them."""
         cuts = []
         for shape in self.constraints.inside:
             distance, normal = shape.surface(command[: shape.num_dims])
@@ -315,7 +317,7 @@ class MotionConstraintFilter:
 
 
 def _finite(bounds: np.ndarray) -> np.ndarray:
-    """Return bounds (O,) with large numbers in place of infinite ones, because zero times infinity is NaN."""
+    """Replace infinite bounds (O,) by large numbers, because zero times infinity is NaN."""
     return np.nan_to_num(bounds, posinf=1e9, neginf=-1e9)
 
 
@@ -323,8 +325,8 @@ def _finite(bounds: np.ndarray) -> np.ndarray:
 class MotionLimits:
     """Largest norms of velocity, acceleration and jerk of a pose."""
 
-    linear: tuple[float, float, float]  # velocity, acceleration and jerk of the position: [m/s], [m/s²], [m/s³]
-    angular: tuple[float, float, float]  # the same of the orientation: [rad/s], [rad/s²], [rad/s³]
+    linear: tuple[float, float, float]  # velocity [m/s], acceleration [m/s²] and jerk [m/s³] of the position
+    angular: tuple[float, float, float]  # velocity [rad/s], acceleration [rad/s²] and jerk [rad/s³] of the orientation
 
     def __post_init__(self) -> None:
         """Check the limits.
@@ -334,18 +336,18 @@ class MotionLimits:
                 the rotation vector (`rotation_vector_limits`).
         """
         if not all(np.isfinite(limit) and limit > 0.0 for limit in (*self.linear, *self.angular)):
-            raise InputError(f"limits of a motion are positive and finite, not {self.linear} and {self.angular}")
+            raise InputError(f"limits of a motion must be positive and finite, not {self.linear} and {self.angular}")
         if min(self.rotation_vector_limits()) <= 0.0:
             raise InputError(f"an angular velocity of {self.angular[0]} rad/s needs more acceleration and jerk")
 
     def scaled(self, factor: float) -> MotionLimits:
-        """Return the limits times a factor from 0 (excluded) to 1.
+        """Return the limits times a factor in (0, 1].
 
         Raises:
             InputError: If the factor is out of range.
         """
         if not 0.0 < factor <= 1.0:
-            raise InputError(f"a factor of the limits of a motion is above 0 and at most 1, not {factor}")
+            raise InputError(f"a factor of motion limits must be above 0 and at most 1, not {factor}")
         linear, angular = ((factor * v, factor * a, factor * j) for v, a, j in (self.linear, self.angular))
         return MotionLimits(linear, angular)
 
@@ -353,7 +355,7 @@ class MotionLimits:
         """Return limits of the derivatives of a rotation vector r that imply the angular limits.
 
         The angular velocity is ω = J(r) ṙ with the left Jacobian J of SO(3). For ‖r‖ ≤ π the norms of J and of its
-        first and second directional derivative are at most 1, 1/2 and 1/3 (tested numerically). Hence ‖ω‖ ≤ ‖ṙ‖,
+        first and second directional derivatives are at most 1, 1/2 and 1/3 (tested numerically). Hence ‖ω‖ ≤ ‖ṙ‖,
         ‖ω̇‖ ≤ ‖r̈‖ + ‖ṙ‖²/2 and ‖ω̈‖ ≤ ‖r⃛‖ + 3 ‖ṙ‖ ‖r̈‖/2 + ‖ṙ‖³/3.
         """
         velocity, acceleration, jerk = self.angular

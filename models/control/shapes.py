@@ -1,12 +1,12 @@
-"""Convex shapes that a command stays outside or inside of, and their linearization.
+"""Convex shapes that a command must not enter or must not leave, and their linearization.
 
 The signed distance d to a convex set is a convex function (negative inside), and its unit normal n at a point p is a
 subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, however far y is from p:
 
-- Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). The half-space contains p if p is outside the set,
-  hence also the straight line from p to every other point of the half-space.
-- The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the command keeps at least the distance that
-  the linear constraint promises. For a sphere whose center is r away from p, the error is at most ‖y − p‖² / (2 r).
+- Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). If p is outside the set, the half-space contains p,
+  and therefore the straight line from p to every other point of the half-space.
+- The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the distance of a command is at least the
+  distance by the linear constraint. For a sphere with its center r away from p, the error is at most ‖y − p‖² / (2 r).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.constraints import LinearConstraints
 
 CLEARANCE = 1e-8
-"""Distance that linearized constraints keep from a shape, more than the tolerance of a solver [unit of the output]."""
+"""Distance of linearized constraints from a shape, larger than the tolerance of a solver [unit of the output]."""
 _HALVINGS = 60  # number of bisections after which the ends of an interval are neighboring floating-point numbers
 
 
@@ -52,10 +52,10 @@ class ConvexShape(ABC):
         return self.surface(p)[0]
 
     def separate(self, p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return n (D,) and c of a half-space nᵀ y ≥ c outside of the shape that contains the line from p to q.
+        """Return n (D,) and c of a half-space nᵀ y ≥ c outside of the shape that contains the line from p to q (D,).
 
-        The shape is linearized at p or q (D,) if the half-space then contains both, otherwise at the point of the line
-        nearest to the shape. If the line crosses the shape, the half-space does not contain all of the line.
+        The shape is linearized at p or at q if the half-space then contains both points, otherwise at the point of the
+        line nearest to the shape. If the line crosses the shape, the half-space contains only a part of the line.
         """
         for at, other in ((p, q), (q, p)):
             n, c = self.half_space(at)
@@ -85,12 +85,12 @@ def _length(value: float, what: str, *, can_be_zero: bool = False) -> float:
 
 
 class Sphere(ConvexShape):
-    """Ball ‖y − center‖ ≤ radius + margin; a disc in the plane.
+    """Ball ‖y − center‖ ≤ radius + margin; in the plane, a disc.
 
     Args:
         center: Center (D,).
         radius: Radius, positive.
-        margin: Distance to keep, not negative.
+        margin: Distance by which the shape is enlarged, not negative.
 
     Raises:
         InputError: If an argument is out of range.
@@ -103,7 +103,7 @@ class Sphere(ConvexShape):
         self.num_dims = len(self.center)
 
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return distance and normal; at the center, where no normal is unique, the normal is the first axis."""
+        """Return distance and normal; at the center, where the normal is not unique, it is the first axis."""
         offset = p - self.center
         length = math.sqrt(offset @ offset)
         normal = offset / length if length > 0.0 else np.eye(self.num_dims)[0]
@@ -116,7 +116,7 @@ class Box(ConvexShape):
     Args:
         lower: Lower corner (D,).
         upper: Upper corner (D,), larger in every coordinate.
-        margin: Distance to keep, not negative.
+        margin: Distance by which the shape is enlarged, not negative.
 
     Raises:
         InputError: If an argument is out of range.
@@ -130,7 +130,7 @@ class Box(ConvexShape):
         self.margin, self.num_dims = _length(margin, "a margin", can_be_zero=True), len(self.lower)
 
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return distance and normal; inside of the box, those of its nearest face."""
+        """Return distance and normal; inside of the box, those of the nearest face."""
         offset = p - np.clip(p, self.lower, self.upper)
         length = math.sqrt(offset @ offset)
         if length > 0.0:
@@ -149,7 +149,7 @@ class Cylinder(ConvexShape):
         start: Center of one face (3,).
         end: Center of the other face (3,).
         radius: Radius, positive.
-        margin: Distance to keep, not negative.
+        margin: Distance by which the shape is enlarged, not negative.
 
     Raises:
         InputError: If an argument is out of range, or both centers are the same point.
@@ -167,7 +167,7 @@ class Cylinder(ConvexShape):
         self.axis = (end - self.start) / self.length
 
     def surface(self, p: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return distance and normal; inside of the cylinder, those of its nearest face or of its side."""
+        """Return distance and normal; inside of the cylinder, those of the side or a face, whichever is nearer."""
         along = float(self.axis @ (p - self.start))
         across = p - self.start - along * self.axis
         radius = math.sqrt(across @ across)
@@ -191,18 +191,18 @@ def _perpendicular(axis: np.ndarray) -> np.ndarray:
 def linearize(
     shapes: Sequence[ConvexShape], path: np.ndarray, linear: LinearConstraints | None = None
 ) -> LinearConstraints:
-    """Return linear constraints to stay outside of shapes, linearized around a reference path.
+    """Return linear constraints that exclude shapes, linearized around a reference path.
 
-    Step n has two half-spaces per shape, of the path's points n and n + 1. Consecutive commands therefore have a
-    half-space in common, and the straight line between them is outside of the shape too. The constraints keep
-    `CLEARANCE`, so that a command that satisfies them up to the tolerance of the solver is outside.
+    Step n has two half-spaces per shape, those of the path's points n and n + 1. Consecutive commands therefore have a
+    half-space in common, so that the straight line between them is outside of the shape too. The half-spaces have the
+    distance `CLEARANCE` from a shape, so that a command that satisfies them up to the solver's tolerance is outside.
 
     Args:
-        shapes: Shapes to stay outside of.
-        path: Reference means (N, O); the first D outputs are positions. For a point inside of a shape, the half-space
-            touches the nearest point of the surface. A path through the middle of a shape does not determine on which
-            side to pass.
-        linear: Further constraints of every step; none by default.
+        shapes: Shapes that commands must not enter.
+        path: Reference means (N, O); the first D outputs are positions. If a point is inside of a shape, the half-space
+            touches the nearest point of the surface. A path through the middle of a shape therefore does not determine
+            the side on which commands pass.
+        linear: Further constraints; none by default.
 
     Raises:
         InputError: If a shape has more dimensions than the path, or the constraints of a step contradict each other.

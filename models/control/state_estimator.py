@@ -20,31 +20,35 @@ from guiderail.models.control.joint_status import (
 )
 from guiderail.models.control.message_sequence import RESOLUTION
 
-ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)  # a status with them is accepted
-# Faults after which the message is dropped, and the next one is compared with the last readable status. After a fault
-# in neither of the two lists, statuses are in doubt until all have been valid for the settling time. A status in doubt
-# is only accepted if it agrees with the prediction.
+ACCEPTABLE_FAULTS = (
+    Fault.NONE,
+    Fault.DEADLINE_MISSED,
+    Fault.SECOND_COMMANDER,
+)  # faults with which a status is accepted
+# Faults after which the message is dropped, and the next message is compared with the last readable status. After any
+# other fault, statuses are in doubt until all have been valid for the settling time. A status in doubt is only accepted
+# if it agrees with the prediction.
 DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
 FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping with a measured velocity does not oscillate
-AGREEMENT = 0.1  # largest difference from the predicted velocity for a status in doubt to be accepted [rad/s]
-# Fraction by which the clock offset follows a status that arrives earlier than expected. With 1, a single stray message
-# would make all others late.
+AGREEMENT = 0.1  # largest difference from the predicted velocity at which a status in doubt is accepted [rad/s]
+# Fraction by which the clock offset follows a status that arrives earlier than expected. With 1, all messages after a
+# single stray message would be late.
 EARLY_FRACTION = 0.2
-EARLY_WINDOW = 0.5  # decay time of the sum of these offset corrections [s]
-MAX_EARLY = 1.0 / 3.0  # largest sum of these corrections, relative to `max_lead`; above it, the robot's clock is fast
+EARLY_WINDOW = 0.5  # decay time of the sum of offset corrections for early statuses [s]
+MAX_EARLY = 1.0 / 3.0  # sum of these corrections above which the robot's clock is too fast, relative to `max_lead`
 POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
 REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
 MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
 MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # motion [rad] and speed [rad/s] above which a joint's values must change
-MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # repetitions of a moving joint's value that are a fault
-MAX_EQUAL_STATUSES = 4  # repetitions of all values of a joint that are a fault while another joint is moving
+MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # number of repetitions of a moving joint's value that is a fault
+MAX_EQUAL_STATUSES = 4  # number of repetitions of all values of a joint that is a fault while another joint is moving
 MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
 EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
 LAG = 1.0  # largest delay of a velocity's filter [periods]
 DELAY = 2.0  # largest time from a command or a contact to its effect on torques [periods]
-REACTION = 1.5  # accepted change of velocity that no torque explains, per measured change
+REACTION = 1.5  # accepted change of velocity that no torque explains, relative to the measured change
 MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
-BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time in which the bias is learned, with and without commanded torque [s]
+BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time constants of the learned bias with and without commanded torque [s]
 MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity is unknown [s]
 
 
@@ -72,9 +76,9 @@ class EstimatorState:
     residual: np.ndarray  # recent difference between positions and integrated velocities, (n,) [rad]
     equal_positions: np.ndarray  # number of consecutive equal positions of each moving joint, (n,)
     equal_velocities: np.ndarray  # number of consecutive equal velocities of each moving joint, (n,)
-    # Number of consecutive statuses with equal values of a joint while another one moves, (n,).
+    # Number of consecutive statuses with equal values of a joint while another joint moves, (n,).
     equal_values: np.ndarray
-    # External torque in the prediction, which follows the accepted one at a limited rate, (n,) [Nm].
+    # External torque of the prediction, which follows the accepted external torque at a limited rate, (n,) [Nm].
     external: np.ndarray
     torque: np.ndarray  # torques in effect until the next check, (n,) [Nm]
     variation: np.ndarray  # last change of torques and external torques, (n,) [Nm]
@@ -94,7 +98,7 @@ class EstimatorState:
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
-        """Return the state from its vector, the result of `vector`."""
+        """Return the state from the result of `vector`."""
         values, vectors = np.split(vector[12:], [6 * num_joints])
         return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(14, -1))
 
@@ -124,32 +128,32 @@ class Estimate:
 
 
 class StateEstimator:
-    """Estimator of a robot's joint state, which checks each status.
+    """Estimator of a robot's joint state that checks each status.
 
     `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
     with a model, for each joint:
 
-    - *Equal values*: a joint whose velocity or positions show motion does not repeat its position or its velocity to
-      the bit in consecutive statuses. No joint repeats position, velocity and external torque together while another
-      joint moves.
-    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses, h apart, with the velocities v₋
-      and v; deviations, added up with a decay, stay within the position tolerance.
-    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v), h being the time between two checks, and
-      m = Σ M Δv, both with a decay,
+    - *Equal values*: if the velocity or positions of a joint show motion, consecutive statuses do not have bit-equal
+      positions or velocities of the joint. While one joint moves, no other joint repeats all of position, velocity and
+      external torque.
+    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses with the velocities v₋ and v and
+      the time h between them. The sum of deviations, with a decay, is within the position tolerance.
+    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay, and the time h
+      between two checks,
       |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
       The last term, with a faster decay, accepts collisions, which change the velocity before the external torque. It
       is zero for a joint that does not react. Δv_noise and Δv_max are `velocity_noise` and `velocity_jump`.
 
     A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
     three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
-    One wrong source cannot move it out of the interval of the other two. While no status is accepted, only the third
-    source is used, so that damping ends when it has removed the momentum; a status in doubt can only reduce the size of
-    the estimate. The accepted velocity, with which the arm is controlled, is the reported one, limited to the interval
-    of the other two sources, widened by the velocity noise.
+    A single wrong source therefore cannot move the estimate out of the interval of the other two sources. While no
+    status is accepted, only the third source is used, so that damping ends when the momentum is removed. A status in
+    doubt can only reduce the size of the estimate. The arm is controlled with the accepted velocity: the reported
+    velocity, limited to the interval of the other two sources, widened by the velocity noise.
 
-    The clocks are synchronized with the first status. Afterwards the offset follows early statuses quickly and late
-    ones slowly; after a fault or a timeout the clocks are synchronized again. Delays of this program are not attributed
-    to the robot; a delay that is too long is reported as `DEADLINE_MISSED`.
+    The clocks are synchronized with the first status. Afterwards the clock offset follows early statuses quickly and
+    late statuses slowly. After a fault or a timeout the clocks are synchronized again. Delays of this program are not
+    attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`.
 
     Args:
         limits: Plausibility limits of a status.
@@ -180,7 +184,7 @@ class StateEstimator:
 
         Args:
             before: State after the last check.
-            status: Newest status; None before the first. One that `parse_status` refuses is malformed.
+            status: Newest status, None before the first; a status that `parse_status` refuses is malformed.
             now: Local time [s].
             M: Mass matrix at the accepted positions, (n, n).
             drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
@@ -203,7 +207,7 @@ class StateEstimator:
             return self._finish(state, before, fault, now)
 
         if fault == Fault.CONFLICT and not is_doubted:
-            # The last statuses may be from a second robot, which does not react: the effect of the torques is added.
+            # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
         elapsed, change = status.time - last.time, values - last.values
@@ -215,7 +219,7 @@ class StateEstimator:
         if is_comparable and not is_doubted and state.torque.any():
             state = self._update_momentum(state, M, change[self._velocities], elapsed)
         else:
-            # The momentum sums restart at this status.
+            # The momentum sums start again at this status.
             is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         fault = fault or self._find_contradiction(state, M)
@@ -228,11 +232,11 @@ class StateEstimator:
             values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
             reported, velocity = velocity, np.median((velocity, *others), axis=0)
             if fault == Fault.INCONSISTENT:
-                # Two of the sources come from this status, which may be old and have an outdated velocity.
+                # Two of the three sources are from this status, whose velocity may be outdated.
                 is_old = np.abs(np.array((reported, others[0])) - state.velocity).min(axis=0) > AGREEMENT
                 velocity = np.where(is_old, state.velocity, velocity)
             if is_doubted:
-                # Damping with a late velocity would drive the arm: the predicted velocity limits it.
+                # Damping with an outdated velocity would drive the arm. The predicted velocity therefore limits it.
                 size = np.minimum(np.abs(velocity), np.abs(state.velocity))
                 velocity = np.where(velocity * state.velocity > 0.0, np.sign(velocity) * size, 0.0)
         if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING) and not is_doubted:
@@ -259,10 +263,10 @@ class StateEstimator:
         return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))
 
     def forget_torque(self, state: EstimatorState) -> EstimatorState:
-        """Return the state after a command that was not sent: the torques in effect are unknown.
+        """Return the state after a command that was not sent, so that the torques in effect are unknown.
 
-        The velocity is then not compared with torques, and no bias is learned. Until the next status, the prediction is
-        that of no torque.
+        Until the next status, the prediction assumes zero torque. The velocity is not compared with torques, and no
+        bias is learned.
         """
         return replace(state, torque=self._zeros, tolerance=self._period * self._torque_tolerance)
 
@@ -297,7 +301,7 @@ class StateEstimator:
         return fault
 
     def _agrees(self, status: JointStatus, state: EstimatorState, now: float) -> bool:
-        """Return True if a status is valid and fresh relative to the accepted one, and moves as predicted."""
+        """Return True if a status is valid and fresh relative to the accepted one, and its velocity is as predicted."""
         accepted, elapsed = state.accepted, status.time - state.accepted_time
         is_fresh = elapsed > 0.0 and now - (status.time + accepted.offset) <= FRESH_FRACTION * self._limits.max_age
         if not is_fresh or check_status(status, accepted, now, self._limits) != Fault.NONE:
@@ -363,10 +367,10 @@ class StateEstimator:
         return np.clip(bias, -limit, limit)
 
     def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the effect of recent torques that the reported velocity lacks [rad/s], and its mask; both are (n,).
+        """Return the velocity change by recent torques that the reported velocity lacks (n,) [rad/s], and a mask (n,).
 
-        A wrong velocity lacks the effect of the torques both with and without the external ones; the smaller effect
-        counts. If only one of the two effects is missing, or they differ in sign, the external torque is wrong.
+        The change is computed with and without the external torques, and the smaller result is used. The mask is true
+        if both results have the same sign. Otherwise, not the velocity but the external torque is wrong.
         """
         missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
         is_missing = np.prod(np.sign(missing), axis=1) > 0.0
@@ -407,12 +411,12 @@ class StateEstimator:
     def _finish(
         self, state: EstimatorState, before: EstimatorState, fault: Fault, now: float, age: float | None = None
     ) -> Estimate:
-        """Return the result of a check; `age` [s] is that of the status accepted at this check, or None."""
+        """Return the result of a check; `age` [s] is that of the status accepted at this check, None without one."""
         is_new = age is not None
         if age is None:
             accepted_at = before.accepted_time + before.accepted_offset
             age = max(now - accepted_at, 0.0) if np.isfinite(accepted_at) else np.inf
-        # If a robot returns after a timeout with its clock set back, its controller has restarted.
+        # If the robot's clock is set back after a timeout, its controller has restarted.
         has_restarted = fault == Fault.OUT_OF_ORDER and before.fault == Fault.STALE
         if age > MAX_PREDICTION_TIME or has_restarted or not np.isfinite(state.velocity).all():
             state = replace(state, velocity=self._zeros)

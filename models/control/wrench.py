@@ -1,4 +1,4 @@
-"""Wrenches in contact: measurement on a tool, and bounds of pushes, impacts and the energy of a controller's spring.
+"""Wrenches in contact: measurement at a tool, and bounds of pushes, impacts and the energy of a controller's spring.
 
 The six limits of a bound are [translational, rotational], along and about the controller's axes. See
 `docs/concepts/forces.md`.
@@ -18,12 +18,12 @@ from guiderail.models.common.errors import InputError, brief
 POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry Rx] in a wrench, and vice versa
 
 MAX_WRENCH_SIZE = 8
-"""Size of a bound as a signal: six along and about the axes, and the norms of force and torque."""
+"""Size of a bound as a signal: six limits along and about the axes, and the limits of the norms of force and torque."""
 
 
-@dataclass(frozen=True, eq=False)  # arrays do not compare to one truth value
+@dataclass(frozen=True, eq=False)  # no `==`, because the comparison of arrays is an array
 class WrenchBound:
-    """Largest wrench of an impedance controller, per axis and as norms, and the contact stiffness that it assumes.
+    """Limits of an impedance controller's wrench, per axis and as norms, and the assumed contact stiffness.
 
     Raises:
         InputError: If `axes` are not six numbers, or a number is negative or NaN.
@@ -32,8 +32,8 @@ class WrenchBound:
     axes: np.ndarray  # limits (6,) of [fx fy fz tx ty tz] along and about the axes [N, Nm], not negative
     force: float  # limit of the norm of the force [N], not negative
     torque: float  # limit of the norm of the torque [Nm], not negative
-    # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m], not
-    # negative. 0: the approach speed is not limited.
+    # Largest stiffness of workpiece, grasp and fixture in series for which impacts are inside the bound [N/m], not
+    # negative. With 0, the approach speed is not limited.
     contact_stiffness: float = 0.0
 
     def __post_init__(self) -> None:
@@ -46,21 +46,21 @@ class WrenchBound:
 
     @property
     def numbers(self) -> np.ndarray:
-        """The bound as a signal, (8,): `axes`, `force` and `torque`."""
+        """Bound as a signal (8,): `axes`, `force` and `torque`."""
         return np.array([*self.axes, self.force, self.torque])
 
     @cached_property
     def in_pose_order(self) -> WrenchBound:
-        """The bound with its axes in the order of a pose, [x y z Rz Ry Rx]."""
+        """Bound with its axes in the order of a pose, [x y z Rz Ry Rx]."""
         return replace(self, axes=self.axes[POSE_ORDER])
 
     def lowered_to(self, max_wrench: np.ndarray) -> WrenchBound:
-        """Return the element-wise minimum of this bound and another (8,), whose negative or NaN numbers count as 0.
+        """Return the element-wise minimum of this bound and `max_wrench` (8,), with 0 for negative and NaN entries.
 
-        A bound that arrives at run time can therefore only lower the configured one.
+        A bound that arrives at run time can therefore only lower the configured bound.
 
         Raises:
-            InputError: If the other bound is not eight numbers.
+            InputError: If `max_wrench` is not eight numbers.
         """
         return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
 
@@ -76,9 +76,9 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
 
 
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:
-    """Move a bound straight towards the bound `target`, so that no number changes by more than `max_change`.
+    """Move a bound on a straight line towards the bound `target`, by at most `max_change` in each number.
 
-    If the limits of the norms are at least the limits per axis at both ends, they are so on the whole line. Both bounds
+    If the limits of the norms are at least the limits per axis at both ends, this holds on the whole line. Both bounds
     are finite signals (8,), and `max_change` (8,) is positive.
 
     Raises:
@@ -104,12 +104,12 @@ def clip_wrench(wrench: np.ndarray, axes: np.ndarray, force: float, torque: floa
 def slow_down(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, impedance: float, force: float
 ) -> np.ndarray:
-    """Limit a spring's force (3,) to F − (c − d) |v|, so that it accelerates the mass to at most F / c.
+    """Limit a spring's force (3,) [N] to F − (c − d) |v|, so that it accelerates the mass to a speed of at most F / c.
 
-    d = vᵀ D v / |v|² is the damping in the direction of motion; c = 2 √(k m) is the `approach_impedance`. Only a force
-    that does positive work is reduced, so that no energy is added: on the way to its rest position, the spring returns
-    at most the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s],
-    `impedance` is c [N s/m], and `force` is F [N].
+    d = vᵀ D v / |v|² is the damping in the direction of motion, and c = 2 √(k m) is the `approach_impedance`. Only a
+    force that does positive work is reduced. No energy is therefore added: while it relaxes, the spring returns at most
+    the energy that it stored. `damping` is the damper's force D v (3,) [N], `velocity` is v (3,) [m/s], `impedance` is
+    c [N s/m], and `force` is F [N].
     """
     speed = norm(velocity)
     if speed == 0.0 or spring.dot(velocity) <= 0.0:
@@ -122,8 +122,8 @@ def slow_down(
 def approach_impedance(contact_stiffness: float, mass: float) -> float:
     """Return c = 2 √(k m) [N s/m], the critical damping of a mass m [kg] in contact with a stiffness k [N/m].
 
-    A mass that is pushed with F − c |v| reaches at most the speed F / c, and presses a stiffness of at most k with at
-    most F, because it does not overshoot. With c = √(k m), half as much, it would press with 1.3 F.
+    A mass that is pushed with F − c |v| reaches at most the speed F / c. In contact with a stiffness of at most k, it
+    presses with at most F, because it does not overshoot. With half of this c, it would press with 1.3 F.
     """
     return 2.0 * math.sqrt(contact_stiffness * mass)
 
@@ -131,10 +131,10 @@ def approach_impedance(contact_stiffness: float, mass: float) -> float:
 def bounded_wrench(
     spring: np.ndarray, damping: np.ndarray, velocity: np.ndarray, mass: float, bound: WrenchBound
 ) -> np.ndarray:
-    """Compute s − β d (6,) with the clipped spring s and the largest share β ≤ 1 of the damper d in the bound.
+    """Compute s − β d (6,) of a clipped spring s and a damper d, with the largest β ≤ 1 for which it is in the bound.
 
-    The clipped spring has a potential, and the damper only dissipates at every share: for a constant bound and rest
-    position the law is passive.
+    The clipped spring has a potential, and the damper dissipates for every β. For a constant bound and a constant rest
+    position, the law is therefore passive.
 
     Args:
         spring: Wrench of the spring (6,) [N, Nm].
@@ -150,7 +150,7 @@ def bounded_wrench(
 
 
 def damping_share(spring: np.ndarray, damping: np.ndarray, bound: WrenchBound) -> float:
-    """Return the largest β from 0 to 1 with s − β d inside the bound, for wrenches s (6,) inside it and d (6,)."""
+    """Return the largest β in [0, 1] with s − β d inside the bound, for a spring s (6,) inside and a damper d (6,)."""
     wrench = spring - damping
     f, t = wrench[:3], wrench[3:]
     if (np.abs(wrench) <= bound.axes).all() and f.dot(f) <= bound.force**2 and t.dot(t) <= bound.torque**2:
@@ -177,11 +177,11 @@ def governed_error(
     step: float,
     bound: WrenchBound,
 ) -> np.ndarray:
-    """Limit the pose error (6,) of a spring and damper for one step of a simulation, so that their force is in a bound.
+    """Limit the pose error (6,) of a spring and damper for one simulation step, so that their force is in the bound.
 
     The plant integrates spring and damper implicitly: their force in the step is K e − (K h + D) v₁ with the velocity
-    v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, this force is inside the bound if K e is inside the bound
-    reduced by (K h + D) |v₀|.
+    v₁ after the step. If |v₁| ≤ |v₀|, as in an impact, the force is inside the bound, provided that K e is inside the
+    bound reduced by (K h + D) |v₀|.
 
     Args:
         stiffness: Stiffness (6,) K of each coordinate [N/m, Nm/rad], positive.
@@ -209,7 +209,7 @@ def governed_error(
 def center_of_pressure(wrench: np.ndarray, min_force: float) -> np.ndarray:
     """Compute the center of pressure (−τ_y, τ_x) / f_z (2,) [m] of a wrench about the tool center (6,), force first.
 
-    Below the normal force `min_force` [N], positive, the result is zero, because the quotient is not reliable.
+    If the normal force is below `min_force` [N], positive, the result is zero, because the quotient is not reliable.
     """
     if not wrench[2] >= min_force:  # for NaN too
         return np.zeros(2)
@@ -221,8 +221,8 @@ def external_wrench(
 ) -> np.ndarray:
     """Compute the external wrench on a rigid tool, F_external = M A + bias(V) − M [0, g] − F_reaction.
 
-    Spatial vectors are [rotational, translational] (6,), about one point P of the tool, and all expressed in
-    the same arbitrary frame.
+    Spatial vectors are [rotational, translational] (6,), about one point P of the tool. All quantities are expressed in
+    one arbitrary frame.
 
     Args:
         F_reaction: Wrench of the wrist on the tool (6,).
@@ -243,10 +243,10 @@ def external_wrench(
 
 
 def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return copies of stiffness and damping (6,) of a pose's coordinates; `owner` is a name for messages.
+    """Check stiffness and damping (6,) of a pose's coordinates, and return copies; `owner` is a name for messages.
 
     Raises:
-        InputError: If a shape is wrong, a stiffness is not positive, a damping is negative, or one is not finite.
+        InputError: If a shape is wrong, a stiffness is not positive, a damping is negative, or a number is not finite.
     """
     K, D = as_numbers(stiffness, "stiffness"), as_numbers(damping, "damping")
     if not K.shape == D.shape == (6,) or not ((K > 0.0) & (D >= 0.0) & np.isfinite(K) & np.isfinite(D)).all():
@@ -255,12 +255,12 @@ def check_spring_damper(stiffness: np.ndarray, damping: np.ndarray, owner: str) 
 
 
 def spring_energy(stiffness: np.ndarray, limits: np.ndarray, error: np.ndarray) -> float:
-    """Return the energy [J] of springs K e that are clipped at a limit F each, the sum of Huber's functions.
+    """Return the energy [J] of springs K e with their forces clipped at limits F, the sum of Huber's functions.
 
-    The energy of a spring is ½ K e² while K |e| ≤ F, and F |e| − F² / (2 K) beyond, with positive stiffness K (n,)
-    [N/m, Nm/rad], limits F (n,) [N, Nm], not negative, and error e (n,) [m, rad].
+    The energy of a spring is ½ K e² if K |e| ≤ F, and F |e| − F² / (2 K) otherwise. K (n,) is the positive stiffness
+    [N/m, Nm/rad], F (n,) are the limits [N, Nm], not negative, and e (n,) is the error [m, rad].
     """
-    # Plain numbers, as NumPy's overhead would exceed the computation, which runs several times per plant step.
+    # Python numbers: NumPy's overhead would exceed the computation, which runs several times per plant step.
     energy = 0.0
     for K, F, e in zip(stiffness.tolist(), limits.tolist(), error.tolist(), strict=True):
         distance = abs(e)
@@ -277,10 +277,10 @@ def admissible_change(
 ) -> tuple[float, float]:
     """Return a share from 0 to 1 of a change of reference and limits, and the energy of the springs after it [J].
 
-    The energy after the change is at most `energy`, if the energy before it is. The share is 1 if the whole change is
-    admissible; otherwise it is found by bisection. With constant limits the energy is convex in the share, and the
-    result is the largest admissible share. With increasing limits it may be a smaller one. No limit may decrease: the
-    caller applies a lower limit at once, which removes energy.
+    If the energy before the change is at most `energy`, so is the energy after it. The share is 1 if the whole change
+    is admissible, and otherwise the result of a bisection. With constant limits the energy is convex in the share, and
+    the result is the largest admissible share. With increasing limits, the result may be smaller. No limit may
+    decrease: the caller applies a lower limit at once, which removes energy.
 
     Args:
         stiffness: Stiffness (n,) [N/m, Nm/rad], positive.

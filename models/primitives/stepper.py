@@ -173,8 +173,8 @@ class StateProgress:
     """
 
     tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
-    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. The option `max_lag` of
-    # an environment is a time in seconds.
+    # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (The option `max_lag`
+    # of an environment is a time in seconds.)
     max_lag: int
 
     def __post_init__(self) -> None:
