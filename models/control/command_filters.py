@@ -36,7 +36,7 @@ class _LastCommand:
     """Law whose state is the last command."""
 
     def start(self, pose: np.ndarray) -> np.ndarray:
-        """Return the pose (O,) at which a motion begins."""
+        """Return the initial state, a copy of the pose (O,) at which a motion begins."""
         return pose.copy()
 
 

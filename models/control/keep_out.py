@@ -10,7 +10,7 @@ from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 
 class KeepOut:
-    """Axis-aligned boxes that must not be entered and linear constraints, both with a margin.
+    """Linear constraints, and axis-aligned boxes that must not be entered, both with a margin.
 
     A desired position is projected onto the constraints, and out of a box through the nearest face. The motion towards
     the projected position ends before a box, so that a large step cannot jump through a wall.
@@ -115,7 +115,7 @@ class KeepOut:
         return np.array(point), was_in_box
 
     def _free_fraction(self, start: list[float], end: list[float]) -> float:
-        """Return the fraction of the line from `start` (O,) to `end` (O,) that lies before a box."""
+        """Return the fraction of the line from `start` (O,) to `end` (O,) before the first box."""
         free = 1.0
         for lower, upper in self._boxes:
             # If the start is closer to a box than the margin, or inside of it (after a push), the margin is reduced to

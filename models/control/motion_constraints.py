@@ -66,7 +66,7 @@ class MotionConstraints:
 
     def __post_init__(self) -> None:
         if self.linear.num_steps is not None:
-            raise InputError("shapes, speed and acceleration need linear constraints that do not change from step to step")
+            raise InputError("shapes, speed and acceleration need linear constraints that do not change between steps")
         if any(shape.num_dims > self.num_outputs for shape in (*self.outside, *self.inside)):
             raise InputError(f"a shape has more dimensions than a command has outputs, {self.num_outputs}")
         for name in ("max_speed", "max_acceleration"):

@@ -5,8 +5,8 @@ subgradient: d(y) ≥ d(p) + nᵀ(y − p) for every y. Two statements follow, h
 
 - Outside: d(y) ≥ 0 everywhere in the half-space nᵀ(y − p) ≥ −d(p). If p is outside the set, the half-space contains p,
   and therefore the straight line from p to every other point of the half-space.
-- The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the distance of a command is at least the
-  distance by the linear constraint. For a sphere with its center r away from p, the error is at most ‖y − p‖² / (2 r).
+- The linearization error e(y) = d(y) − d(p) − nᵀ(y − p) is never negative: the true distance of a command is at least
+  its linearization. For a sphere whose center is at the distance r from p, the error is at most ‖y − p‖² / (2 r).
 """
 
 from __future__ import annotations

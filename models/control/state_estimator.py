@@ -20,11 +20,8 @@ from guiderail.models.control.joint_status import (
 )
 from guiderail.models.control.message_sequence import RESOLUTION
 
-ACCEPTABLE_FAULTS = (
-    Fault.NONE,
-    Fault.DEADLINE_MISSED,
-    Fault.SECOND_COMMANDER,
-)  # faults with which a status is accepted
+# Faults with which a status is accepted.
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)
 # Faults after which the message is dropped, and the next message is compared with the last readable status. After any
 # other fault, statuses are in doubt until all have been valid for the settling time. A status in doubt is only accepted
 # if it agrees with the prediction.

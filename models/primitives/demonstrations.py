@@ -286,11 +286,6 @@ class DemonstratedBounds:
     upper: np.ndarray  # upper bounds (K, O), inf for an unbounded output
     max_rates: np.ndarray  # largest demonstrated rate of each output (O,) [unit of the output/s]
 
-    def contains(self, outputs: np.ndarray) -> np.ndarray:
-        """Return a mask (N,), true where a sample is within the bounds; `outputs` (N, O) cover the whole motion."""
-        phase = phases_of_steps(self.phases, len(outputs))
-        return np.all((outputs >= self.lower[phase]) & (outputs <= self.upper[phase]), axis=1)
-
 
 def compute_bounds(
     demonstrations: Demonstrations,

@@ -12,9 +12,9 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 MAX_DEVIATION = 10.0
 """Largest accepted RMS distance of a motion without actions from its demonstrations, in their standard deviations."""
 MAX_MISS = 0.1
-"""RMS distance relative to an output's range that is accepted for any deviation, as standard deviations may be tiny."""
+"""RMS distance relative to an output's range that is always accepted, because standard deviations may be tiny."""
 MAX_OUTSIDE = 1.0
-"""Constraint violation by a reference that is accepted for any standard deviation [unit of the output]."""
+"""Violation of a constraint by a reference that is always accepted [unit of the output]."""
 MAX_RANGES = 30.0
 """As `MAX_OUTSIDE`, relative to the largest range of an output; a wrong unit changes this ratio by factors of 1000."""
 _EVALUATED = 16  # number of steps at which the deviation is measured

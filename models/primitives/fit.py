@@ -47,11 +47,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """Selected mixture, kernel and regularization.
-
-    The regularization is the strongest one within a standard error of the best error, and the kernel is the widest one
-    with this regularization.
-    """
+    """Mixture, kernel and regularization that `fit` selected."""
 
     reference: ReferenceTrajectory  # reference of all demonstrations
     components: int  # number of components C of its mixture
@@ -61,7 +57,7 @@ class Selection:
     beta: float
     share: float  # share of the steps at which the motion without actions is within one standard deviation of the mean
     criteria: dict[int, float]  # Bayesian information criterion by number of components
-    candidates: tuple[Candidate, ...]  # all candidates
+    candidates: tuple[Candidate, ...]  # all compared candidates
     why: str  # reason for the selection, in sentences
 
     @property

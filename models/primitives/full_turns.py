@@ -69,7 +69,7 @@ def continued_angles(angles: np.ndarray, near: np.ndarray | None) -> np.ndarray:
 
 
 def continued_vectors(vectors: np.ndarray, near: np.ndarray | None) -> np.ndarray:
-    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to the last one, first `near`."""
+    """Replace each rotation vector (N, 3) by the equivalent r + 2πk r/‖r‖ nearest to the last, at first to `near`."""
     vectors = np.array(vectors)
     last = np.zeros(3) if near is None else near
     for i, r in enumerate(vectors):

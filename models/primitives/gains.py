@@ -117,7 +117,7 @@ def residual_gains(
     """Compute the displacement (O,) of a residual command by an action of one, equal for all outputs of a group.
 
     The displacement [unit of the output] is √3 κ times the RMS of the demonstrations' standard deviations over the
-    motion and the group. A null-space action of one causes the same displacement on average, but a displacement that
+    motion and the group. A null-space action of one causes the same displacement on average, but its displacement
     depends on time and direction.
 
     Args:

@@ -164,9 +164,9 @@ class LcNsKmp:
         order = np.argsort(at, kind="stable")
         for rows in np.split(order, np.flatnonzero(np.diff(at[order])) + 1) if len(x) else ():
             factor = self._factor(int(at[rows[0]]))
-            some = x if len(rows) == len(x) else x[rows]
-            violates = ~factor.find_slack(some)
-            outputs[slice(None) if some is x else rows] = some @ factor.output_map.T + factor.output_offset
+            batch = x if len(rows) == len(x) else x[rows]
+            violates = ~factor.find_slack(batch)
+            outputs[slice(None) if batch is x else rows] = batch @ factor.output_map.T + factor.output_offset
             for row in rows[violates]:
                 try:
                     outputs[row] = self._finish(factor, x[row]).output
@@ -222,8 +222,8 @@ class LcNsKmp:
             raise InputError(f"inputs must be of shape (H+1,) or (H+1, I), not {inputs.shape}")
         past = inputs[:0] if history_inputs is None else as_numbers(history_inputs, "history_inputs")
         window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
-        if past.shape != (self.history, *inputs.shape[1:]):
-            raise InputError(f"history_inputs must be {self.history} inputs of a shape like inputs, not {past.shape}")
+        if past.shape != (shape := (self.history, *inputs.shape[1:])):
+            raise InputError(f"history_inputs must be of shape {shape}, not {past.shape}")
         if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
             raise InputError("inputs, means and covariances must be finite")
         features = window_features(self.kernel, past, inputs, self._history_noise)

@@ -241,7 +241,7 @@ def test_predict_at_refuses_invalid_arguments():
     ):
         with pytest.raises(InputError, match=names):
             p.predict_at(inputs, m, s)
-    with pytest.raises(InputError, match="history_inputs must be 0"):
+    with pytest.raises(InputError, match="history_inputs must be of shape"):
         p.predict_at(t, means, covariances, history_inputs=np.zeros(1))
     stepwise = primitive(LinearConstraints.box(np.full((30, 2), -1.0), np.full((30, 2), 1.0)))
     with pytest.raises(InputError, match="need a clock"):
