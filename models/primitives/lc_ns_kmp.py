@@ -36,9 +36,8 @@ if TYPE_CHECKING:
 class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
-    The kernel's input is the reference's time, so that every matrix depends on the step alone. Each step is factored at
-    its first use. A prediction then takes two small matrix products; a QP is solved only if the result violates a
-    constraint.
+    The kernel's input is the reference's time, so every matrix depends on the step alone. Each step is factored at its
+    first use. A prediction takes two small matrix products; a QP is solved only if the result violates a constraint.
 
     Args:
         reference: Means and covariances of the demonstrations, N steps of O outputs.

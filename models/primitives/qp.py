@@ -10,6 +10,7 @@ long). It does not retry with another tolerance or a margin, and it does not che
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 
 import numpy as np
@@ -27,7 +28,7 @@ Solver = Callable[[np.ndarray, np.ndarray, np.ndarray], tuple[np.ndarray, np.nda
 
 
 class UnsolvableError(RuntimeError):
-    """No solution within tolerance is found; the caller must repeat its last safe command."""
+    """Failure to find a solution within tolerance; the caller must repeat its last safe command."""
 
 
 def _daqp(rows: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -126,13 +127,13 @@ def solve_least_norm(
     # The problem is homogeneous: at unit scale the solver's absolute tolerance is relative to the correction.
     scale = max(lower.max(), -upper.min())
     lower, upper = lower / scale, upper / scale
-    for relaxation in RELAXATIONS:
-        try:
+    *first, last = RELAXATIONS
+    for relaxation in first:
+        with suppress(UnsolvableError):
             v, multipliers = solver(rows, lower - relaxation, upper + relaxation)
             return scale * v, scale * multipliers
-        except UnsolvableError as error:
-            failure = error
-    raise failure
+    v, multipliers = solver(rows, lower - last, upper + last)
+    return scale * v, scale * multipliers
 
 
 _identity = cache(np.eye)  # shared: building one for each QP costs as much as solving it

@@ -27,8 +27,8 @@ class Command:
         violation: Largest violation of the constraints, max(c − G y), or of the motion's constraints if there is a
             motion filter; negative if all constraints are slack, −inf without constraints.
         is_fallback: True if no window within the constraints was found, or if the motion filter had to brake, or if the
-            first command exceeds the filter's largest acceleration. Without a window, the command is the point nearest
-            to the last command within the constraints of the step.
+            first command exceeds the filter's largest acceleration. Without a window, the primitive's output is the
+            point nearest to the last command within the constraints of the step.
     """
 
     output: np.ndarray
