@@ -1,4 +1,4 @@
-"""Chunk cloning: an ensemble learns to predict the next commanded poses from an observation.
+"""Chunk cloning: supervised training of an ensemble that predicts the next commanded poses from an observation.
 
 As in action chunking with transformers (ACT), the targets are chunks of future commands.
 """
@@ -10,25 +10,26 @@ import gymnasium
 import numpy as np
 import torch
 from scipy.linalg import block_diag
+from stable_baselines3.common.torch_layers import create_mlp
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
-from guiderail.tools.learning.cloning import BcLearner, perceptron
+from guiderail.tools.learning.cloning import BcLearner
 from guiderail.tools.learning.config import ChunkConfig
 from guiderail.tools.learning.learner import register_learner
 
-MIN_SCALE = 1e-6  # smallest scale of an output, because the standard deviation of a constant output is zero
+MIN_SCALE = 1e-6  # minimum scale of an output; the standard deviation of a constant output is zero
 
 
 @register_learner("chunk")
 class ChunkLearner(BcLearner):
     """Learner of a base policy that maps an observation to the next K commanded poses (mean squared error, Adam).
 
-    Chunks are those of Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", RSS 2023. The
-    policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations. The spread of their
-    outputs is the uncertainty of the chunk (Lakshminarayanan et al., 2017). The networks are exported as one network
-    with block-diagonal layers. The learner does not act: its action is always zero.
+    Action chunks are from Zhao et al., "Learning Fine-Grained Bimanual Manipulation with Low-Cost Hardware", RSS 2023.
+    The policy is an ensemble of E networks, each trained on a bootstrap sample of the demonstrations. The spread of
+    their outputs is the uncertainty of the chunk (Lakshminarayanan et al., 2017). The networks are exported as one
+    network with block-diagonal layers. The learner's own action is always zero.
     """
 
     Config = ChunkConfig
@@ -49,26 +50,26 @@ class ChunkLearner(BcLearner):
         self._env = cast(Any, env.unwrapped)
         dims = self._env.task.declaration.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
-        self._seen: list[np.ndarray] = []  # observations of the episode
-        self._starts: list[int] = []  # control steps of these observations
-        self._groups: list[int] = []  # number of the demonstration of each observation
+        self._episode_observations: list[np.ndarray] = []
+        self._starts: list[int] = []  # control step of each observation of the episode
+        self._groups: list[int] = []  # episode of each stored observation
         self._step, self._num_outputs = 0, 0
         self._center, self._scale = np.zeros(1), np.ones(1)
         self.network = torch.nn.Sequential()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return zero: a chunk is a reference and not an action."""
+        """Return zero, because the chunks are references and not actions."""
         return np.zeros(self._space.shape or (), np.float32)
 
     def on_episode_start(self) -> None:
         """Count the episode and clear its observations."""
         super().on_episode_start()
-        self._seen, self._starts, self._step = [], [], 0
+        self._episode_observations, self._starts, self._step = [], [], 0
 
     def on_step(self, transition: Transition) -> None:
         """Store the observation if the episode is a demonstration."""
         if self.episodes <= self.config.demonstration_episodes:
-            self._seen.append(np.asarray(transition.observation, np.float32))
+            self._episode_observations.append(np.asarray(transition.observation, np.float32))
             self._starts.append(self._step)
         self._step = len(self._env.trace)
 
@@ -77,23 +78,23 @@ class ChunkLearner(BcLearner):
         if self.episodes <= self.config.demonstration_episodes:
             commanded = self._env.trace.commanded
             self._num_outputs = commanded.shape[1]
-            at = np.array(self._starts)[:, None] + np.arange(self.config.chunk_steps)
-            self._add(np.array(self._seen), commanded[np.minimum(at, len(commanded) - 1)])
+            steps = np.array(self._starts)[:, None] + np.arange(self.config.chunk_steps)
+            self._add(np.array(self._episode_observations), commanded[np.minimum(steps, len(commanded) - 1)])
         return super().on_episode_end(row)
 
     def _add(self, observations: np.ndarray, chunks: np.ndarray) -> None:
         """Store observations (n, size) and chunks (n, K, O) with symmetric copies.
 
-        A symmetry transforms the outputs that actions move, `_dims`, as it transforms actions.
+        A symmetry acts on the outputs that actions move, `_dims`, as on the actions.
         """
         symmetries = [(np.eye(observations.shape[1]), None)]
         if self._symmetry is not None:
             symmetries += [*zip(self._symmetry.observations, self._symmetry.actions, strict=True)]
-        for observed, moved in symmetries:
+        for observation_matrix, action_matrix in symmetries:
             copies = chunks.copy()
-            if moved is not None:
-                copies[:, :, self._dims] = chunks[:, :, self._dims] @ moved.T
-            self._observations.extend((observations @ observed.T).astype(np.float32))
+            if action_matrix is not None:
+                copies[:, :, self._dims] = chunks[:, :, self._dims] @ action_matrix.T
+            self._observations.extend((observations @ observation_matrix.T).astype(np.float32))
             self._actions.extend(copies.reshape(len(chunks), -1))
             self._groups.extend([self.episodes] * len(chunks))
 
@@ -104,8 +105,8 @@ class ChunkLearner(BcLearner):
         targets = torch.from_numpy((chunks - self._center) / self._scale).float()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self._seed)
-            sizes = [observations.shape[1], *self.config.net_arch, chunks.shape[1]]
-            members = [perceptron(sizes) for _ in range(self.config.members)]
+            sizes = observations.shape[1], chunks.shape[1], [*self.config.net_arch]
+            members = [torch.nn.Sequential(*create_mlp(*sizes)) for _ in range(self.config.members)]
         losses = []
         for index, network in enumerate(members):
             random = np.random.default_rng([self._seed, index])
@@ -114,7 +115,7 @@ class ChunkLearner(BcLearner):
             optimizer = torch.optim.Adam(network.parameters(), lr=self.config.learning_rate)
             for _ in range(self.config.gradient_steps):
                 batch = rows[random.integers(len(rows), size=self.config.batch_size)]
-                # Without noise the network copies an observed command, and errors accumulate (Ke et al., 2021).
+                # Without noise, the network copies an observed command, and errors accumulate (Ke et al., 2021).
                 noise = torch.randn(inputs[batch].shape, generator=generator)
                 noisy = inputs[batch] + self.config.observation_noise * noise
                 loss = torch.nn.functional.mse_loss(network(noisy), targets[batch])
@@ -125,11 +126,11 @@ class ChunkLearner(BcLearner):
         self.network, self._loss = torch.nn.Sequential(*members), float(np.mean(losses))
 
     def _training_rows(self, random: np.random.Generator) -> np.ndarray:
-        """Return the indices of the samples in a bootstrap sample of the demonstrations, for training one network."""
-        # Not `self.episodes`, which is larger if a run is resumed, and trains again, after further episodes.
+        """Return the row indices of a bootstrap sample of the demonstrations, for training one network."""
+        # A run that is resumed after further episodes trains again: `self.episodes` is then larger than this number.
         groups, number = np.array(self._groups), self.config.demonstration_episodes
-        drawn = random.integers(1, number + 1, size=number)
-        return np.concatenate([np.flatnonzero(groups == one) for one in drawn])
+        sampled = random.integers(1, number + 1, size=number)
+        return np.concatenate([np.flatnonzero(groups == demonstration) for demonstration in sampled])
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
         """Return the base policy: the ensemble as one network, whose output is limited to the demonstrated range.
@@ -139,7 +140,7 @@ class ChunkLearner(BcLearner):
         """
         self._check_trained()
         members: list[Any] = [
-            [one for one in member.children() if hasattr(one, "weight")] for member in self.network.children()
+            [layer for layer in member.children() if hasattr(layer, "weight")] for member in self.network.children()
         ]
         layers = []
         for depth in range(len(members[0])):
@@ -171,15 +172,13 @@ class ChunkLearner(BcLearner):
         return len(self.network) > 0
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of a run depends on: the demonstrations."""
+        """Return the state that a resumed run continues from: the demonstrations."""
         arrays = {"observations": np.array(self._observations), "actions": np.array(self._actions)}
-        return arrays | {"groups": np.array(self._groups)}, {
-            "episodes": self.episodes,
-            "num_outputs": self._num_outputs,
-        }
+        values = {"episodes": self.episodes, "num_outputs": self._num_outputs}
+        return arrays | {"groups": np.array(self._groups)}, values
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; raise KeyError if it does not fit."""
+        """Restore a result of `state`; raise KeyError if it does not fit this learner."""
         self._observations, self._actions = [*arrays["observations"]], [*arrays["actions"]]
         self._groups = arrays["groups"].tolist()
         self.episodes, self._num_outputs = values["episodes"], values["num_outputs"]

@@ -1,12 +1,13 @@
-"""Behavior cloning: a policy that is regressed on the actions of a demonstrator, without reinforcement learning."""
+"""Behavior cloning: supervised regression of a policy on a demonstrator's actions, without reinforcement learning."""
 
 from collections.abc import Mapping
-from itertools import pairwise
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
+from gymnasium.spaces.utils import flatdim
+from stable_baselines3.common.torch_layers import create_mlp
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
@@ -21,9 +22,9 @@ from guiderail.tools.learning.sb3 import load_module
 
 @register_learner("bc")
 class BcLearner(Learner):
-    """Learner of behavior cloning (Pomerleau, 1988), with the mean squared error to the demonstrator's actions.
+    """Behavior cloning (Pomerleau, 1988): minimizes the mean squared error to the demonstrator's actions.
 
-    The learner trains once, by Adam, after the last demonstration, and acts by the trained policy from then on.
+    The network is trained once, by Adam, after the last demonstration. The trained policy acts in all later episodes.
     """
 
     Config = BcConfig
@@ -41,10 +42,10 @@ class BcLearner(Learner):
         """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used."""
         self.config, self._space, self._seed = config, env.action_space, seed
         self._symmetry = symmetry if config.symmetry else None
-        sizes = [*(env.observation_space.shape or ()), *config.net_arch, *(env.action_space.shape or ())]
+        sizes = flatdim(env.observation_space), flatdim(env.action_space)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
-            self.network = perceptron(sizes)
+            self.network = torch.nn.Sequential(*create_mlp(*sizes, [*config.net_arch]))
         self.episodes = 0
         self._observations: list[np.ndarray] = []
         self._actions: list[np.ndarray] = []
@@ -62,7 +63,7 @@ class BcLearner(Learner):
         return np.clip(action, space.low, space.high)
 
     def on_step(self, transition: Transition) -> None:
-        """Store a transition of a demonstration, and its symmetric copies."""
+        """Store the transition, and its symmetric copies, if the episode is a demonstration."""
         if self.episodes > self.config.demonstration_episodes:
             return
         observation, action = (np.asarray(x, np.float32) for x in (transition.observation, transition.action))
@@ -97,7 +98,7 @@ class BcLearner(Learner):
         return {"train/loss": loss} if np.isfinite(loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the cloned policy; `description` holds further entries of the policy's description.
+        """Return the cloned policy; the entries of `description` are added to the policy's description.
 
         Raises:
             InputError: If there were fewer demonstrations than `demonstration_episodes`.
@@ -117,27 +118,18 @@ class BcLearner(Learner):
 
     def has_diverged(self) -> bool:
         """Return True if a parameter is NaN or infinite."""
-        return not all(bool(torch.isfinite(one).all()) for one in self.network.parameters())
+        return not all(bool(torch.isfinite(parameter).all()) for parameter in self.network.parameters())
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
+        """Return the state that a resumed run continues from: arrays by name, and JSON-serializable values."""
         arrays = {f"network/{name}": value.numpy() for name, value in self.network.state_dict().items()}
         if self._observations:
             arrays |= {"observations": np.array(self._observations), "actions": np.array(self._actions)}
         return arrays, {"episodes": self.episodes}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; raise KeyError or RuntimeError if it does not fit."""
+        """Restore a result of `state`; raise KeyError or RuntimeError if it does not fit this learner."""
         load_module(self.network, entries_of(arrays, "network"))
         self._observations = [*arrays.get("observations", ())]
         self._actions = [*arrays.get("actions", ())]
         self.episodes = values["episodes"]
-
-
-def perceptron(sizes: list[int]) -> torch.nn.Sequential:
-    """Return a multilayer perceptron: linear layers with ReLU activations between them.
-
-    The sizes are the numbers of inputs, of units of each hidden layer, and of outputs.
-    """
-    layers = [layer for into, out in pairwise(sizes) for layer in (torch.nn.Linear(into, out), torch.nn.ReLU())]
-    return torch.nn.Sequential(*layers[:-1])

@@ -20,13 +20,7 @@ from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.evaluation.rollout import check_seed
-from guiderail.tools.learning.learner import (
-    LEARNERS,
-    LearnerConfig,
-    NonNegative,
-    Positive,
-    reject_bool,
-)
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
 MAX_EPISODES = 10**9  # largest number of episodes of a run
@@ -35,7 +29,7 @@ MAX_EPISODES = 10**9  # largest number of episodes of a run
 def _check_ent_coef(ent_coef: str) -> str:
     initial = ent_coef.removeprefix("auto_")
     if ent_coef != "auto" and not 0 < float(initial) < math.inf:
-        raise ValueError("it is auto, auto_<initial value> or a positive number")
+        raise ValueError("it must be auto, auto_<initial value> or a positive number")
     return ent_coef
 
 
@@ -48,7 +42,7 @@ Factor = Annotated[float, Field(gt=0, le=1), BeforeValidator(reject_bool)]
 Noise = Annotated[float, Field(ge=0, le=10), BeforeValidator(reject_bool)]
 Rate = Annotated[float, Field(gt=0, allow_inf_nan=False), BeforeValidator(reject_bool)]
 EntCoef = Annotated[str, BeforeValidator(str), AfterValidator(_check_ent_coef)]
-# Absolute, so that a run can be resumed from another folder.
+# The path is made absolute, so that a run can be resumed from another working directory.
 Folder = Annotated[str, AfterValidator(lambda path: path and str(Path(path).resolve()))]
 NetArch = Annotated[
     tuple[NumUnits, ...],
@@ -68,24 +62,24 @@ class OffPolicyConfig(LearnerConfig):
     training_step: Literal["fast", "sb3"] = "fast"  # fast: equivalent to Stable-Baselines3's step, if available
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
-    gamma_per: Literal["control_step", "action"] = "control_step"  # time to which gamma applies
+    gamma_per: Literal["control_step", "action"] = "control_step"  # interval that gamma discounts
     tau: Factor = 0.02  # Polyak factor of the target critics per gradient step
     train_freq: Positive = 8  # transitions between two trainings
     gradient_steps: Positive = 24  # gradient steps per training
     batch_size: BatchSize = 64  # transitions
     n_steps: Annotated[Positive, Field(le=1000)] = 1  # transitions of an n-step return
     buffer_size: Positive = 1_000_000  # transitions in the replay buffer
-    learning_starts: Positive = 100  # transitions before the first training; the learner acts at random until then
+    learning_starts: Positive = 100  # transitions before the first training; until then, actions are random
     ent_coef: EntCoef = "auto_0.1"  # "auto", "auto_<initial value>", or a number
     net_arch: NetArch = (256, 256)  # units of the hidden layers
-    constant_episodes: NonNegative = 0  # episodes after the demonstrated ones that each repeat one random action
+    constant_episodes: NonNegative = 0  # episodes after the demonstrations, each of which repeats one random action
     ez_greedy: Fraction = 0.0  # probability that an exploring action starts a temporally extended action (εz-greedy)
     ez_greedy_longest: Positive = 8  # maximum number of actions that an extended action lasts
     ez_greedy_until: NonNegative = 0  # greedy successes in a row that pause εz-greedy until a greedy failure; 0: never
     greedy_episode_fraction: Fraction = 0.0  # fraction of the episodes, evenly spread, that do not explore
     privileged_critic: bool = False  # critics also observe hidden values and the exact wrench; the policy never does
     layer_norm: bool = False  # normalize hidden layers before their activation
-    selection_window: NonNegative = 0  # limit of the greedy successes counted before and after an actor; 0: last actor
+    selection_window: NonNegative = 0  # maximum greedy successes counted before and after an actor; 0: last actor
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
@@ -93,7 +87,7 @@ class OffPolicyConfig(LearnerConfig):
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
-    init_from: Folder = ""  # run whose networks, optimizers, replay buffer and number of episodes learning starts from
+    init_from: Folder = ""  # run whose networks, optimizers, replay buffer and episode count training starts from
 
     def __post_init__(self) -> None:
         if self.demonstration_fraction and not self.demonstration_episodes:
@@ -225,15 +219,15 @@ class DistillationConfig(ChunkConfig):
 
 _TABLE_4_1 = OffPolicyConfig(
     learning_rate=1e-3, gamma=0.99, gradient_steps=8, batch_size=256, ent_coef="auto", actor_ema=0.0
-)  # table 4.1 of the thesis states no batch and buffer size: they are from table 3.2
+)  # table 4.1 of the thesis has no batch size and no buffer size; both are from table 3.2
 _TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
 _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
-# docs/experiments.md has the measurements that each preset results from.
+# The measurements behind each preset are in docs/experiments.md.
 PRESETS = {
-    # Contact makes learning oscillate. Small batches, a moderate learning rate and normalized layers reduce that,
-    # greedy episodes show the critics the returns of the mean action, and checkpoint selection takes an actor whose
-    # greedy episodes succeed many times in a row.
+    # Contact makes learning oscillate. Small batches, a moderate learning rate and layer normalization reduce the
+    # oscillation. Greedy episodes train the critics on returns of the mean action. Checkpoint selection exports an actor
+    # from the middle of a long streak of greedy successes.
     "tqc_contact": OffPolicyConfig(
         learning_rate=3e-4,
         train_freq=4,
@@ -247,7 +241,8 @@ PRESETS = {
         actor_ema=0.003,
     ),
     # The force cost is learned long before a success, so policies avoid contact. A large entropy coefficient and
-    # temporally extended actions restore contact. Extended actions push hardest: they pause if greedy episodes succeed.
+    # temporally extended actions restore contact. Extended actions cause the largest forces, so they pause while greedy
+    # episodes succeed.
     "sac_gridclamp": OffPolicyConfig(
         algorithm="sac",
         learning_rate=7e-4,
@@ -285,12 +280,12 @@ def action_gamma(config: OffPolicyConfig | OnPolicyConfig, action_repeat: int) -
 def resolve_preset(
     preset: str | None, algorithm: str | None = None, settings: Mapping[str, Any] | None = None
 ) -> LearnerConfig:
-    """Return the configuration of a learner: a preset in which single settings are replaced.
+    """Return the configuration of a learner: a preset with some settings replaced.
 
     Args:
         preset: Name of a preset; `default_preset` by default.
         algorithm: Name of the learner; the preset's by default.
-        settings: Values that replace the preset's, numbers or text by name.
+        settings: Values by name that replace those of the preset; numbers or text.
 
     Raises:
         InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.
@@ -329,9 +324,9 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
         return TypeAdapter(kind).validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
-        if not first["loc"]:  # settings that exclude each other
+        if not first["loc"]:  # an error of `__post_init__`
             raise InputError(str(first.get("ctx", {}).get("error", first["msg"]))) from None
-        name = str(first["loc"][0]) if first["loc"] else "configuration"
+        name = str(first["loc"][0])
         defaults = {field.name: getattr(field.default, "default", field.default) for field in fields(kind)}
         example = f" such as {defaults[name]!r}" if name in defaults else ""
         raise InputError(
@@ -373,7 +368,7 @@ def check_choices(
 
 
 def check_episodes(episodes: object) -> int:
-    """Return a number of episodes as an int; raise an InputError unless it is whole and in [1, `MAX_EPISODES`]."""
+    """Return a number of episodes as an int; raise an InputError unless it is a whole number in [1, `MAX_EPISODES`]."""
     episodes = as_whole(episodes, "the number of episodes")
     if episodes < 1:
         raise InputError(f"a run needs at least one episode, not {episodes}")
@@ -383,5 +378,5 @@ def check_episodes(episodes: object) -> int:
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:
-    """Return a configuration as values that YAML can hold."""
+    """Return a configuration as YAML-serializable values."""
     return TypeAdapter(type(config)).dump_python(config, mode="json")

@@ -16,15 +16,15 @@ from guiderail.tools.learning.config import DistillationConfig
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.pretrained import find_run
 
-CLOCK_SPREAD = 1e-6  # an observation entry that varies less than this between episodes depends on the step only
+CLOCK_SPREAD = 1e-6  # an observation entry with a smaller range over the episodes, at every step, is a clock
 
 
 @register_learner("distillation")
 class DistillationLearner(ChunkLearner):
     """Learner of a student that maps the teacher's observation directly to the next K commands.
 
-    In every episode the teacher acts with noise, so that observations off the teacher's own path are visited. The
-    labels are the commands of the teacher without noise,
+    In every episode the teacher acts with noise, so that observations off its own path are visited. The labels are the
+    commands of the teacher without noise,
 
         y_{t+k} = LC-NS-KMP(t + k, π(s_t)),   k = 0 … K−1,
 
@@ -39,8 +39,8 @@ class DistillationLearner(ChunkLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If no teacher is given or it has no policy, its observations or actions differ from the
-                environment's, the guidance is not KGRL driven by the clock, or as for `ChunkLearner`.
+            InputError: If no teacher is given, the teacher has no policy, its observations or actions differ from the
+                environment's, or the guidance is not KGRL with a clock-driven phase; also as `ChunkLearner`.
         """
         super().__init__(config, env, **arguments | {"symmetry": None})
         if not config.teacher:
@@ -48,12 +48,13 @@ class DistillationLearner(ChunkLearner):
         self._teacher = Policy.load(find_run(config.teacher))
         if not is_compatible(lambda env: self._teacher, env):
             raise InputError(
-                f"the policy of {config.teacher} has other observations or actions: give the --env of its training"
+                f"the policy of {config.teacher} has other observations or actions than this environment: give the "
+                "--env of its training"
             )
         declared = self._env.task.declaration.config
         prior = make_prior_knowledge(declared).demonstrations
         if declared.guidance != "kgrl" or prior is None or prior.motion is not None or prior.progress is not None:
-            raise InputError("distillation takes the commands of kgrl, driven by the clock: give --guidance kgrl")
+            raise InputError("distillation needs kgrl with a clock-driven phase: give --guidance kgrl")
         self._primitive = prior.primitive(history=False)
         self._gains, self._selection = prior.null_space_gains(self._primitive), prior.selection
         self._num_outputs = prior.num_outputs
@@ -85,24 +86,24 @@ class DistillationLearner(ChunkLearner):
         """Return the teacher's commands (K, O) from a control step on, for an observation (n,) at that step."""
         action = self._gains * (self._selection @ np.asarray(self._teacher(observation), float))
         commands = []
-        for at in range(step, step + self.config.chunk_steps):
+        for future_step in range(step, step + self.config.chunk_steps):
             try:
-                commands.append(self._primitive.predict(at, action).output)
-            except UnsolvableError:  # as in the guidance: the last command, moved into the constraints
+                commands.append(self._primitive.predict(future_step, action).output)
+            except UnsolvableError:  # as in the guidance: project the last command onto the constraints
                 last = commands[-1] if commands else self._primitive.reference.means[0]
-                commands.append(self._primitive.constraints.nearest(last, at))
+                commands.append(self._primitive.constraints.nearest(last, future_step))
         return np.array(commands)
 
     def finish(self) -> None:
-        """Label the observations and noisy copies of them, and train.
+        """Label the observations and their noisy copies, and train.
 
         Raises:
-            InputError: If there are noisy copies and only one episode, in which every entry may be the observed clock.
+            InputError: If noisy copies are configured and there is only one episode, so that no clock can be found.
         """
         if self.config.noisy_copies and self.config.copy_noise and len(set(self._groups)) < 2:
             raise InputError(
-                "noisy copies leave the observed clock out, which is found by comparing episodes: give at least 2 "
-                "--episodes, not 1, or --set noisy_copies=0"
+                "noisy copies have no noise in the observed clock, which is found by comparing episodes: give at least "
+                "2 --episodes, not 1, or --set noisy_copies=0"
             )
         observations, steps, groups = np.array(self._observations), np.array(self._steps), list(self._groups)
         scale = observations.std(axis=0) * ~self._clocks(observations, steps)
@@ -122,7 +123,7 @@ class DistillationLearner(ChunkLearner):
 
     @staticmethod
     def _clocks(observations: np.ndarray, steps: np.ndarray) -> np.ndarray:
-        """Return a mask (n,) of the entries of observations (N, n) that depend on the control step (N,) only."""
+        """Return a mask (n,) of the entries that depend only on the step, for observations (N, n) at `steps` (N,)."""
         spreads = [np.ptp(observations[steps == step], axis=0) for step in np.unique(steps)]
         return np.max(spreads, axis=0) < CLOCK_SPREAD
 
@@ -131,11 +132,11 @@ class DistillationLearner(ChunkLearner):
         return np.arange(len(self._groups))
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of a run depends on: the visited observations."""
+        """Return the state that a resumed run continues from: the visited observations."""
         arrays = {"observations": np.array(self._observations), "steps": np.array(self._steps)}
         return arrays | {"groups": np.array(self._groups)}, {"episodes": self.episodes}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; raise KeyError if it does not fit."""
+        """Restore a result of `state`; raise KeyError if it does not fit this learner."""
         self._observations, self._steps = [*arrays["observations"]], arrays["steps"].tolist()
         self._groups, self.episodes = arrays["groups"].tolist(), values["episodes"]

@@ -2,8 +2,7 @@
 
 Interventions are recorded with the run. A correction, clipped to the action's limits, replaces the policy's action,
 and an off-policy learner stores it as a transition. It also becomes via-points through which the demonstrations pass
-from the next episode on. Corrections and via-points go through guidance: the resulting commands satisfy the constraints
-like all others.
+from the next episode on. Guidance processes both, so that all resulting commands satisfy the constraints.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ VIA_POINT_SPACING = 5  # control steps between two via-points of a correction
 
 
 class Supervisor:
-    """Interface of a supervisor; this one does not intervene."""
+    """Interface of a supervisor; the base class does not intervene."""
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
         """Start an episode of `env`."""
@@ -43,7 +42,7 @@ class Supervisor:
         return None
 
     def label(self) -> str | None:
-        """Return the label given since the last call: "success", "failure" or "stop"; None if there is none."""
+        """Return the label since the last call: "success", "failure" or "stop"; None if there is none."""
         return None
 
 
@@ -66,7 +65,7 @@ class SupervisedEnv(gymnasium.Wrapper):
 
 
 class InterventionPolicy(Callback):
-    """Policy that a supervisor's corrections override, and the via-points that result.
+    """Policy that a supervisor's corrections override, and the resulting via-points.
 
     Attributes:
         interventions: Number of corrections that began in this episode.
@@ -102,8 +101,8 @@ class InterventionPolicy(Callback):
         Raises:
             InputError: If the correction is not (A,) or not finite.
         """
-        given = self._supervisor.correction(observation)
-        offset = None if given is None else self._corrections.check_offset(given)
+        correction = self._supervisor.correction(observation)
+        offset = None if correction is None else self._corrections.check_offset(correction)
         if offset is not None and self._offset is None:
             self.interventions += 1
         self._offset = offset
@@ -112,7 +111,7 @@ class InterventionPolicy(Callback):
     def on_step(self, transition: Transition) -> None:
         """Store the correction at the last completed control step.
 
-        No step is completed if the simulation failed in the first one.
+        If the simulation failed in the first step, no step is completed.
         """
         if self._offset is not None and transition.info["control_steps"]:
             self._offsets[int(transition.info["control_steps"]) - 1] = self._offset
@@ -123,26 +122,23 @@ class InterventionPolicy(Callback):
 
 
 class ViaPointCorrections:
-    """Via-points in the demonstrations of an environment, made of a supervisor's corrections.
+    """Via-points of an environment's demonstrations, computed from a supervisor's corrections.
 
     Attributes:
         points: Via-points so far, as the option `via_points`.
-        reach: Displacement by a full action, (A,), as an RMS over the motion, in units of the output.
+        reach: RMS displacement over the motion by a full action, (A,) [unit of the output].
     """
 
     def __init__(self, task: str, environment: Mapping[str, Any]):
-        """Construct the corrections of a task's environment, given its options.
+        """Construct the via-points for a task and the options of its environment.
 
         Raises:
             InputError: If the guidance has no demonstrations to correct.
         """
         config = EnvConfig.resolve(task, environment)
         instance, kind = config.make_task(), config.guidance_kind
-        if "demonstrations" not in {one for needed in kind.needs for one in needed}:
-            raise InputError(
-                f"corrections need demonstrations, which guidance {kind.name!r} does not use: choose another, such as "
-                "kgrl"
-            )
+        if not any("demonstrations" in alternative for alternative in kind.needs):
+            raise InputError(f"guidance {kind.name!r} has no demonstrations to correct: choose another, such as kgrl")
         values = config.options
         self.points = tuple(values["via_points"])
         reference = instance.reference()
@@ -160,7 +156,7 @@ class ViaPointCorrections:
         return numbers
 
     def with_offsets(self, offsets: Mapping[int, np.ndarray], *, is_held: bool = False) -> tuple[float, ...]:
-        """Return the via-points so far with those of an episode's corrections.
+        """Return the via-points so far, updated by the corrections of an episode.
 
         Old via-points between the first and the last new one, and less than `VIA_POINT_SPACING` steps outside of this
         interval, are removed.
@@ -187,17 +183,17 @@ class ViaPointCorrections:
         return tuple(float(number) for step in sorted(merged) for number in (step, *merged[step]))
 
     def _displaced(self, step: int, offset: np.ndarray) -> np.ndarray:
-        """Return the admissible output (O,) nearest to the displaced demonstration."""
+        """Return the output (O,) within the constraints that is nearest to the displaced demonstration."""
         output = self._reference.means[step].copy()
         output[self._action_dims] += offset * self.reach
         return output if self._constraints is None else self._constraints.nearest(output, step)
 
 
 class SupervisedTraining:
-    """Episodes of a run with a supervisor, each in an environment with the via-points of the episodes before."""
+    """Episodes of a run with a supervisor, each in an environment with the via-points of all previous episodes."""
 
     def __init__(self, config: RunConfig, supervisor: Supervisor, state: Mapping[str, Any]):
-        """Construct the environment of the first episode; `state` are the values of a checkpoint, empty for a new run.
+        """Construct the first episode's environment; `state` has the values of a checkpoint, or is empty in a new run.
 
         Raises:
             InputError: If the guidance has no demonstrations to correct.

@@ -1,4 +1,4 @@
-"""Stable-Baselines3 in a run: callbacks, a replay buffer with demonstrations, and states as arrays of a checkpoint."""
+"""Adapters for Stable-Baselines3: callbacks, a replay buffer with demonstrations, and state as checkpoint arrays."""
 
 import random
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
 
     Attributes:
-        fraction: Fraction of a batch that is demonstrated, as soon as the buffer holds other transitions.
+        fraction: Fraction of demonstrations in a batch, once the buffer also has other transitions.
         num_demonstrated: Number of rows of demonstrations.
     """
 
@@ -54,11 +54,11 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
     def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
         if not self.num_demonstrated:
             return super()._get_samples(batch_inds, env)
-        # The buffer is a ring: a demonstration follows its last row, so an n-step return must end there.
-        kept = self.timeouts[-1].copy()
-        self.timeouts[-1] = np.logical_or(kept, np.logical_not(self.dones[-1]))
+        # In the ring buffer, a demonstration follows the last row: an n-step return must end at the last row.
+        timeouts = self.timeouts[-1].copy()
+        self.timeouts[-1] = np.logical_or(timeouts, np.logical_not(self.dones[-1]))
         samples = super()._get_samples(batch_inds, env)
-        self.timeouts[-1] = kept
+        self.timeouts[-1] = timeouts
         return samples
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
@@ -96,7 +96,7 @@ def restore_modules(
     modules: Mapping[str, torch.nn.Module],
     optimizers: Mapping[str, torch.optim.Optimizer],
 ) -> None:
-    """Set modules and optimizers from the arrays that `module_arrays` returned, for optimizers given as tensors."""
+    """Restore modules and optimizers from a result of `module_arrays`; the moments of optimizers must be tensors."""
     for name, module in modules.items():
         load_module(module, entries_of(arrays, name))
     for name, optimizer in optimizers.items():
@@ -110,18 +110,18 @@ def restore_modules(
 def load_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
     """Set the parameters and buffers of a module from arrays or tensors by name.
 
-    Each array is reshaped to the module's shape, because files store 0-d arrays, such as counters of steps, as 1-d.
+    Each array is reshaped to the module's shape, because safetensors stores 0-d arrays, such as step counters, as 1-d.
     """
     shapes = {name: value.shape for name, value in module.state_dict().items()}
     tensors = {name: torch.as_tensor(value) for name, value in arrays.items()}
-    module.load_state_dict({name: one.reshape(shapes.get(name, one.shape)) for name, one in tensors.items()})
+    module.load_state_dict({name: value.reshape(shapes.get(name, value.shape)) for name, value in tensors.items()})
 
 
 def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return the states of the global random generators, which Stable-Baselines3 samples from.
 
     Returns:
-        Arrays by name, and values that JSON can hold.
+        Arrays by name, and JSON-serializable values.
     """
     kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
@@ -143,10 +143,10 @@ def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) 
 
 
 class Sb3Callbacks(Callback):
-    """Callback of an episode that calls callbacks of Stable-Baselines3.
+    """Adapter that calls callbacks of Stable-Baselines3 in the episodes of a run.
 
     The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts the run's
-    transitions, including those before it was resumed. `locals` has the names `infos`, `rewards`, `dones`, `actions`
+    transitions, including those before it was resumed. `locals` has the entries `infos`, `rewards`, `dones`, `actions`
     and `new_obs`, each of length 1 as for one environment.
 
     Attributes:
@@ -161,15 +161,13 @@ class Sb3Callbacks(Callback):
         """
         model = getattr(learner, "model", None)
         if model is None:
-            raise InputError(
-                f"callbacks of Stable-Baselines3 need one of its models, and {type(learner).__name__} has none"
-            )
+            raise InputError(f"{type(learner).__name__} has no Stable-Baselines3 model, which its callbacks need")
         callback_list = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
-        for one in callback_list:
-            if not isinstance(one, BaseCallback):
-                raise InputError(f"{brief(one)} is no callback of Stable-Baselines3: derive one from BaseCallback")
+        for callback in callback_list:
+            if not isinstance(callback, BaseCallback):
+                raise InputError(f"{brief(callback)} is no callback of Stable-Baselines3: derive it from BaseCallback")
         self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
-        # Transitions of `init_from` are not counted.
+        # Transitions of the run that `init_from` names are not counted.
         self._learner, self._first = learner, getattr(learner, "transitions", 0)
         self.is_stopped = False
 
