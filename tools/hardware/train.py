@@ -25,7 +25,8 @@ from guiderail.tools.hardware.executor import record_size
 from guiderail.tools.hardware.robot_env import RobotEnv
 from guiderail.tools.hardware.session import robot_session
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
-from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
+from guiderail.tools.learning.networks import SpacesOnlyEnv
+from guiderail.tools.learning.pipelined import PipelinedLearner
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, warn_of_unfinished_source, with_defaults
 from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint

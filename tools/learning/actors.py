@@ -1,4 +1,4 @@
-"""Parallel actors: episodes are simulated in forks of this process while it learns."""
+"""Parallel actors: forks of this process simulate episodes while this process learns."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ class Snapshot(NamedTuple):
 class SimulatedEpisode(NamedTuple):
     """Episode that an actor simulated."""
 
-    number: int  # number of the episode
-    row: dict[str, Any]  # its row in the table of the run
-    transitions: list[Transition]  # its transitions
+    number: int
+    row: dict[str, Any]  # row in the table of the run
+    transitions: list[Transition]
     is_greedy: bool  # True if the learner acted without exploration
 
 
@@ -72,12 +72,12 @@ class ParallelLearner(Learner):
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`, observations have images, or this process cannot
-                have forks.
+                fork.
         """
         if not isinstance(learner, OffPolicyLearner):
             raise InputError("only an off-policy learner has parallel actors: choose tqc, sac, td3 or crossq")
         if not can_fork():
-            raise InputError("parallel actors are forks, which this process cannot have: leave num_envs out")
+            raise InputError("parallel actors are forks, which this process cannot create: leave num_envs out")
         if has_image(env.observation_space):
             raise InputError("parallel actors are forks, which cannot render images: leave num_envs out")
         self._learner, self._env, self._num_envs, self._seed = learner, env, num_envs, seed
@@ -119,8 +119,8 @@ class ParallelLearner(Learner):
         row = {**episode.row, **new_columns(learner, episode.row)}
         self._learned += 1
         self._snapshots[self._learned] = _snapshot(learner)
-        for old in [number for number in self._snapshots if number < self._required(self._learned)]:
-            del self._snapshots[old]
+        oldest = self._required(self._learned)
+        self._snapshots = {number: snapshot for number, snapshot in self._snapshots.items() if number >= oldest}
         self._exchange(0.0)
         return row
 
@@ -140,7 +140,7 @@ class ParallelLearner(Learner):
             self._simulated[episode.number] = episode
 
     def _simulate(self, assignment: tuple[int, Snapshot]) -> SimulatedEpisode:
-        """Run an episode, in a fork."""
+        """Simulate an episode; called in a fork."""
         (index, snapshot), learner = assignment, self._learner
         conditions, exploration, process = np.random.SeedSequence([self._seed, index]).spawn(3)
         self._env.unwrapped.np_random = np.random.default_rng(conditions)
@@ -157,7 +157,7 @@ class ParallelLearner(Learner):
         return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)
 
     def finish(self) -> None:
-        """End the actors, whose episodes nothing will be learned from."""
+        """End the actors, and discard the episodes that they simulated ahead."""
         self.close()
 
     def close(self) -> None:
@@ -172,7 +172,7 @@ class ParallelLearner(Learner):
         return self._learner.metrics()
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of the learner; `description` holds further entries of its description."""
+        """Return the policy of the learner; the entries of `description` are added to its description."""
         return self._learner.policy(description)
 
     def has_diverged(self) -> bool:
@@ -188,14 +188,15 @@ class ParallelLearner(Learner):
             for number, snapshot in self._snapshots.items()
             for name, array in snapshot.weights.items()
         }
-        snapshots = {str(number): [one.transitions, one.greedy_successes] for number, one in self._snapshots.items()}
+        snapshots = {str(number): counts for number, (_, *counts) in self._snapshots.items()}
         return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; episodes simulated ahead of the checkpoint are simulated again.
+        """Restore a result of `state`; episodes simulated ahead of the checkpoint are simulated again.
 
         Raises:
-            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+            KeyError: If an entry is missing.
+            RuntimeError, ValueError: If the state does not fit this learner.
         """
         self._learner.restore(entries_of(arrays, "learner"), values["learner"])
         self._snapshots = {}
@@ -219,7 +220,7 @@ class _EpisodeRecorder(Callback):
 
 
 def record_transition(transitions: list[Transition], transition: Transition) -> bool:
-    """Append a transition, without its `info`; return False if it is left out because the simulation failed.
+    """Append a transition without its `info`; return False if the simulation failed and nothing was appended.
 
     If the simulation fails, the episode ends with the transition before the failure, as at a time limit.
     """

@@ -1,4 +1,4 @@
-"""Checkpoint files, from which a run resumes bit for bit and which hold no code; selection of the exported actor."""
+"""Checkpoint files, which contain no code and resume a run bit for bit; selection of the exported actor."""
 
 import json
 from collections.abc import Mapping
@@ -22,7 +22,7 @@ Entry = TypeVar("Entry")
 
 @dataclass
 class Candidate:
-    """Actor of a greedy episode, with the numbers of consecutive greedy successes before it and beginning with it."""
+    """Actor of a greedy episode, with the numbers of consecutive greedy successes before the episode and from it on."""
 
     actor: Actor  # parameters by name
     before: int  # number of successes before the episode
@@ -37,8 +37,8 @@ class CheckpointSelection:
     """Selection of the latest actor in the middle of the longest streak of successful greedy episodes.
 
     Learning at the edge of contact oscillates: a policy that succeeds for twenty episodes can fail for two and recover,
-    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. Successes after an
-    actor's own episode do not suffice, because later actors achieved them; the score also counts those before it.
+    so the last actor of a run is a poor choice. Held-out conditions must not influence the choice. The successes after
+    an actor's own episode are those of later actors, so its score also counts the successes before the episode.
     """
 
     def __init__(self, window: int):
@@ -80,23 +80,23 @@ class CheckpointSelection:
         return candidate if candidate.score() >= required else best
 
     def state(self) -> tuple[Actor, dict[str, Any]]:
-        """Return the state between episodes: tensors by name, and values that JSON can hold."""
+        """Return the state between episodes: tensors by name, and JSON-serializable values."""
         candidates = {str(index): candidate for index, candidate in enumerate(self._open)}
         if self._selected is not None:
             candidates["selected"] = self._selected
-        tensors = {f"{name}/{key}": value for name, one in candidates.items() for key, value in one.actor.items()}
-        return tensors, {"rows": {name: [one.before, one.since] for name, one in candidates.items()}}
+        tensors = {f"{name}/{key}": tensor for name, each in candidates.items() for key, tensor in each.actor.items()}
+        return tensors, {"rows": {name: [each.before, each.since] for name, each in candidates.items()}}
 
     def restore(self, tensors: Mapping[str, torch.Tensor], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned."""
+        """Restore a result of `state`."""
         candidates = {name: Candidate(entries_of(tensors, name), *rows) for name, rows in values["rows"].items()}
         self._selected = candidates.pop("selected", None)
         self._open = [candidates[name] for name in sorted(candidates, key=int)]
 
 
 def entries_of(entries: Mapping[str, Entry], part: str) -> dict[str, Entry]:
-    """Return the entries whose names begin with `part`/, by the rest of their names."""
-    return {name.removeprefix(f"{part}/"): one for name, one in entries.items() if name.startswith(f"{part}/")}
+    """Return the entries whose names begin with `part`/, without this prefix."""
+    return {name.removeprefix(f"{part}/"): entry for name, entry in entries.items() if name.startswith(f"{part}/")}
 
 
 def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
@@ -117,7 +117,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         with safe_open(path, framework="numpy") as file:
             metadata = file.metadata()
-            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (it is no dictionary)
+            arrays = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (`file` is no dictionary)
         text = metadata["values"]
         if metadata["digest"] != digest(arrays, text):
             raise ValueError("the digest differs")
@@ -129,12 +129,12 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the arrays and values of a run's off-policy learner; a pipelined one has not learned its last episode.
+    """Return the state of a run's off-policy learner; without the last episode if the learner was pipelined.
 
     Raises:
         InputError: If the run has no checkpoint, or its learner is not off-policy.
     """
-    from guiderail.tools.learning.run_folder import RunFolder  # pandas, which the learners do not need
+    from guiderail.tools.learning.run_folder import RunFolder  # imports pandas, which the learners do not need
 
     file = RunFolder(Path(run)).checkpoint
     if not file.is_file():
@@ -146,5 +146,5 @@ def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     elif "learner" in values:  # with parallel actors
         arrays, values = entries_of(arrays, "learner"), values["learner"]
     if "exploration" not in values:
-        raise InputError(f"init_from names {run}, whose learner is not off-policy: name one of the same algorithm")
+        raise InputError(f"init_from names {run}, whose learner is not off-policy: name a run of the same algorithm")
     return arrays, values

@@ -226,8 +226,8 @@ _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_c
 # The measurements behind each preset are in docs/experiments.md.
 PRESETS = {
     # Contact makes learning oscillate. Small batches, a moderate learning rate and layer normalization reduce the
-    # oscillation. Greedy episodes train the critics on returns of the mean action. Checkpoint selection exports an actor
-    # from the middle of a long streak of greedy successes.
+    # oscillation. Greedy episodes train the critics on returns of the mean action. Checkpoint selection exports the
+    # actor in the middle of a long streak of greedy successes.
     "tqc_contact": OffPolicyConfig(
         learning_rate=3e-4,
         train_freq=4,

@@ -76,7 +76,7 @@ def _split(flat: torch.Tensor, inputs: int, outputs: int) -> tuple[torch.Tensor,
 
 @dataclass
 class ForwardCache:
-    """Intermediate results of a forward pass that the backward pass needs."""
+    """Intermediate results of a forward pass, which the backward pass reuses."""
 
     inputs: list[torch.Tensor]  # input of each layer, (n or 1, batch, inputs)
     # Affine output, its mean and its inverse standard deviation for each normalized hidden layer.
@@ -130,7 +130,7 @@ class BatchedMLP:
         return self._layers[0].input_gradient(d, len(cache.inputs[0]) == 1, columns)
 
     def _through(self, index: int, cache: ForwardCache, d: torch.Tensor) -> torch.Tensor:
-        """Return the gradient of the output of layer `index - 1`, given that of layer `index`."""
+        """Return the gradient with respect to the output of layer `index - 1`, given that of layer `index`."""
         x = cache.inputs[index]
         d = torch.ops.aten.threshold_backward(self._layers[index].input_gradient(d, len(x) == 1), x, 0)
         if not self._layer_norm:
@@ -155,10 +155,10 @@ def _parts(flat: torch.Tensor, shapes: Sequence[torch.Size]) -> list[torch.Tenso
 
 
 class FlatAdam:
-    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, with the stored moments of `torch.optim.Adam`.
+    """Adam (Kingma and Ba, 2015) by PyTorch's fused kernel, whose `state_dict` has the moments of `torch.optim.Adam`.
 
-    It is not derived from `torch.optim.Optimizer`, because creating such an optimizer imports PyTorch's compiler, which
-    takes seconds.
+    The class is not derived from `torch.optim.Optimizer`, whose construction imports PyTorch's compiler: that takes
+    seconds.
 
     Attributes:
         values: All parameters, (P,); each parameter is a view of this buffer.
@@ -193,7 +193,7 @@ class FlatAdam:
             return {"state": {}, "param_groups": []}
         moments = [_parts(moment, self._shapes) for moment in self._moments]
         named = [dict(zip(_MOMENTS, pair, strict=True)) for pair in zip(*moments, strict=True)]
-        return {"state": {i: {"step": self._steps, **one} for i, one in enumerate(named)}, "param_groups": []}
+        return {"state": {i: {"step": self._steps, **values} for i, values in enumerate(named)}, "param_groups": []}
 
     def load_state_dict(self, stored: Mapping[str, Any]) -> None:
         """Set the state from a `state_dict` of this class or of `torch.optim.Adam`.
@@ -229,7 +229,7 @@ else:
 
 
 class FastTrainingStep(_Algorithm):
-    """Mixin that replaces the training step; list it before SAC or TQC among the base classes.
+    """Mixin that replaces the training step; it must come before SAC or TQC in the list of base classes.
 
     A subclass implements `_target_value`, `_critic_gradient`, `_value_gradient`, and for the logger `_critic_loss` and
     `_actor_value`.
@@ -293,10 +293,10 @@ class FastTrainingStep(_Algorithm):
 
     @torch.inference_mode()
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """Take `gradient_steps` gradient steps, each on a batch of its own."""
+        """Take `gradient_steps` gradient steps, each on a new batch."""
         steps_at_once = max(1, _MAX_GATHERED // (2 * batch_size * (self._features + self._actions)))
-        for done in range(0, gradient_steps, steps_at_once):
-            steps = min(steps_at_once, gradient_steps - done)
+        for first in range(0, gradient_steps, steps_at_once):
+            steps = min(steps_at_once, gradient_steps - first)
             self._train_batches(self.replay_buffer.sample(steps * batch_size), steps, batch_size)
         self._n_updates += gradient_steps
 
@@ -386,7 +386,7 @@ class FastTrainingStep(_Algorithm):
         raise NotImplementedError
 
     def _critic_loss(self, values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Return the critics' loss for a log, given their outputs (n, B, outputs) and the target (B, …)."""
+        """Return the critics' loss, which is only logged, given their outputs (n, B, outputs) and the target (B, …)."""
         raise NotImplementedError
 
     def _critic_gradient(self, values: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
@@ -459,7 +459,7 @@ class FastTqc(FastTrainingStep, TQC):
 
 
 def _layers(values: torch.Tensor, gradient: torch.Tensor, sizes: list[int]) -> list[Linear]:
-    """Return the layers of n networks whose parameters are the rows of `values`, layer by layer."""
+    """Return the layers of n networks; each row of `values` has the parameters of one network, layer by layer."""
     pairs = list(pairwise(sizes))
     counts = [(inputs + 1) * outputs for inputs, outputs in pairs]
     parts = zip(values.split(counts, dim=1), gradient.split(counts, dim=1), pairs, strict=True)

@@ -40,7 +40,7 @@ LOGGED_COLUMNS = {
 def reject_bool(value: Any) -> Any:
     """Return a value; raise a ValueError if it is a bool, because a number is expected."""
     if isinstance(value, bool):
-        raise ValueError("it is a number")
+        raise ValueError("it must be a number")
     return value
 
 
@@ -52,7 +52,7 @@ NonNegative = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(reject_bool)
 class LearnerConfig:
     """Base class of the learners' configurations: the settings that the training loop reads.
 
-    A learner adds settings of its own by a derived pydantic dataclass, named as its `Config`.
+    A learner adds its own settings in a derived pydantic dataclass, which is its attribute `Config`.
 
     Attributes:
         algorithm: Registered name of the learner.
@@ -66,7 +66,7 @@ class LearnerConfig:
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
         stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
-            never. The run may then be resumed, but does not continue.
+            never. Resuming such a run runs no further episodes.
         takes_images: True if the learner's networks take observations with images.
     """
 
@@ -108,7 +108,7 @@ class Learner(Callback, ABC):
         """
 
     def submit_episode(self) -> None:
-        """Submit the finished episode to training; called after its checkpoint, if one is due, has been written."""
+        """Submit the finished episode to training; called after the checkpoint, if it is due, has been written."""
 
     def finish(self) -> None:
         """Block until everything is learned; called after the last episode."""
@@ -117,7 +117,7 @@ class Learner(Callback, ABC):
         """Release resources such as processes; called even if training fails."""
 
     def metrics(self) -> Mapping[str, float]:
-        """Return scalars that were recorded since the last call, such as losses, by their names in a log."""
+        """Return scalars recorded since the last call, such as losses, by their names in a log."""
         return {}
 
     @abstractmethod
@@ -125,7 +125,7 @@ class Learner(Callback, ABC):
         """Return the learned policy.
 
         Args:
-            description: Further entries of the policy's description, such as the observation's shape.
+            description: Entries to add to the policy's description, such as the observation's shape.
         """
 
     @abstractmethod
@@ -134,28 +134,28 @@ class Learner(Callback, ABC):
 
     @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of the run depends on, between two episodes.
+        """Return the state that a resumed run continues from; called between two episodes.
 
         Returns:
-            Arrays of numbers by name (one without a dimension is restored with the shape (1,)), and values that JSON
-            can hold.
+            Arrays of numbers by name (a 0-d array is restored with the shape (1,)), and JSON-serializable values.
         """
 
     @abstractmethod
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned.
+        """Restore a result of `state`.
 
         Args:
             arrays: Arrays by name, of the shapes that `state` returned.
             values: Values by name.
 
         Raises:
-            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+            KeyError: If an entry is missing.
+            RuntimeError, ValueError: If the state does not fit this learner.
         """
 
 
 def _check_learner(name: str, learner: Any) -> None:
-    """Raise an InputError if a name cannot be that of a learner, or a class lacks what a learner needs."""
+    """Raise an InputError if a learner's name is invalid, or the learner is incomplete."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise InputError(f"the name of a learner has letters, digits, '_', '-' and '.', unlike {brief(name)}")
     check_callable(name, learner)
@@ -163,7 +163,7 @@ def _check_learner(name: str, learner: Any) -> None:
     if hasattr(learner, "Config") and not (
         isinstance(config, type) and issubclass(config, LearnerConfig) and is_pydantic_dataclass(config)
     ):
-        raise InputError(f"Config of {name} must be a pydantic dataclass made of LearnerConfig, not {brief(config)}")
+        raise InputError(f"Config of {name} must be a pydantic dataclass based on LearnerConfig, not {brief(config)}")
     if not inspect.isclass(learner):
         if config is None:
             raise InputError(f"the learner {name} has no Config: see `Learner`")
@@ -176,7 +176,7 @@ def _check_learner(name: str, learner: Any) -> None:
 
 
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
-# takes seconds to import: `LEARNERS.declared(name, "Config")` imports no module whose source shows the `Config`.
+# takes seconds to import: `LEARNERS.declared(name, "Config")` reads the `Config` from the source if possible.
 LEARNERS: Registry[Any] = Registry(
     "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners",
     check=_check_learner,
@@ -199,10 +199,10 @@ def divergence_error() -> InputError:
 def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
     """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
-    The symmetry is None if a supervisor or via-points correct the demonstrations: they are not symmetric then.
+    If a supervisor or via-points correct the demonstrations, the symmetry is None.
 
     Raises:
-        InputError: If observations have images, and the learner's networks take none.
+        InputError: If observations have images, and the learner does not accept images.
     """
     if not config.learner.takes_images and has_image(task.observation_space):
         name = config.learner.algorithm
@@ -238,7 +238,7 @@ class LearningLog:
     """
 
     def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
-        """Construct the log; files in `folder` are opened at the first entry.
+        """Construct the log, which opens files in `folder` at the first entry.
 
         Raises:
             InputError: If a format is unknown, or its package is not installed.
@@ -258,7 +258,7 @@ class LearningLog:
         Args:
             rows: Rows of all episodes so far.
             metrics: Function that returns the learner's metrics, `Learner.metrics`.
-            is_finished: True after the learner's `finish`; the entry then has only the metrics recorded since.
+            is_finished: True after the learner's `finish`; the entry then has only metrics, and none of the row.
         """
         if not self._formats:
             return
@@ -281,7 +281,7 @@ class LearningLog:
             self._logger = Logger(str(self._folder), outputs)
         for name, value in entry.items():
             self._logger.record(name, value)
-        self._logger.dump(sum(int(one["steps"]) for one in rows))
+        self._logger.dump(sum(int(row["steps"]) for row in rows))
 
     def close(self) -> None:
         """Close the files."""
@@ -302,7 +302,7 @@ def _checked_metrics(metrics: Callable[[], Mapping[str, float]]) -> Mapping[str,
 
 
 def _make_wandb_output(folder: str) -> Any:
-    """Return an output format that logs to Weights & Biases; the same folder always continues the same W&B run."""
+    """Return an output format that logs to Weights & Biases; one folder always continues one W&B run."""
     import wandb
     from stable_baselines3.common.logger import KVWriter
 

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
 
 class SpacesOnlyEnv(gymnasium.Env):
-    """Environment with the spaces of another one and nothing else, to send to another process."""
+    """Environment with only the spaces of another environment, for sending to another process."""
 
     def __init__(self, env: gymnasium.Env, observation_space: spaces.Box | None = None):
-        """Copy the spaces of `env`, with another observation space if one is given."""
+        """Copy the spaces of `env`; `observation_space` replaces its observation space if given."""
         self.observation_space, self.action_space = observation_space or env.observation_space, env.action_space
         self.privileged_space = getattr(env.unwrapped, "privileged_space", None)
 
@@ -45,7 +45,7 @@ class FirstEntries(BaseFeaturesExtractor):
 
 
 def asymmetric_policy(policy: Any, num_observed: int) -> type:
-    """Return a policy class of Stable-Baselines3 with an actor that observes the first `num_observed` entries only.
+    """Return a Stable-Baselines3 policy class whose actor observes only the first `num_observed` entries.
 
     The critics observe all entries (asymmetric actor-critic; Pinto et al., 2018).
     """
@@ -63,8 +63,8 @@ def observe_privileged(
     """Make an environment provide privileged observations for the critics of an algorithm.
 
     Returns:
-        An environment with the spaces of the critics, a policy class whose actor observes the entries of `env` only,
-        and the number of privileged entries.
+        An environment with the spaces of the critics, a policy class whose actor observes only the observation of
+        `env`, and the number of privileged entries.
 
     Raises:
         InputError: If the observation is not a vector, the task declares no privileged observation or, with `symmetry`,
@@ -143,7 +143,7 @@ class ImageFeatures(BaseFeaturesExtractor):
 
     Attributes:
         pool: Side of the averaged squares [pixels]; 1 for convolutions.
-        convolutions: Convolutions, each with a rectifier; empty for pooling.
+        convolutions: Convolutions, each followed by a ReLU; empty for pooling.
     """
 
     def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str, random_shift: int):
@@ -171,7 +171,7 @@ class ImageFeatures(BaseFeaturesExtractor):
         self.pool, self._shape, self._random_shift = side_of_squares, (channels, height, width), random_shift
         inputs = [channels, *CHANNELS[:-1]]
         pairs = zip(inputs, CHANNELS, strict=True) if encoder == "convolutional" else ()
-        self.convolutions = torch.nn.ModuleList(torch.nn.Conv2d(into, out, 3, stride=2) for into, out in pairs)
+        self.convolutions = torch.nn.ModuleList(torch.nn.Conv2d(*pair, 3, stride=2) for pair in pairs)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Map packed observations (batch, n), as numbers of any type, to features (batch, features)."""
@@ -191,8 +191,8 @@ class ImageFeatures(BaseFeaturesExtractor):
         shifts = torch.randint(-self._random_shift, self._random_shift + 1, (2, number, 1)).to(images.device)
         rows = (torch.arange(height, device=images.device) + shifts[0]).clamp(0, height - 1)
         columns = (torch.arange(width, device=images.device) + shifts[1]).clamp(0, width - 1)
-        chosen = torch.arange(number, device=images.device)[:, None, None]
-        return images.permute(0, 2, 3, 1)[chosen, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
+        indices = torch.arange(number, device=images.device)[:, None, None]
+        return images.permute(0, 2, 3, 1)[indices, rows[:, :, None], columns[:, None, :]].permute(0, 3, 1, 2)
 
 
 class DetachedFeatures(BaseFeaturesExtractor):
@@ -228,7 +228,7 @@ def share_encoder(model: Any) -> None:
 
 
 class NormalizedReLU(torch.nn.Module):
-    """Layer normalization without learned parameters, followed by a rectifier."""
+    """Layer normalization without learned parameters, followed by a ReLU."""
 
     kind = "normalized_relu"
 
@@ -238,7 +238,7 @@ class NormalizedReLU(torch.nn.Module):
 
 
 class DroppedNormalizedReLU(NormalizedReLU):
-    """Dropout, followed by layer normalization and a rectifier (DroQ; Hiraoka et al., 2022)."""
+    """Dropout, followed by layer normalization and a ReLU (DroQ; Hiraoka et al., 2022)."""
 
     def __init__(self, probability: float):
         super().__init__()
@@ -250,7 +250,7 @@ class DroppedNormalizedReLU(NormalizedReLU):
 
 
 def add_dropout(critic: Any, probability: float) -> None:
-    """Replace each layer of the critics that is not linear by a `DroppedNormalizedReLU`."""
+    """Replace each activation of the critics by a `DroppedNormalizedReLU`."""
     for network in critic.q_networks:
         for index, layer in enumerate(network):
             if not isinstance(layer, torch.nn.Linear):
@@ -258,9 +258,9 @@ def add_dropout(critic: Any, probability: float) -> None:
 
 
 def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
-    """Return the policy of a Stable-Baselines3 actor: linear layers with rectifiers between them, and a final tanh.
+    """Return the policy of a Stable-Baselines3 actor: linear layers with activations between them, and a final tanh.
 
-    `description` holds further entries of the policy's description, such as the observation's shape.
+    The entries of `description`, such as the observation's shape, are added to the policy's description.
 
     Raises:
         InputError: If the actor has other layers.
@@ -268,13 +268,13 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     features = actor.features_extractor
     features = features.features if isinstance(features, DetachedFeatures) else features
-    encoder = [_arrays(one) for one in getattr(features, "convolutions", ())]
+    encoder = [_arrays(layer) for layer in getattr(features, "convolutions", ())]
     pool = {"pool": getattr(features, "pool", 1)}
     return export_layers(layers, actor.action_space, {**pool, "squash": "tanh", **description}, encoder)
 
 
 def _arrays(layer: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return copies of weight and bias of a layer."""
+    """Return copies of the weight and bias of a layer."""
     return layer.weight.detach().cpu().numpy().copy(), layer.bias.detach().cpu().numpy().copy()
 
 
@@ -284,18 +284,18 @@ def export_layers(
     description: Mapping[str, Any],
     encoder: Sequence[tuple[np.ndarray, np.ndarray]] = (),
 ) -> Policy:
-    """Return the policy of linear layers with one kind of activation between them, and of convolutions before them.
+    """Return the policy of optional convolutions, followed by linear layers with one kind of activation between them.
 
     Batch renormalization is merged into the next linear layer.
 
     Args:
         layers: Layers from input to output.
         space: Action space.
-        description: Further entries of the policy's description.
+        description: Entries to add to the policy's description.
         encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution.
 
     Raises:
-        InputError: If there are other layers, or the layers are in another order.
+        InputError: If a layer has another type, or the layers are in another order.
     """
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []

@@ -86,7 +86,7 @@ class OffPolicyLearner(Learner):
     ):
         """Construct the learner; `Learner` describes the arguments. Only the spaces of `env` are used.
 
-        A privileged critic also sets `observes_privileged` of `env`. Settings that do not fit raise an InputError.
+        With a privileged critic, `env.observes_privileged` is set to True. Incompatible settings raise an InputError.
         """
         self.symmetry = symmetry if config.symmetry else None
         self._copies = 1 if self.symmetry is None else 1 + len(self.symmetry.actions)  # buffer entries per transition
@@ -195,16 +195,16 @@ class OffPolicyLearner(Learner):
         self.episodes += 1
         self._has_transition = False
         fraction = self.config.greedy_episode_fraction
-        own = self.episodes - self.config.demonstration_episodes  # a demonstrator acts in the episodes before
-        self._constant_action = self._uniform() if 0 < own <= self.config.constant_episodes else None
+        own_episode = self.episodes - self.config.demonstration_episodes  # at most 0 while a demonstrator acts
+        self._constant_action = self._uniform() if 0 < own_episode <= self.config.constant_episodes else None
         is_due = int(self.episodes * fraction) > int((self.episodes - 1) * fraction)
-        self.is_greedy = is_due and own > 0 and self._constant_action is None and self.is_learning()
+        self.is_greedy = is_due and own_episode > 0 and self._constant_action is None and self.is_learning()
         self._extended_steps = 0
         if self.selection is not None and self.is_greedy:
             self.selection.begin(self.actor(), self.greedy_successes)
 
     def start_recorded(self, is_greedy: bool, actor: torch.nn.Module) -> None:
-        """Start learning from an episode that `actor` has already run in another process."""
+        """Start learning from an episode in which `actor` acted in another process."""
         self.episodes += 1
         self._has_transition, self.is_greedy = False, is_greedy
         if self.selection is not None and is_greedy:
@@ -226,7 +226,7 @@ class OffPolicyLearner(Learner):
         self._has_transition = True
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """End an episode; one with interventions of a supervisor does not count for the checkpoint selection."""
+        """End an episode; it does not count for the checkpoint selection if a supervisor intervened."""
         if row.get("interventions"):
             self.exclude_episode()
         elif self.is_greedy:
@@ -277,8 +277,8 @@ class OffPolicyLearner(Learner):
     def _temporally_extended(self) -> np.ndarray | None:
         """Return a uniformly sampled action that is repeated for several transitions; None if no repetition is active.
 
-        This is the εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leads
-        out of regions in which a policy stays, such as free space, and yields data about long motion in one direction.
+        This is the εz-greedy exploration of Dabney, Ostrovski and Barreto (2021), with uniform durations. It leaves
+        regions in which a policy stays, such as free space, and adds data of long motions in one direction.
         """
         if self._extended_steps == 0:
             is_over = 0 < self.config.ez_greedy_until <= self.greedy_successes
@@ -302,15 +302,16 @@ class OffPolicyLearner(Learner):
         clock identifies the phase of a skill, not the time left.
         """
         infos = [{"TimeLimit.truncated": transition.truncated and not transition.terminated}]
-        observation, following = transition.observation, transition.next_observation
+        observation, next_observation = transition.observation, transition.next_observation
         action = self.model.policy.scale_action(np.asarray(transition.action)[None])[0]
         if self._image_shape is not None:
-            observation, following = (pack_observation(one, self._image_shape) for one in (observation, following))
-        observations, actions, next_observations = [observation], [action], [following]
+            observation = pack_observation(observation, self._image_shape)
+            next_observation = pack_observation(next_observation, self._image_shape)
+        observations, actions, next_observations = [observation], [action], [next_observation]
         if self.symmetry is not None:
             observations.extend(self.symmetry.observations @ observation)
             actions.extend(self.symmetry.actions @ action)
-            next_observations.extend(self.symmetry.observations @ following)
+            next_observations.extend(self.symmetry.observations @ next_observation)
         if self._num_privileged:
             observations = with_privileged(observations, transition.privileged, self.symmetry)
             next_observations = with_privileged(next_observations, transition.next_privileged, self.symmetry)
@@ -332,7 +333,7 @@ class OffPolicyLearner(Learner):
             return
         self.model.records_metrics = self.records_metrics
         self.model.train(self.config.gradient_steps, self.config.batch_size)
-        self.model.policy.set_training_mode(False)  # acting needs no dropout and no statistics of a batch
+        self.model.policy.set_training_mode(False)  # acting uses no dropout and no batch statistics
         if self.has_diverged():
             raise divergence_error()
         if self.averaged is not None:
@@ -350,7 +351,7 @@ class OffPolicyLearner(Learner):
         return recorded
 
     def actor(self) -> Any:
-        """Return the network whose mean is the greedy action: the averaged actor if there is one."""
+        """Return the network whose mean is the greedy action: the averaged actor, or without averaging the actor."""
         return self.model.actor if self.averaged is None else self.averaged
 
     def selected_actor(self) -> Any:
@@ -363,7 +364,7 @@ class OffPolicyLearner(Learner):
         return selected
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of `selected_actor`; `description` holds further entries of its description."""
+        """Return the policy of `selected_actor`; the entries of `description` are added to its description."""
         return export_policy(self.selected_actor(), description)
 
     def has_diverged(self) -> bool:
@@ -380,7 +381,7 @@ class OffPolicyLearner(Learner):
         return optimizers if entropy is None else optimizers | {"entropy": entropy}
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
+        """Return the state that a resumed run continues from: arrays by name, and JSON-serializable values."""
         arrays = module_arrays(self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
             arrays["log_ent_coef"] = self._log_ent_coef().detach().cpu().numpy()
@@ -402,7 +403,7 @@ class OffPolicyLearner(Learner):
         } | ({"demonstrated": buffer.num_demonstrated} if self.config.demonstration_fraction else {})
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Restore the result of `state`; raise KeyError, ValueError or RuntimeError if it does not fit this learner."""
+        """Restore a result of `state`; raise KeyError, ValueError or RuntimeError if it does not fit this learner."""
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         restore_modules(tensors, self._modules(), self._optimizers())
         if self._log_ent_coef() is not None:
@@ -424,7 +425,7 @@ class OffPolicyLearner(Learner):
         self._check_restored(arrays, values)
 
     def _check_restored(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Raise a ValueError if `state` differs from the restored state, for example because of another learner."""
+        """Raise a ValueError if `state` differs from the restored state, as that of another learner does."""
         own_arrays, own_values = self.state()
         different = {
             key for key in {*own_arrays, *arrays} if _array_key(own_arrays.get(key)) != _array_key(arrays.get(key))

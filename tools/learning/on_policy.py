@@ -89,8 +89,8 @@ class OnPolicyLearner(Learner):
     def on_step(self, transition: Transition) -> None:
         """Store a transition and train if the buffer is full.
 
-        A transition is not stored if the simulation failed in it, or if its action is not from `act`, such as a
-        supervisor's correction. The transition before it is then treated as the episode's last, as at a time limit.
+        A transition is not stored if the simulation failed in it, or if its action is not from `act`, as a supervisor's
+        correction. The previous transition is then treated as the episode's last, as at a time limit.
 
         Raises:
             InputError: If learning diverged.
@@ -103,7 +103,7 @@ class OnPolicyLearner(Learner):
             return
         action, value, log_prob = self._sampled
         reward = transition.reward
-        if transition.truncated and not transition.terminated:  # bootstrapped, because truncation is not termination
+        if transition.truncated and not transition.terminated:  # bootstrap, because the task did not end
             reward += self.model.gamma * float(self._value(transition.next_observation))
         starts = np.array([self._is_start])
         buffer.add(transition.observation[None], action.numpy(), np.array([reward]), starts, value, log_prob)
@@ -130,7 +130,7 @@ class OnPolicyLearner(Learner):
         return recorded
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy that takes the most probable action, with `description` added to its description."""
+        """Return the policy of the most probable action; the entries of `description` are added to its description."""
         network = self.model.policy
         layers = [*network.mlp_extractor.policy_net, network.action_net]
         return export_layers(layers, network.action_space, {"squash": "clip", **description})
@@ -140,7 +140,7 @@ class OnPolicyLearner(Learner):
         return not bool(torch.isfinite(parameters_to_vector(self.model.policy.parameters())).all())
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return everything that the rest of a run depends on: arrays by name, and values that JSON can hold."""
+        """Return the state that a resumed run continues from: arrays by name, and JSON-serializable values."""
         policy, buffer = self.model.policy, self.model.rollout_buffer
         arrays = module_arrays({"policy": policy}, {"policy": policy.optimizer})
         arrays |= {f"buffer/{name}": getattr(buffer, name)[: buffer.pos] for name in _BUFFER_ARRAYS if buffer.pos}
@@ -149,7 +149,7 @@ class OnPolicyLearner(Learner):
         return arrays | generators, values | states
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned; raise KeyError, ValueError or RuntimeError if it does not fit."""
+        """Restore a result of `state`; raise KeyError, ValueError or RuntimeError if it does not fit this learner."""
         tensors = {key: torch.from_numpy(np.array(value)) for key, value in arrays.items()}
         policy, buffer = self.model.policy, self.model.rollout_buffer
         restore_modules(tensors, {"policy": policy}, {"policy": policy.optimizer})

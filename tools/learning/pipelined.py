@@ -24,7 +24,6 @@ from guiderail.tools.evaluation.step_log import write_step_log
 from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import LEARNERS, Learner
-from guiderail.tools.learning.networks import SpacesOnlyEnv as SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 
 
@@ -35,12 +34,12 @@ class PipelinedLearner(Learner):
     long as an episode. With `waits`, an episode waits for these weights, so that the same seed gives the same run
     whatever the durations. Without `waits`, an episode starts at once with the newest weights.
 
-    Exploration and checkpoint selection stay in this process; the second one only trains.
+    Exploration and checkpoint selection stay in this process; the second process only trains.
 
     Attributes:
         known: Number of the submitted episodes that the current weights were learned from.
         submitted: Number of episodes submitted since construction; after a resumption it begins with 0 again.
-        late: Number of episodes that began before their weights were learned.
+        late: Number of episodes that began before the weights planned for them were learned.
     """
 
     def __init__(
@@ -58,8 +57,8 @@ class PipelinedLearner(Learner):
         Args:
             acting: Learner that acts; its weights are replaced as they are learned.
             arguments: Positional and keyword arguments of the learner in the training process, configuration first.
-            waits: Wait at the start of an episode until its weights are learned, as described above.
-            excluded: Terminations of episodes that are not learned from.
+            waits: True to wait at the start of an episode until its weights are learned, as described above.
+            excluded: Terminations of the episodes that are excluded from training.
             niceness: Niceness of the training process.
             imports: Modules, files (.py) or task folders that the training process imports, such as a module that
                 registers the learner.
@@ -116,7 +115,7 @@ class PipelinedLearner(Learner):
         self._acting.transitions += record_transition(self._transitions, transition)
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """End an episode; an excluded one does not count and does not advance the acting learner's `random`."""
+        """End an episode; an excluded episode does not count and does not advance the acting learner's `random`."""
         if row["termination"] in self._excluded:
             self._acting.transitions -= len(self._transitions)
             self._acting.episodes -= 1
@@ -149,7 +148,7 @@ class PipelinedLearner(Learner):
         return self.known == self.submitted
 
     def write(self, path: Path, table: pa.Table) -> None:
-        """Write a step log in the training process; a later call raises the error if that fails."""
+        """Write a step log in the training process; if writing fails, a later call raises the error."""
         self._send(("write", path, table))
 
     def finish(self) -> None:
@@ -179,7 +178,7 @@ class PipelinedLearner(Learner):
         return metrics
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of the acting learner; `description` holds further entries of its description."""
+        """Return the policy of the acting learner; the entries of `description` are added to its description."""
         return self._acting.policy(description)
 
     def has_diverged(self) -> bool:
@@ -195,18 +194,20 @@ class PipelinedLearner(Learner):
         arrays, values = self._acting.state()
         pending = self._pending or []
         stored = {
-            f"pending/{name}": np.array([getattr(one, name) for one in pending])
+            f"pending/{name}": np.array([getattr(transition, name) for transition in pending])
             for name in _STORED
             if pending and getattr(pending[0], name) is not None
         }
-        both = {f"acting/{k}": v for k, v in arrays.items()} | {f"learning/{k}": v for k, v in learned_arrays.items()}
-        return both | stored, {"acting": values, "learning": learned_values}
+        stored |= {f"acting/{name}": array for name, array in arrays.items()}
+        stored |= {f"learning/{name}": array for name, array in learned_arrays.items()}
+        return stored, {"acting": values, "learning": learned_values}
 
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Set the state to what `state` returned, and submit the pending episode.
+        """Restore a result of `state`, and submit the pending episode.
 
         Raises:
-            KeyError: If an entry is missing. ValueError and RuntimeError likewise mean that the state does not fit.
+            KeyError: If an entry is missing.
+            RuntimeError, ValueError: If the state does not fit this learner.
         """
         self._acting.restore(entries_of(arrays, "acting"), values["acting"])
         self._send(("restore", entries_of(arrays, "learning"), values["learning"]))
@@ -249,7 +250,7 @@ def _process_ended_error() -> InputError:
 
 
 def _serve(
-    pipe: Connection, niceness: int, imports: tuple[str, ...], given: tuple[Any, ...], named: dict[str, Any]
+    pipe: Connection, niceness: int, imports: tuple[str, ...], arguments: tuple[Any, ...], keywords: dict[str, Any]
 ) -> None:
     """Run the training process: answer requests until the other end of the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches both processes; the acting one handles it
@@ -262,13 +263,13 @@ def _serve(
         from guiderail.tools.imports import import_modules  # imports Drake, which takes a second
 
         import_modules(imports)
-    learner: Any = LEARNERS.get(given[0].algorithm)(*given, **named)
-    is_packaged = LEARNERS.is_packaged(given[0].algorithm)  # failures of a user's learner are one sentence
+    learner: Any = LEARNERS.get(arguments[0].algorithm)(*arguments, **keywords)
+    is_packaged = LEARNERS.is_packaged(arguments[0].algorithm)  # an error of a user's learner becomes an InputError
     while (message := requests.get()) != ("end",):
-        name, *arguments = message
+        name, *values = message
         try:
             with nullcontext() if is_packaged else naming_failures(f"{type(learner).__name__} in the training process"):
-                answer = _HANDLERS[name](learner, *arguments)
+                answer = _HANDLERS[name](learner, *values)
         except InputError as error:
             answer = error
         try:

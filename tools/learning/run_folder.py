@@ -29,7 +29,7 @@ from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
-# Options that may change within a run: via points are added during a supervised one, and a robot has another address.
+# Options that may change within a run: corrections add via-points, and a robot may have another address when resumed.
 CHANGING = ("via_points", "robot_url", "robot_timeout")
 _version = cache(metadata.version)  # cached, because it reads files
 
@@ -42,8 +42,8 @@ class RunConfig:
     environment: dict[str, Any]  # arguments of gymnasium.make
     learner: SkipValidation[LearnerConfig]  # all settings, an instance of the learner's `Config`
     preset: str | None  # preset that the learner's settings were derived from
-    # Planned number of episodes, with which --resume and a repeated run end at the same episode; `stop_after_successes`
-    # may end training earlier. The number of finished episodes is that of the rows of `episodes.csv`.
+    # Planned number of episodes. `stop_after_successes` may end training earlier; the table `episodes.csv` has one row
+    # for each finished episode.
     episodes: Annotated[int, Field(ge=1, le=MAX_EPISODES, strict=True)]
     seed: Annotated[int, Field(ge=0, lt=2**31, strict=True)]  # seed of all random numbers
     versions: dict[str, str] = field(default_factory=dict)  # versions of the packages that the result depends on
@@ -61,7 +61,7 @@ class RunConfig:
 
     @property
     def identity(self) -> str:
-        """Text of all that determines an episode; a resumed run may differ in the rest, such as `episodes`."""
+        """JSON text of all settings that determine an episode; a resumed run may change others, such as `episodes`."""
         environment = {name: value for name, value in self.environment.items() if name not in CHANGING}
         learner = config_values(self.learner) | ({"init_from": self.source} if self.source else {})
         return json.dumps([self.task, self.seed, environment, learner], sort_keys=True)
@@ -99,7 +99,7 @@ class RunFolder:
     """
 
     def __init__(self, path: Path | str):
-        """Construct the interface of the folder `path`, which need not exist."""
+        """Construct the interface of the folder `path`, which may be missing."""
         self.path = Path(path)
         self.checkpoint = self.path / "checkpoint" / "state.safetensors"
         self.steps, self.logs = self.path / "steps", self.path / "logs"
@@ -139,12 +139,12 @@ class RunFolder:
 
     def remove_unstarted(self, *, remove_folder: bool) -> None:
         """Remove the configuration of a run that has written nothing else, and with `remove_folder` the folder too."""
-        if [one.name for one in self.path.iterdir() if not one.name.startswith(".")] != ["config.yaml"]:
+        if [file.name for file in self.path.iterdir() if not file.name.startswith(".")] != ["config.yaml"]:
             return
         (self.path / "config.yaml").unlink()
         if remove_folder:
             (self.path / LOCK).unlink(missing_ok=True)
-            with suppress(OSError):  # the folder holds hidden files of the user
+            with suppress(OSError):  # the folder has hidden files of the user
                 self.path.rmdir()
 
     def refuse_existing(self) -> None:
@@ -181,8 +181,8 @@ class RunFolder:
         """Read the configuration of the run, and import the modules that register its task and learner.
 
         Raises:
-            InputError: If the folder is not a run, its configuration is invalid, or it names code to import
-                that is not trusted (`trust_imports`).
+            InputError: If the folder is not a run, its configuration is invalid, or the configuration names code that
+                is not trusted (`trust_imports`).
         """
         file = self.path / "config.yaml"
         try:
@@ -211,7 +211,7 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
 
     def write_episodes(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Replace `episodes.csv`; reading a number gives the same number, bit for bit."""
+        """Replace `episodes.csv`; numbers are written such that they are read back bit for bit."""
         write_atomically(self.path / "episodes.csv", table_text(rows).encode())
 
     def num_saved_episodes(self) -> int:
@@ -232,5 +232,5 @@ class RunFolder:
 
 
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of an environment with tuples in place of the lists that YAML has."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in dict(environment).items()}
+    """Return the arguments of an environment with each list, as read from YAML, converted to a tuple."""
+    return {key: tuple(value) if isinstance(value, list) else value for key, value in environment.items()}

@@ -82,10 +82,10 @@ class Run:
 
     @property
     def summary(self) -> dict[str, Any]:
-        """Statistics of training, and the paths of the pictures; no collisions if the task declares no collision."""
+        """Statistics of training, and the paths of the pictures; `collisions` is None if the task declares none."""
         rows = self.episodes
         recent, values = own_episodes(rows)["success"].tail(10), summary(rows, SUMMARY)
-        config = load_yaml(self.path / "config.yaml", "configuration")  # `self.config` would import what it names
+        config = load_yaml(self.path / "config.yaml", "configuration")  # `self.config` would import modules
         if not counts_collisions(config["task"]):
             values["collisions"] = None
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"
@@ -135,8 +135,8 @@ def train(
             default.
         callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after the
             episode.
-        resume: Continue a run that was stopped; the result is that of an uninterrupted run. `episodes` may be any
-            number from that of the finished episodes on: nothing in training depends on the planned number.
+        resume: Continue a run that was stopped; the result is that of an uninterrupted run. `episodes` may be changed
+            to any number of at least the finished episodes, because training does not depend on the planned number.
         pictures: Draw the learning curve and the replay page after training.
         **options: Options of the environment, such as `station`, `reward` or `fixture_offset`.
 
@@ -168,7 +168,7 @@ def train(
 
 
 def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mapping[str, Any]) -> None:
-    """Raise an InputError if the environment refuses its options, and one has nearly the name of an argument."""
+    """Raise an InputError if the environment refuses its options, and an option resembles an argument of `train`."""
     for name in options:
         if near := get_close_matches(name.lower(), signature(train).parameters.keys() - {"task", "options"}, 1, 0.8):
             try:
@@ -227,19 +227,19 @@ def start_or_resume(
         folder.refuse_existing()
         given["settings"] = settings
         config = configure(task, environment, imports=imports, **with_defaults(task, given))
-    shown = config.learner.demonstration_episodes
-    if isinstance(config.learner, OffPolicyConfig) and shown >= config.episodes:
+    num_demonstrated = config.learner.demonstration_episodes
+    if isinstance(config.learner, OffPolicyConfig) and num_demonstrated >= config.episodes:
         _LOGGER.warning(
             "the scripted policy acts in every episode and the learned one in none, because demonstration_episodes is "
             "%d: give more than %d episodes",
-            shown,
-            shown,
+            num_demonstrated,
+            num_demonstrated,
         )
     if not resume:
         warn_of_unfinished_source(config)
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
-    demonstrator = make_baseline(config.task, "scripted") if config.learner.demonstration_episodes else None
+    demonstrator = make_baseline(config.task, "scripted") if num_demonstrated else None
     supervisor = make_supervisor() if config.human_in_the_loop and make_supervisor is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         run_training(
@@ -253,7 +253,7 @@ def start_or_resume(
 
 
 def warn_of_unfinished_source(config: RunConfig) -> None:
-    """Warn if the run that the learner's setting `init_from` names is unfinished; its checkpoint is used then."""
+    """Warn if the run that the setting `init_from` names is unfinished, and that training starts from its checkpoint."""
     name = getattr(config.learner, "init_from", "")
     source = RunFolder(name)
     if name and source.checkpoint.is_file() and not (source.path / "policy.json").is_file():

@@ -60,8 +60,8 @@ def run_training(
     """Train a run to its last episode and write its folder.
 
     A run that was killed and resumed gives bit for bit the result of an uninterrupted run: a checkpoint is written at
-    the end of an episode and holds everything that the rest of the run depends on, random generators included. The
-    step log is written before the checkpoint; episodes after the last checkpoint are run and logged again.
+    the end of an episode and has all state that later episodes depend on, including the random generators. The step log
+    is written before the checkpoint; episodes after the last checkpoint are run and logged again.
 
     Args:
         folder: Folder of the run; with `resume`, that of the run to continue.
@@ -87,8 +87,7 @@ def run_training(
     """
     if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
         raise InputError(
-            "parallel actors have no supervisor and are pipelined already: leave num_envs, or pipelined and "
-            "--human-in-the-loop, out"
+            "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
         )
     if config.human_in_the_loop and supervisor is None:
         raise InputError("this run has a supervisor: give --human-in-the-loop")
@@ -129,9 +128,10 @@ def run_training(
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
             callbacks = closed_first.enter_context(closing(Sb3Callbacks(sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
-        stack.enter_context(closed_first.pop_all())  # the lock is released last, as all of these write into the folder
+        stack.enter_context(closed_first.pop_all())  # the lock is released last: all of these write into the folder
         if config.learner.pipelined:
-            from guiderail.tools.learning.pipelined import PipelinedLearner, SpacesOnlyEnv
+            from guiderail.tools.learning.networks import SpacesOnlyEnv
+            from guiderail.tools.learning.pipelined import PipelinedLearner
 
             child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
             learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
@@ -152,8 +152,8 @@ def run_training(
                 folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
             )
         except InputError:
-            # A folder that holds only a configuration would make the user's next attempt fail.
-            # The folder of a learner that diverged is kept.
+            # The next attempt would refuse a folder that has only a configuration. If the learner diverged, the folder
+            # stays.
             if not resume and not learner.has_diverged():
                 folder.remove_unstarted(remove_folder=is_new_folder)
             raise
@@ -186,7 +186,7 @@ def _train(
         env, config = supervised.env, supervised.config
     folder.write_config(config)
     if resume and len(rows) < config.episodes and not _ends_with_successes(rows, config.learner.stop_after_successes):
-        folder.remove_policy()  # otherwise a run killed from here on leaves an outdated policy
+        folder.remove_policy()  # a run that is killed later must not leave an outdated policy
 
     step_log = StepLog(env, folder.steps)
     callbacks: list[Callback] = [step_log] if config.step_log else []
@@ -233,7 +233,7 @@ def _train(
         if is_last:
             break
     learner.finish()
-    remove_step_logs(folder.steps, len(rows))  # of episodes that actors simulated ahead of an early end
+    remove_step_logs(folder.steps, len(rows))  # episodes that actors simulated ahead before training ended early
     learning_log.record(rows, learner.metrics, is_finished=True)
     learned_policy(config, learner, env).save(folder.path, write=write_atomically)
     return rows
@@ -267,7 +267,7 @@ def _has_diverged(learner: Learner) -> bool:
 
 def _ends_with_successes(rows: Sequence[Mapping[str, Any]], number: int) -> bool:
     """Return True if the last `number` episodes are successes of the learner itself; False if `number` is 0."""
-    last = rows[-number:] if number else []
+    last = rows[-number:]
     return len(last) == number > 0 and all(row["success"] and not row.get("is_demonstration") for row in last)
 
 
@@ -295,7 +295,7 @@ def _save(
     env: Any,
     supervised: SupervisedTraining | None,
 ) -> None:
-    """Write the checkpoint, which holds the table too, and then the table: a kill between the two loses nothing."""
+    """Write the checkpoint, which includes the table, and then the table: a kill in between loses nothing."""
     write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())
     if supervised is not None:
         folder.write_config(supervised.config)
@@ -313,8 +313,8 @@ def write_checkpoint(
     """Write the checkpoint: the run's identity, the episodes' rows, the states of learner and environment, and `more`.
 
     Raises:
-        InputError: If `Learner.state` does not return arrays of numbers by name, and values that JSON can hold and
-            does not change; or if `Learner.state` of a user's learner fails.
+        InputError: If `Learner.state` does not return arrays of numbers by name and values that JSON stores unchanged,
+            or if `Learner.state` of a user's learner fails.
     """
     with _naming_failures(config, f"{type(learner).__name__}.state"):
         state = learner.state()
@@ -328,7 +328,7 @@ def write_checkpoint(
         json.dumps(values)
     except (TypeError, ValueError) as error:
         raise InputError(f"the values of {type(learner).__name__}.state must be values of JSON: {error}") from error
-    for changed in _changed_by_json(values):
+    if changed := next(_changed_by_json(values), None):
         raise InputError(
             f"the values of {type(learner).__name__}.state must not contain {changed}, because JSON changes it: use "
             "lists, and text as keys"
@@ -343,7 +343,7 @@ def write_checkpoint(
 
 
 def _changed_by_json(value: Any) -> Iterator[str]:
-    """Yield a description of each tuple, and of each key that is not a text, of values that JSON can hold."""
+    """Yield a description of each tuple and each key that is not text, in JSON-serializable values."""
     if isinstance(value, tuple):
         yield f"the tuple {brief(value)}"
     elif isinstance(value, Mapping):
@@ -365,8 +365,8 @@ def restore_checkpoint(
         between writing the two files. Without both files, there are no rows.
 
     Raises:
-        InputError: If the checkpoint is missing or damaged, its run had another task, seed, environment or learner
-            than `config`, its rows differ from `episodes.csv`, or its state is that of another learner.
+        InputError: If the checkpoint is missing or damaged, belongs to another task, seed, environment or learner than
+            `config`, or contains rows that differ from `episodes.csv`.
     """
     table = folder.path / "episodes.csv"
     if not folder.checkpoint.exists() and not table.exists():
@@ -382,15 +382,14 @@ def restore_checkpoint(
         written: Sequence[Mapping[str, Any]] | Any = folder.episodes() if table.exists() else []
         if table_text(written) != table_text(rows[: len(written)]):
             raise InputError(
-                f"{table} is not the table of its checkpoint: restore it, or remove it to have it written again"
+                f"{table} differs from the table in its checkpoint: restore it, or remove it to have it written again"
             )
         with _naming_failures(config, f"{type(learner).__name__}.restore", *_UNFIT):
             learner.restore(arrays, values["learner"])
         env.unwrapped.np_random.bit_generator.state = values["environment"]
     except InputError:
         raise
-    # The digest matches, so the content is complete but of another learner.
-    except _UNFIT as error:
+    except _UNFIT as error:  # the digest matches, so the content is complete, but of another learner
         raise InputError(
             f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
         ) from error

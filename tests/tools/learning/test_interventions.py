@@ -185,7 +185,7 @@ def test_supervised_run_resumes_with_its_corrections(tmp_path):
 
 
 def test_corrections_are_refused_without_demonstrations():
-    with pytest.raises(InputError, match="does not use"):
+    with pytest.raises(InputError, match="has no demonstrations to correct"):
         ViaPointCorrections("Pouring", {})
 
 
