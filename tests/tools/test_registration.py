@@ -61,7 +61,7 @@ class Loose:
         (lambda: register_end_effector(3), "an end effector is registered as an EndEffector object, not 3"),
         (lambda: register_learner("mine", 3), "registered with a function or a class, not with 3"),
         (lambda: register_learner("mine", build), "the learner mine has no Config"),
-        (lambda: register_learner("mine", learner(dict)), "Config of mine must be a pydantic dataclass made of Learn"),
+        (lambda: register_learner("mine", learner(dict)), "Config of mine must be a pydantic dataclass based on Learn"),
         (lambda: register_learner("mine", learner(None)), "Config of mine must be a pydantic dataclass .*, not None"),
         (lambda: register_learner("mine", learner(Loose)), "Config of mine must be a pydantic dataclass"),
     ],

@@ -1,4 +1,4 @@
-"""Guidance around any Gymnasium environment, or several: the action moves a demonstrated motion within constraints."""
+"""Wrappers that add guidance to any Gymnasium environment: the action moves a demonstrated motion in constraints."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from guiderail.tools.guided.guide import (
 from guiderail.tools.guided.segment import Constraints, Segment
 
 OBSERVED = ("phase", "command")
-SUCCESSES = ("is_success", "success")  # entries of `info` that say whether the task is done
+SUCCESSES = ("is_success", "success")  # entries of `info` that report success
 
 
 class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -47,8 +47,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     - `constraint_violation`: largest violation by the commands of the action. It is negative inside the constraints,
       0 inside those of a template, and −inf without constraints. It is at most 1e-9 for guidance that enforces the
       constraints, except while a motion that began outside `MotionConstraints` or outside a template moves inside.
-    - `fallback`: number of the action's steps without a solution, in which only braking was left, or in which a segment
-      exceeded its largest acceleration because the motion was too fast to brake within its other constraints.
+    - `fallback`: number of the action's steps with a fallback command: no solution was found, only braking was
+      feasible, or a segment exceeded its largest acceleration to brake within its other constraints.
     - `phase`: phase of the motion, 0 to 1.
     - `command`: last command (O,) in the world.
     - `segment`: name of the segment or of the template's state.
@@ -56,17 +56,18 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     Args:
         env: Environment to wrap; its own action is what `to_action` returns.
-        demonstrations: One motion in the world or in `frame`, its file, or segments with frames of their own; at least
-            three demonstrations each, from whose spread the kernel is selected.
+        demonstrations: Demonstrations of one motion in the world or in `frame`, their file, or a list of `Segment`; at
+            least three demonstrations for each, because the kernel is selected from their spread.
         pose: (env, observation) → measured outputs (O,) in the world, such as a position, or a position and an
             orientation (see `orientation`).
         to_action: (env, observation, command, extra) → action of `env` that reaches the command (O,); `extra` is the
             segment's discrete output, such as a gripper command.
         guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (the action is added to the motion,
             without constraints), "clipped_residual" (as "residual", moved to the nearest point within the linear
-            constraints), "template", or a `Guide`, with which arguments about the motion are ignored. A guide holds an
-            episode, so that each environment needs its own: give `Guide.copy()` to another one.
-        constraints: Constraints of a single motion without segments; `Segment` has its own.
+            constraints), "template", or a `Guide`. A guide replaces the arguments about the motion: settings such as
+            `horizon` are ignored, and the others are refused. Each environment needs its own guide, which stores the
+            state of an episode: give `Guide.copy()` to another environment.
+        constraints: Constraints of a single motion without segments, as in `Segment`.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
         template_frames: (env, observation) → poses X_WF of the template's objects by name, called at reset; each is a
@@ -74,8 +75,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         period: Duration of a step of `env` [s], positive; required for a template, for `MotionConstraints`, and unless
             every segment has `num_steps`.
         action_repeat: Steps of `env` for which an action is applied, at least 1.
-        action_scale: κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the
-            demonstrations; exactly so for a declared standard deviation (`prior_std`).
+        action_scale: κ. A constant action of ±1 displaces the motion by about √3 κ standard deviations of the
+            demonstrations, and by exactly √3 κ declared standard deviations (`prior_std`).
         action_dims: Indices of the outputs that an action moves; all by default.
         history: P, number of past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
@@ -83,7 +84,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         orientation: Meaning of the last three of six outputs: "euler_zyx" for angles [Rz Ry Rx], or "rotation_vector".
             By default, that of the demonstrations' names ("Rz [rad]", "Ry [rad]", "Rx [rad]" are Euler angles), and
             "rotation_vector" for other names.
-        observe: What is appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
+        observe: Terms appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
             command in the segment's frame, scaled to the demonstrations' range. The command of a template is in the
             template's first frame, in units of 0.2 m and π.
 
@@ -132,11 +133,11 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if orientation is not None:
             check_orientation(orientation)
         if isinstance(guidance, Guide):
-            others = {
+            unused = {
                 "demonstrations": demonstrations, "constraints": constraints, "frame": frame, "template": template,
                 "template_frames": template_frames, "action_dims": action_dims, "orientation": orientation,
             }  # fmt: skip
-            if superfluous := [name for name, value in others.items() if value is not None]:
+            if superfluous := [name for name, value in unused.items() if value is not None]:
                 raise InputError(f"a guide does not use {superfluous[0]}: leave it out, or give the guide's name")
             self.guide = guidance
         elif guidance == "template":
@@ -144,8 +145,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
                 raise InputError("guidance by a template needs template= and template_frames=")
             if orientation == "rotation_vector":
                 raise InputError("poses of a template are [x y z Rz Ry Rx]: leave orientation out")
-            others = {"demonstrations": demonstrations, "constraints": constraints, "frame": frame}
-            if superfluous := [name for name, value in others.items() if value is not None]:
+            unused = {"demonstrations": demonstrations, "constraints": constraints, "frame": frame}
+            if superfluous := [name for name, value in unused.items() if value is not None]:
                 raise InputError(f"guidance by a template does not use {superfluous[0]}: leave it out")
             if not isinstance(template, SharedControlTemplate):
                 template = load_template(template)
@@ -157,7 +158,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self.action_repeat, self._observe = int(action_repeat), observed
         self._pose, self._to_action = pose, to_action
         self._command: GuideCommand | None = None
-        self._is_pending = False  # True if an error kept the environment from a step with `_command`
+        self._is_pending = False  # True if an error prevented the step with `_command`
         self._observation: Any = None
         self._has_begun = False
         self._num_steps = 0
@@ -171,7 +172,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         Raises:
             InputError: If the measured pose is not (O,) finite numbers, or a frame or constraints are invalid.
         """
-        self._has_begun = False  # an error leaves no episode to continue
+        self._has_begun = False  # after an error below, no episode can be stepped
         self._observation, info = self.env.reset(seed=seed, options=options)
         self._terminated = self._truncated = self._is_pending = False
         self._num_steps = 0
@@ -184,8 +185,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Apply an action (A,) for `action_repeat` steps of the environment, or until the episode ends.
 
         Raises:
-            InputError: If the action is not (A,) finite numbers (the environment has not moved then), or the measured
-                pose is not (O,) finite numbers.
+            InputError: If the action is not (A,) finite numbers, in which case the environment is not stepped, or the
+                measured pose is not (O,) finite numbers.
             ResetNeeded: If no episode has begun, or the episode has ended.
         """
         self.begin_action(action)
@@ -194,10 +195,10 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self.end_action()
 
     def begin_action(self, action: Any) -> None:
-        """Begin an action, which `request`, `advance` and `end_action` then apply in step with other environments.
+        """Begin an action; `request`, `advance` and `end_action` apply it step by step, alongside other environments.
 
         Raises:
-            InputError: If the action is not (A,) finite numbers; one outside [−1, 1] is clipped.
+            InputError: If the action is not (A,) finite numbers; entries outside [−1, 1] are clipped.
             ResetNeeded: If no episode has begun, or the episode has ended.
         """
         if not self._has_begun:
@@ -220,7 +221,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def request(self) -> Any:
         """Return the request for the next step's prediction, or None if the step needs no prediction.
 
-        After an error in `to_action` or in the environment, the next step repeats the command, whatever the action.
+        After an error in `to_action` or in the environment, the next step repeats the command and ignores the action.
 
         Raises:
             InputError: If the measured pose is not (O,) finite numbers.
@@ -232,8 +233,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Step the environment with the predicted output (O,); None without a request or a solution.
 
         Raises:
-            InputError: If `to_action` returns no action of the environment (it has not moved then), or the environment
-                returns a reward that is not finite or an observation with NaN.
+            InputError: If `to_action` returns an invalid action, in which case the environment is not stepped, or the
+                environment returns a reward that is not finite or an observation with NaN.
         """
         command = self._command
         if command is None or not self._is_pending:
@@ -271,13 +272,13 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return self._extended(), self._reward, bool(self._terminated), bool(self._truncated), info
 
     def _check_action(self, action: Any) -> None:
-        """Raise an InputError if the result of `to_action` has another shape than the actions, or is not finite."""
+        """Raise an InputError if the result of `to_action` does not have the shape of an action, or is not finite."""
         space = self.env.action_space
         if not isinstance(space, Box):
             return
         try:
             is_action = np.shape(action) == space.shape and bool(np.isfinite(action).all())
-        except (TypeError, ValueError):  # no numbers, or ragged
+        except (TypeError, ValueError):  # not numbers, or ragged
             is_action = False
         if not is_action:
             raise InputError(f"to_action must return finite numbers of shape {space.shape}, not {brief(action)}")
@@ -294,8 +295,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not extra:
             return space
         if isinstance(space, Box) and len(space.shape) == 1:
-            low = np.concatenate([space.low, *(one.low for one in extra.values())])
-            high = np.concatenate([space.high, *(one.high for one in extra.values())])
+            low = np.concatenate([space.low, *(box.low for box in extra.values())])
+            high = np.concatenate([space.high, *(box.high for box in extra.values())])
             return Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
         if isinstance(space, Dict):
             if taken := sorted(extra.keys() & space.spaces.keys()):
@@ -320,7 +321,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def _has_nan(observation: Any) -> bool:
-    """Return True if an observation, or an entry of one, is an array of floating-point numbers with NaN."""
+    """Return True if an observation, or one of its entries, is an array of floating-point numbers with NaN."""
     if isinstance(observation, Mapping):
         return any(map(_has_nan, observation.values()))
     return isinstance(observation, np.ndarray) and observation.dtype.kind == "f" and bool(np.isnan(observation).any())
@@ -341,9 +342,9 @@ def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment
 
 
 class GuidedVectorEnv(SyncVectorEnv):
-    """Vector environment of `GuidedEnv`s that share their guidance; each behaves like a single `GuidedEnv`.
+    """Vector environment of `GuidedEnv`s that share fitted primitives; each behaves like a single `GuidedEnv`.
 
-    The guidance is fitted once. `LcNsKmp.predict_batch` computes the predictions of all environments at a control step.
+    The primitives are fitted once. `LcNsKmp.predict_batch` computes the predictions of all environments in each step.
     An environment is reset in the step after the end of its episode (`AutoresetMode.NEXT_STEP`).
 
     Args:
@@ -351,8 +352,8 @@ class GuidedVectorEnv(SyncVectorEnv):
         **keywords: Keywords of `GuidedEnv`.
 
     Raises:
-        InputError: As `GuidedEnv`, or if `env_fns` is empty, holds something else than functions, or two of them return
-            the same environment.
+        InputError: As `GuidedEnv`, or if `env_fns` is empty, has an entry that is no function, or two of its functions
+            return the same environment.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
@@ -375,8 +376,8 @@ class GuidedVectorEnv(SyncVectorEnv):
         """Apply actions (B, A); return observations, rewards (B,), terminations (B,), truncations (B,) and infos.
 
         Raises:
-            InputError: If the actions are not (B, A) finite numbers (no environment has moved then), or a measured pose
-                is not (O,) finite numbers.
+            InputError: If the actions are not (B, A) finite numbers, in which case no environment is stepped, or a
+                measured pose is not (O,) finite numbers.
             ResetNeeded: If no episode has begun.
         """
         actions = as_numbers(actions, "actions")
@@ -393,11 +394,11 @@ class GuidedVectorEnv(SyncVectorEnv):
                 env.advance(output)
         results = {i: env.end_action() for env, i in zip(guided, stepped, strict=True)}
         infos: dict[str, Any] = {}
-        for i, one in enumerate(self.envs):
+        for i, env in enumerate(self.envs):
             if i in results:
                 self._env_obs[i], self._rewards[i], self._terminations[i], self._truncations[i], info = results[i]
             else:
-                self._env_obs[i], info = one.reset()
+                self._env_obs[i], info = env.reset()
                 self._rewards[i], self._terminations[i], self._truncations[i] = 0.0, False, False
             infos = self._add_info(infos, info, i)
         self._observations = gymnasium.vector.utils.concatenate(
@@ -409,7 +410,7 @@ class GuidedVectorEnv(SyncVectorEnv):
 
 
 def _predict_batch(requests: list[Any]) -> list[np.ndarray | None]:
-    """Return the outputs of requested predictions, batched by primitive; None without a request or a solution."""
+    """Compute requested predictions, batched by primitive; an output is None without a request or a solution."""
     groups: dict[int, list[int]] = defaultdict(list)
     outputs: list[np.ndarray | None] = [None] * len(requests)
     for i, request in enumerate(requests):

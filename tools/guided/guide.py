@@ -1,4 +1,4 @@
-"""Guides, which compute commands from a policy's actions and from demonstrations or a shared control template."""
+"""Guides: compute commands from a policy's actions and demonstrations, or a shared control template."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ class GuideCommand:
     """Command of one control step."""
 
     output: np.ndarray  # command (O,) in the world
-    # Violation of the segment's constraints, negative inside and −inf without constraints; of a template's, 0 inside.
+    # Constraint violation: negative inside a segment's constraints, 0 inside a template's, −inf without constraints.
     violation: float
-    # True if no command within the constraints was found, so that the command is the last one or near it, if only
-    # braking was left, or if a segment that began too fast exceeded its largest acceleration.
+    # True if no prediction within the constraints was found, so that the last command is repeated or projected onto the
+    # constraints, if only braking was feasible, or if a segment that began too fast exceeded its largest acceleration.
     is_fallback: bool
     extra: Any  # discrete output of the segment, for `to_action`
 
@@ -59,7 +59,7 @@ class Guide(ABC):
     num_actions: int
 
     def copy(self) -> Guide:
-        """Return a guide for another environment, with an episode of its own and the same fitted parts."""
+        """Return a guide for another environment, which shares the fitted parts but not the episode."""
         return copy(self)
 
     @abstractmethod
@@ -68,7 +68,7 @@ class Guide(ABC):
 
     @abstractmethod
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
-        """Begin a control step; return the request of the prediction that `finish` needs, or None.
+        """Begin a control step; return the request for the prediction that `finish` needs, or None.
 
         Args:
             env: Environment, for the callables of segments and templates.
@@ -79,7 +79,7 @@ class Guide(ABC):
 
     @abstractmethod
     def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step with the predicted output (O,); None without a request or a solution."""
+        """Complete the control step with the predicted output (O,), or None without a request or a solution."""
 
     @property
     @abstractmethod
@@ -117,32 +117,32 @@ class _FittedSegment:
         self.center = 0.5 * (samples.max(axis=0) + samples.min(axis=0))
         self.half_range = np.maximum(0.5 * np.ptp(samples, axis=0), deviation(self.reference))
         self._primitive: LcNsKmp | None = None
-        given = segment.constraints
-        if not callable(given):
-            self.primitive_for(self.as_constraints(given))  # refuses invalid constraints before an episode
+        if not callable(segment.constraints):
+            self.primitive_for(self.as_linear(segment.constraints))  # refuses invalid constraints before an episode
 
-    def as_constraints(self, given: Any) -> LinearConstraints:
-        """Return the linear constraints in `given`; demonstrated bounds become a box for each step.
+    def as_linear(self, constraints: Any) -> LinearConstraints:
+        """Return the linear constraints of a segment; demonstrated bounds become a box for each step.
 
         Raises:
-            InputError: If they are no constraints, do not fit the reference, or have limits that a residual exceeds.
+            InputError: If the value is no constraint, does not fit the reference, or has limits of the motion that
+                residual guidance does not enforce.
         """
-        if given is None:
+        if constraints is None:
             return LinearConstraints.none(self.num_outputs)
-        if isinstance(given, DemonstratedBounds):
-            phase = phases_of_steps(given.phases, self.num_steps) if len(given.phases) > 1 else 0
-            given = LinearConstraints.box(given.lower[phase], given.upper[phase])
-        if isinstance(given, MotionConstraints):
+        if isinstance(constraints, DemonstratedBounds):
+            phase = phases_of_steps(constraints.phases, self.num_steps) if len(constraints.phases) > 1 else 0
+            constraints = LinearConstraints.box(constraints.lower[phase], constraints.upper[phase])
+        if isinstance(constraints, MotionConstraints):
             if "residual" in self.guidance:
-                _refuse_limits(given)
-            given = given.linear
-        if not isinstance(given, LinearConstraints):
-            raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(given)}")
-        given.check_sizes(self.num_outputs, self.num_steps)
-        return given
+                _refuse_limits(constraints)
+            constraints = constraints.linear
+        if not isinstance(constraints, LinearConstraints):
+            raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(constraints)}")
+        constraints.check_sizes(self.num_outputs, self.num_steps)
+        return constraints
 
     def primitive_for(self, constraints: LinearConstraints) -> tuple[LcNsKmp, np.ndarray]:
-        """Return the primitive with these constraints, built only when they change, and the gains (O,)."""
+        """Return the primitive with these constraints, rebuilt only if the constraints change, and its gains (O,)."""
         current = self._primitive
         if current is None or not (
             np.array_equal(current.constraints.G, constraints.G)
@@ -182,7 +182,7 @@ class GuideSettings:
     history: int = 4  # P, number of past outputs that the motion of sKGRL passes through
     history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
     horizon: int = 20  # H, number of future points at which the constraints are satisfied
-    # Meaning of the last three of six outputs; None for that of the demonstrations' names, or else "rotation_vector".
+    # Representation of the last three of six outputs; None: by the demonstrations' names, otherwise "rotation_vector".
     orientation: Orientation | None = None
 
     def __post_init__(self) -> None:
@@ -251,7 +251,7 @@ class PrimitiveGuide(Guide):
         self.frame = frame if isinstance(frame, Frame) else Frame(frame)
         given = segment.constraints
         given = given(env, observation) if callable(given) else given
-        self.constraints = fitted.as_constraints(given)
+        self.constraints = fitted.as_linear(given)
         is_enforced = "residual" not in self.guidance
         self._motion, motion_filter = given if isinstance(given, MotionConstraints) else None, None
         if self._motion is not None and is_enforced:
@@ -264,7 +264,7 @@ class PrimitiveGuide(Guide):
         length = max(primitive.history, 1 if motion_filter is None else 2)  # a filter continues the last velocity
         recent = self._recent[-length:]
         past = [self.frame.to_frame(recent[-1], self._orientation, fitted.reference.means[0])]
-        for output in recent[-2::-1]:  # each orientation is near the next one, so that none jumps by a full turn
+        for output in recent[-2::-1]:  # each orientation is near the next, without jumps by a full turn
             past.insert(0, self.frame.to_frame(output, self._orientation, past[0]))
         past = [past[0]] * (length - len(past)) + past
         start = past[-1] if primitive.history == 0 and motion_filter is None else np.array(past)
@@ -296,7 +296,7 @@ class PrimitiveGuide(Guide):
             output = output + self._residual
             if self.guidance == "clipped_residual":
                 output = self.constraints.nearest(output, step)
-        extra = self._extra(self._step)  # a function of the user, whose error must not skip a command
+        extra = self._extra(self._step)  # may call a function of the user, whose error must not skip a command
         command = self._stepper.finish(output)
         self._last = command.output
         world = self.frame.to_world(command.output, self._orientation)
@@ -339,14 +339,14 @@ class PrimitiveGuide(Guide):
 
 
 def _refuse_limits(motion: MotionConstraints) -> None:
-    """Raise an InputError if limits are given, for guidance that does not enforce them."""
+    """Raise an InputError if the motion has limits, which residual guidance does not enforce."""
     limits = [name for name in ("max_speed", "max_acceleration") if np.isfinite(getattr(motion, name)).any()]
     if names := " and ".join([*limits, *(["state"] if motion.state else [])]):
         raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
 def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[int]:
-    """Return the indices of the outputs that an action moves; refuse others than distinct indices."""
+    """Return the indices of the outputs that an action moves; raise an InputError unless they are distinct indices."""
     if action_dims is None:
         return list(range(num_outputs))
     given = list(action_dims) if isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1 else [-1]
@@ -358,11 +358,11 @@ def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[i
 
 
 def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> Orientation:
-    """Return the orientation `given`, or else that of the outputs' names; refuse names that contradict it."""
+    """Return the orientation `given`, or that of the outputs' names; raise an InputError if both differ."""
     if given is not None:
         check_orientation(given)
         if (number := segments[0].recorded.num_outputs) != POSE_SIZE:
-            raise InputError(f"orientation is that of poses of 6 outputs, and there are {number}: leave it out")
+            raise InputError(f"orientation needs poses of 6 outputs, and there are {number}: leave it out")
     orientation = given
     for segment in segments:
         stated = orientation_of_names(segment.recorded.names)
@@ -406,7 +406,7 @@ class TemplateGuide(Guide):
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin in the template's state at the measured pose.
+        """Begin in the template's state for the measured pose.
 
         Raises:
             InputError: If the pose of an object is missing or no transform, a pose is not finite, or the measured pose

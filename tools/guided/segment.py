@@ -1,4 +1,4 @@
-"""Segments of a motion: demonstrations in a frame of their own, constraints and discrete outputs."""
+"""Segments of a motion: demonstrations in a segment's frame, constraints and discrete outputs."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Frame:
         Args:
             output: Output (O,) in W.
             orientation: Meaning of the last three of six entries.
-            near: Output (O,) in F. If O is 6, full turns are added to the orientation so that it is nearest to that of
+            near: Output (O,) in F. If O is 6, full turns are added to the orientation to bring it nearest to that of
                 `near`.
 
         Raises:
@@ -111,14 +111,14 @@ class Segment:
         frame: (env, observation) → `Frame` or its origin, called when the segment begins; the world by default.
         constraints: Constraints in the frame, or (env, observation) → constraints, called when the segment begins.
         extra: Value for `to_action` that the policy does not change, such as a gripper command, or a function (phase,
-            is_held) → value: the phase of the segment from 0 to 1, and true while its last point is held. By default,
-            the value of `discrete`.
+            is_held) → value. The phase of the segment is from 0 to 1; is_held is true while the last point is held. By
+            default, the value of `discrete`.
         discrete: Discrete outputs recorded with the demonstrations, M arrays (N_m,) or (N_m, D): each control step has
             the most frequent value of the demonstrations at its phase.
-        until: (env, observation) → true to end the segment early, called before each step but its first; by default
-            it ends after `num_steps` and `dwell`.
+        until: (env, observation) → true to end the segment early, called before each step except the first; by default
+            the segment ends after `num_steps` and `dwell`.
         num_steps: Control steps, at least 12; by default the mean duration of the demonstrations in periods, plus one.
-            Demonstrations of four to ten periods are slowed down to 12 steps.
+            Demonstrations of 4 to 10 periods are slowed down to 12 steps.
         dwell: Control steps for which the last point is held after `num_steps`.
         floor: Standard deviation (O,) or scalar whose square is added to every variance [unit of the output].
         name: Name of the segment, in `info`.
@@ -156,7 +156,7 @@ class Segment:
 
     @cached_property
     def recorded(self) -> Demonstrations:
-        """Demonstrations, read from the file if the segment was given one."""
+        """Demonstrations, read from the segment's file if `demonstrations` is a path."""
         given = self.demonstrations
         return given if isinstance(given, Demonstrations) else Demonstrations.load(given)
 
@@ -183,7 +183,7 @@ class Segment:
         """Return the most frequent discrete output of the demonstrations for each control step, or None.
 
         Raises:
-            InputError: If there is not one discrete output, a scalar or (D,), for each sample of each demonstration.
+            InputError: Unless each sample of each demonstration has one discrete output, a scalar or (D,).
         """
         if self.discrete is None:
             return None
@@ -234,9 +234,7 @@ def cut_demonstrations(demonstrations: Demonstrations, cuts: Sequence[Sequence[i
     for m, (t, y, at) in enumerate(zip(demonstrations.times, demonstrations.outputs, lists, strict=True)):
         edges = [0, *(int(k) if is_whole(k, 0) else -1 for k in at), len(t) - 1]
         if min(np.diff(edges)) < 1:
-            raise InputError(
-                f"the cuts of demonstration {m} must be indices that increase inside of it, not {brief(at)}"
-            )
+            raise InputError(f"the cuts of demonstration {m} must be increasing indices inside it, not {brief(at)}")
         for (times, outputs), first, last in zip(parts, edges[:-1], edges[1:], strict=True):
             times.append(t[first : last + 1] - t[first])
             outputs.append(y[first : last + 1])

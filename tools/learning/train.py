@@ -253,7 +253,7 @@ def start_or_resume(
 
 
 def warn_of_unfinished_source(config: RunConfig) -> None:
-    """Warn if the run that the setting `init_from` names is unfinished, and that training starts from its checkpoint."""
+    """Warn if the run that the setting `init_from` names is unfinished; training starts from its checkpoint."""
     name = getattr(config.learner, "init_from", "")
     source = RunFolder(name)
     if name and source.checkpoint.is_file() and not (source.path / "policy.json").is_file():

@@ -349,7 +349,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"observe": None}, "observe has some of phase, command, not None"),
         ({"kind": "dict_with_phase"}, "has an entry 'phase' already"),
         ({"guidance": "residual", "constraints": MotionConstraints(LIMIT, max_speed=np.ones(3))}, "enforce max_speed"),
-        ({"orientation": "euler_zyx"}, "orientation is that of poses of 6 outputs, and there are 3: leave it out"),
+        ({"orientation": "euler_zyx"}, "orientation needs poses of 6 outputs, and there are 3: leave it out"),
     ],
 )
 def test_wrong_argument_is_refused(keywords, message):

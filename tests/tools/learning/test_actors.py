@@ -105,7 +105,7 @@ def test_diverged_run_with_actors_is_reported(parallel_config, tmp_path):
 
 def test_actors_are_refused_when_they_cannot_be(parallel_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    with pytest.raises(InputError, match="pipelined already"):
+    with pytest.raises(InputError, match="num_envs does not work with"):
         run_training(folder, parallel_config(2, pipelined=True))
     with pytest.raises(InputError, match="callbacks need model and episodes"):
         run_training(folder, parallel_config(2), sb3_callbacks=[])
