@@ -33,11 +33,11 @@ MILLISECOND = 0.001  # [s]
 LOCKSTEP_TIMEOUT = 20.0  # longest wait for a status in lockstep [s of wall clock time]
 COMMAND_TIMEOUT = 300.0  # longest wait of the simulated driver for an acknowledgement [s of wall clock time]
 MAX_DURATION = 7 * 24 * 3600.0  # longest run of a simulated driver, by the robot's clock [s]
-DEFAULT_RATE = 0.2  # rate of a simulated robot's clock; simulating contact at 1 kHz is slower than real time
+DEFAULT_RATE = 0.2  # rate of a simulated robot's clock; contact simulation at 1 kHz is slower than real time
 FCI = "fci"  # driver of a Franka arm over the Franka Control Interface
 SIMULATED = (DEFAULT_ROBOT, FCI)  # drivers that have a simulated robot
-ROBOT_TIMEOUT = 60.0  # longest wait for the first status of a simulated driver, which has to start first [s]
-NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine the arm will be stopped because commands are late"
+ROBOT_TIMEOUT = 60.0  # longest wait for the first status of a simulated driver, including its start [s]
+NO_REALTIME_PRIORITY = "no real-time priority: on a busy machine, late commands may stop the arm"
 
 Log = Callable[[str], None]
 
@@ -84,7 +84,9 @@ def check_simulation(driver: str, scenario: Path | None, joint_friction: float |
     if joint_friction is not None and not (isinstance(joint_friction, Real) and 0.0 <= joint_friction < math.inf):
         raise InputError(f"joint_friction must be at least 0 and finite, not {brief(joint_friction)}")
     if driver == FCI and scenario is not None:
-        raise InputError("the simulated robot of the driver fci has no other surroundings than the task's")
+        raise InputError(
+            "the simulated robot of the driver fci has only the task's surroundings: leave the scenario out"
+        )
 
 
 def exit_with_parent() -> None:
@@ -107,20 +109,20 @@ class RobotConnection:
             or the joint friction is out of range.
     """
 
-    robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has a bus of its own
+    robot_url: str = ""  # address of the driver, LCM's default if empty; a simulated driver has its own bus
     robot: str = ""  # name of the arm; by default the driver's, or `DEFAULT_ROBOT`
     driver: str = ""  # name of the driver; empty for the one with the robot's name
-    sim: bool = False  # use a simulated driver, in a process of its own
+    sim: bool = False  # use a simulated driver, in its own process
     # Run station and simulated driver in lockstep instead of by the wall clock. Always True for the simulated robot of
     # the driver fci, because at 1 kHz it is slower than real time on most machines.
     synchronous: bool = False
-    rate: float | None = None  # rate of a simulated robot's clock by the wall clock; `DEFAULT_RATE` by default
+    rate: float | None = None  # rate of a simulated robot's clock to the wall clock; `DEFAULT_RATE` by default
     scenario: Path | None = None  # scenario file with robot, address and surroundings
     joint_friction: float | None = None  # friction of each joint of a simulated Franka [Nm], for experiments
 
     @classmethod
     def from_scenario(cls, file: Path | None, **options: Any) -> RobotConnection:
-        """Return the connection with the robot and address of a scenario file, if there is one, and with options.
+        """Return the connection with the given options, and with the robot and address of a scenario file, if given.
 
         Args:
             file: Scenario file, or None.
@@ -164,7 +166,7 @@ class RobotConnection:
         if not self.sim:
             raise InputError("a real robot's clock has its own rate: --rate is for a simulated driver, --sim")
         if self.synchronous:
-            raise InputError("driver and controller that wait for each other have no rate: leave --rate out")
+            raise InputError("a synchronous simulation has no rate relative to the wall clock: leave --rate out")
 
     @property
     def clock_rate(self) -> float:
@@ -175,7 +177,7 @@ class RobotConnection:
         """Return the environment options of a hardware station on this connection."""
         url = self.robot_url
         if self.sim:
-            # With a time to live of zero no message leaves this machine.
+            # With a time to live of 0, no message leaves this machine.
             url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
             if self.driver == FCI:
                 url = _loopback_address(os.getpid())
@@ -183,7 +185,7 @@ class RobotConnection:
         return options | ({"robot_timeout": ROBOT_TIMEOUT} if self.sim else {})
 
     def clocks(self, station: HardwareStation) -> tuple[Clock, WallClock]:
-        """Return a station's clock and a wall clock; they are the same object unless in lockstep."""
+        """Return a station's clock and a wall clock, which are one object except in lockstep."""
         wall_clock = WallClock(station.driver, station.period, self.clock_rate)
         if not self.synchronous:
             return wall_clock, wall_clock
@@ -209,7 +211,7 @@ class RobotConnection:
     ) -> Iterator[subprocess.Popen[Any] | None]:
         """Run the simulated driver of an arm in front of a task's fixture; for a real robot, do nothing and yield None.
 
-        The driver listens at `url` and imports the modules `imports`.
+        The simulated driver listens at `url` and imports the modules `imports`.
 
         Raises:
             InputError: If the surroundings of the scenario file cannot be simulated.

@@ -24,14 +24,8 @@ from guiderail.tools.pretrained import find_run
 from guiderail.tools.tables import table_text
 
 STATISTICS = (
-    "episodes",
-    "success_rate",
-    "success_low",
-    "success_high",
-    "mean_return",
-    "max_commanded_violation",
-    "peak_force",
-)
+    "episodes", "success_rate", "success_low", "success_high", "mean_return", "max_commanded_violation", "peak_force",
+)  # fmt: skip
 
 
 def evaluate_on_robot(
@@ -47,8 +41,8 @@ def evaluate_on_robot(
 ) -> Mapping[str, Any]:
     """Run episodes of a policy on a robot or a simulated driver, and write a row for each.
 
-    With a simulated driver the episodes have the conditions of `guiderail evaluate` in simulation: held-out conditions,
-    and the run's own hidden offset.
+    With a simulated driver, the episodes are those of `guiderail evaluate` in simulation, with held-out conditions and
+    the run's own hidden offset.
 
     Args:
         run: Run folder, or `pretrained:NAME`.
@@ -61,8 +55,8 @@ def evaluate_on_robot(
         log: Function that shows a message.
 
     Returns:
-        `rows`, the path of the rows; the statistics of the episodes, in which a stopped one counts as a failure; and
-        `stopped`, the number of stopped episodes.
+        `rows`, the path of the rows; the statistics of the episodes, in which a stopped episode counts as a failure;
+        and `stopped`, the number of stopped episodes.
 
     Raises:
         InputError: If `episodes` is less than 1, the policy cannot be executed, no robot answers, a check fails or is
@@ -77,9 +71,7 @@ def evaluate_on_robot(
     own_policy = Policy.load(folder.path) if policy is None else None
     environment = hardware_environment(config.task, config.environment, station)
     if environment.get("reward") != config.environment.get("reward"):
-        log(
-            f"mean_return is that of the reward {environment['reward']!r}, because the run's own needs simulation state"
-        )
+        log(f"mean_return is of the reward {environment['reward']!r}, because the run's reward needs simulation state")
     config = replace(config, environment=environment | connection.environment_options(station))
     path = (out or recordings_folder(run)) / ("episodes.csv" if policy is None else f"episodes-{policy}.csv")
     rows: list[dict[str, Any]] = []

@@ -99,7 +99,11 @@ class SkillExecutor:
     def __init__(self, task: InsertionTask, skill: SkillDiagram, clock: Clock, is_stop_requested: Callable[[], bool]):
         """Connect to the robot.
 
-        The skill has a `HardwareStation`, which advances by `clock`. Each control step calls `is_stop_requested`.
+        Args:
+            task: Task of the skill.
+            skill: Skill with a `HardwareStation`.
+            clock: Clock of the station.
+            is_stop_requested: Function called in each control step; True stops the arm.
 
         Raises:
             InputError: If no robot answers.
@@ -107,12 +111,12 @@ class SkillExecutor:
         self._task, self._skill, self._clock, self._is_stop_requested = task, skill, clock, is_stop_requested
         self._diagram = skill.diagram
         self._skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
-        # The guidance begins its motion when its diagram is first advanced, so a clone of the station, on the same
-        # driver, does the approach.
+        # The guidance begins its motion when its diagram is first advanced. The approach therefore uses a clone of the
+        # station, on the same driver.
         self._station = self._skill_station.clone(task.workcell())
         self._steps = round(skill.control_period / self._skill_station.period)
         self._start = task.start_pose(np.random.default_rng(0))
-        # The approach has the bound with which the skill begins.
+        # The approach has the force bound of the skill's first step.
         context = self._skill_station.GetMyContextFromRoot(skill.diagram.CreateDefaultContext())
         self._max_wrench = self._skill_station.read_max_wrench(context)
         self.preflight = PreflightChecks(self._station, clock, self._start, self._steps, self._max_wrench)
@@ -124,7 +128,7 @@ class SkillExecutor:
         """Take control of the arm, approach the skill's start slowly, execute the skill, and damp the arm to rest.
 
         The arm is brought to rest after any exception too, for example if a policy returns no action. An exception of
-        the driver stops the arm as a fault does. If the commands that bring the arm to rest fail, the outcome says so.
+        the driver stops the arm as a fault does. The outcome reports a failure of commands that bring the arm to rest.
 
         Raises:
             InputError: If no robot answers.
@@ -150,7 +154,7 @@ class SkillExecutor:
     def _warm_up(self) -> None:
         """Run every code path of the skill once: first calls (imports, caches) would miss the control deadline.
 
-        The skill's station receives statuses, but not for long enough to send anything.
+        The skill's station receives statuses, but for less than the settling time, after which it sends commands.
         """
         duration = min(MAX_WARM_UP_TIME, 0.5 * self._skill_station.status_limits.settling_time)
         simulator = Simulator(self._diagram)
@@ -159,7 +163,7 @@ class SkillExecutor:
         self._clock.advance(simulator, self._skill_station, round(duration / self._skill_station.period))
 
     def _rest(self) -> str:
-        """Damp the arm to rest; return a sentence on commands that could not be sent, or an empty text."""
+        """Damp the arm to rest; return a message about commands that could not be sent, or an empty text."""
         station, context = self._active_station()
         station.stop(context)
         return advance_to_rest(self._clock, self._simulator, station)
@@ -204,7 +208,7 @@ class SkillExecutor:
         station, context = self._station, self._simulator.get_mutable_context()
         desired_pose = station.get_desired_pose_input_port()
         elapsed = 0.0
-        # Until then there is no command, because the pose of a single status may be wrong: the station holds the arm.
+        # Before RUNNING, the station holds the arm. No pose is commanded, because a single status may be wrong.
         while station.get_arm_state_output_port().Eval(context)[0] != ArmState.RUNNING:
             elapsed += self._skill.control_period
             if (outcome := self._step()) is not None:
@@ -246,8 +250,8 @@ class SkillExecutor:
             else station.GetOutputPort(name).Eval(station_context)
             for name in SIGNALS
         }
-        # Joint signals are appended before the trace: after an interruption in between they have one sample more than
-        # the trace, never one less.
+        # Joint signals are appended first: an interruption in between leaves them with one sample more than the trace,
+        # never with one sample less.
         for name, values in self._joints.items():
             values.append(station.GetOutputPort(f"{station.driver.name}.{name}").Eval(station_context).copy())
         self.trace.append(
@@ -260,22 +264,17 @@ class SkillExecutor:
 
     def save(self, folder: Path, outcome: Outcome, metadata: Mapping[str, Any], log: Log) -> None:
         """Write the recording with its outcome and further metadata, and log its path."""
-        metadata = {
-            **metadata,
-            "outcome": outcome.description,
-            "fault": outcome.fault.name,
-            "steps": outcome.steps,
-        }
-        where = ""
+        metadata = {**metadata, "outcome": outcome.description, "fault": outcome.fault.name, "steps": outcome.steps}
+        distance_text = ""
         if outcome.steps:
             distance, angle = pose_distance(self.trace.measured[-1], np.zeros(6))
             metadata |= {"millimeters_from_target": distance / MM, "degrees_from_target": angle / DEGREE}
             metadata["peak_force"] = float(self.trace.force.max())
-            where = f"ended {distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees from the nominal target"
-        # The record is written before anything is shown: SIGHUP closes the terminal.
+            distance_text = f"ended {distance / MM:.1f} mm and {angle / DEGREE:.1f} degrees from the nominal target"
+        # The recording is written before messages are logged, because SIGHUP closes the terminal.
         path, failure = self.write(folder, metadata)
-        if where:
-            log(where)
+        if distance_text:
+            log(distance_text)
         log(f"{outcome.description}, after {outcome.steps} control steps: {path}")
         if failure:
             log(f"the motion was executed, but {failure}")
@@ -284,7 +283,7 @@ class SkillExecutor:
         """Write the control steps with joint signals as Parquet, and the metadata as JSON.
 
         Returns:
-            As `write_record`: the path of the Parquet file, and a sentence if it is in another folder.
+            The path of the Parquet file, and a message if it is in another folder, as `write_record` returns them.
         """
         number = _next_number(folder)
         steps = table(self.trace, number)
@@ -293,7 +292,7 @@ class SkillExecutor:
             columns = np.reshape(values[: len(self.trace)], (len(self.trace), num_joints)).T
             for joint, column in enumerate(columns):
                 steps = steps.append_column(f"{name}_{joint}", pa.array(column))
-        # NaN and infinite numbers, such as statistics of no statuses, are null: JSON does not have them.
+        # JSON has no NaN and infinite numbers, such as statistics of zero statuses: they become null.
         values = json.loads(json.dumps(dict(metadata)), parse_constant=lambda name: None)
 
         def write(path: Path) -> None:
@@ -310,7 +309,7 @@ def record_size(num_steps: int) -> int:
 
 
 def _next_number(folder: Path) -> int:
-    """Return a number above those of all recordings in a folder; either file of a recording may have been removed."""
+    """Return a number above those of all recordings in a folder; one of a recording's two files may be missing."""
     with suppress(OSError):
         matches = (re.match(r"episode-(\d+)\.", file.name) for file in folder.iterdir())
         return max((int(match.group(1)) for match in matches if match), default=-1) + 1
@@ -334,7 +333,7 @@ def deploy(
         connection: Connection to the robot driver.
         station: Name of a hardware station.
         force_limit: Contact force above which the arm is stopped [N], at most that of the training (the default);
-            a lower one limits the forces of a first motion.
+            a lower limit makes the first motion on a robot safer.
         assume_yes: Do not ask for confirmation of the pre-flight checks.
         out: Folder of the recording; `recordings_folder` by default.
         log: Function that shows a message.
@@ -407,9 +406,9 @@ def recordings_folder(run: Path) -> Path:
 
 
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
-    """Return a run's environment options without those of the station that it was trained on.
+    """Return a run's environment options without those of the station of its training.
 
-    A reward that needs simulation state is replaced by the task's first reward that does not; no policy uses rewards.
+    A reward that needs simulation state is replaced by the task's first reward without it; no policy uses rewards.
 
     Raises:
         InputError: If `station` is unknown or simulated.
@@ -418,9 +417,9 @@ def hardware_environment(task: str, environment: Mapping[str, Any], station: str
         raise InputError(f"station {station!r} is a simulation: watch the policy there with guiderail visualize")
     config = EnvConfig.resolve(task, environment)
     training_options = config.station_kind.options or Options
-    kept = {name: value for name, value in environment.items() if name not in training_options.model_fields}
+    options = {name: value for name, value in environment.items() if name not in training_options.model_fields}
     task_class = TASKS.get(config.task)
     simulated = getattr(task_class, "simulated_rewards", ())
     if environment.get("reward") in simulated:
-        kept["reward"] = next(reward for reward in task_class.rewards if reward not in simulated)
-    return kept
+        options["reward"] = next(reward for reward in task_class.rewards if reward not in simulated)
+    return options

@@ -14,11 +14,11 @@ from guiderail.models.common.errors import InputError
 
 PAUSE_KEY = "p"
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-HANGING_TIME = 5.0  # time after which a stop that no control step has noticed may be forced [s]
+HANGING_TIME = 5.0  # a signal raises KeyboardInterrupt if no control step read a stop request for this long [s]
 
 
 def is_terminal() -> bool:
-    """Return True if the operator types at a terminal; standard input may also be a pipe, or closed."""
+    """Return True if standard input is a terminal, and not a pipe or closed."""
     return sys.stdin is not None and sys.stdin.isatty()
 
 
@@ -26,7 +26,7 @@ class OperatorKeys:
     """Non-blocking keys: Enter or Ctrl-C stops the arm, p and Enter pauses it at the end of an episode.
 
     Attributes:
-        is_pause_requested: True if a pause was requested; reset by the program that pauses.
+        is_pause_requested: True if a pause was requested; the caller resets it when it pauses.
         is_moving: True as soon as the arm may move; until then, a signal ends the program at once.
         must_end: True after SIGTERM or SIGHUP: the arm must not resume after the stop.
     """
@@ -70,8 +70,8 @@ class OperatorKeys:
         A second signal does not interrupt the orderly stop.
 
         Raises:
-            InputError: If nothing moves yet.
-            KeyboardInterrupt: If no control step has noticed an earlier request for `HANGING_TIME`.
+            InputError: If the arm does not move yet.
+            KeyboardInterrupt: If no control step has read an earlier request for `HANGING_TIME`.
         """
         if not self.is_moving:
             raise InputError("stopped: nothing moved")
@@ -86,8 +86,8 @@ class OperatorKeys:
 def operator_keys() -> Iterator[OperatorKeys]:
     """Yield the operator's keys; Ctrl-C, SIGTERM and SIGHUP request a stop."""
     keys = OperatorKeys()
-    # A program that was started by nohup ignores SIGHUP.
-    numbers = [one for one in STOP_SIGNALS if one == signal.SIGINT or signal.getsignal(one) != signal.SIG_IGN]
+    # A program started by nohup keeps ignoring SIGHUP.
+    numbers = [each for each in STOP_SIGNALS if each == signal.SIGINT or signal.getsignal(each) != signal.SIG_IGN]
     before = {number: signal.signal(number, keys.handle_signal) for number in numbers}
     try:
         yield keys
@@ -107,9 +107,9 @@ def confirm(question: str, *, has_yes: bool = True) -> None:
         InputError: If the answer is not yes, Ctrl-C is pressed, a signal arrives, or there is no terminal.
     """
     if not is_terminal():
-        by_option = ", or by --yes of a caller who has checked it" * has_yes
+        by_option = ", or by --yes after it was checked" * has_yes
         raise InputError(f"this has to be confirmed at a terminal{by_option}")
-    # Nothing moves, so a signal only ends the question.
+    # The arm does not move, so a signal only ends the question.
     before = {number: signal.signal(number, signal.default_int_handler) for number in STOP_SIGNALS}
     try:
         termios.tcflush(sys.stdin, termios.TCIFLUSH)

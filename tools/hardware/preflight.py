@@ -17,11 +17,17 @@ from guiderail.models.control.joint_status import check_content
 from guiderail.tools.hardware.operator import confirm
 
 SPEED, ANGULAR_SPEED = 0.02, 0.1  # speeds of a slow approach [m/s], [rad/s]
-# Minimum speeds of the way back [m/s], [rad/s]. A slower motion is repeated at less than twice the minimum speed, so it
-# does not exceed the speed of a slow approach.
+# Minimum speeds of the motion back [m/s], [rad/s]. A slower motion is repeated at less than twice these speeds, which
+# does not exceed the speeds of a slow approach.
 MIN_SPEED, MIN_ANGULAR_SPEED = 0.5 * SPEED, 0.5 * ANGULAR_SPEED
 POSITION_TOLERANCE, ANGLE_TOLERANCE = 3.0 * MM, 2.0 * DEGREE  # tolerances of a reached pose [m], [rad]
 SETTLING_TIME = 0.5  # time that the target is held at the end of an approach [s]
+MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # largest distance and angle from the start pose for an approach [m], [rad]
+MAX_JOINT_SPEED = 0.05  # largest joint speed of an arm at rest [rad/s]
+MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
+MAX_RESTS = 3  # maximum number of damping times to wait for if commands cannot be sent
+NUM_STATUSES = 20  # number of statuses to receive before the checks
+MARKS = {True: "ok  ", False: "NOT ", None: "read"}  # line marks; the operator checks lines marked `read`
 
 
 def pose_distance(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -37,16 +43,16 @@ def is_near(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def describe_distance(pose: np.ndarray, start: np.ndarray) -> str:
-    """Return a sentence on an arm that did not reach its start; poses are (6,)."""
+    """Return a message about an arm at `pose` (6,) that did not reach `start` (6,)."""
     distance, angle = pose_distance(pose, start)
-    left = f"{distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left"
-    return f"the arm did not reach the start: {left}"
+    return f"the arm did not reach the start: {distance / MM:.1f} mm and {np.rad2deg(angle):.1f} degrees are left"
 
 
 def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.ndarray:
-    """Return commands (n, 6) along a straight line from `pose` to `target`, (6,), which is held for `SETTLING_TIME`.
+    """Return commands (n, 6) along a straight line from `pose` (6,) to `target` (6,).
 
-    The speeds are at most `SPEED` and `ANGULAR_SPEED`. The time between commands is `period` [s].
+    The speeds are at most `SPEED` and `ANGULAR_SPEED`. At the end, the target is held for `SETTLING_TIME`. The time
+    between commands is `period` [s].
     """
     distance, angle = pose_distance(target, pose)
     moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
@@ -55,7 +61,7 @@ def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.nda
 
 
 def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
-    """Return commands backwards along poses (n, 6) at the recorded speed, but not below the minimum speeds.
+    """Return commands backwards along poses (n, 6), at the recorded speed or the minimum speeds, if these are higher.
 
     The time between poses is `period` [s]. A pose is skipped if both its distance and its angle from the last
     pose that was not skipped are less than the minimum speeds cover in a period. The first pose of `path` is never
@@ -69,16 +75,6 @@ def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
     if len(path):
         poses.append(path[0].copy())
     return poses
-
-
-MAX_DISTANCE, MAX_ANGLE = 0.15, 1.0  # largest distance and angle from the start pose for an approach [m], [rad]
-MAX_JOINT_SPEED = 0.05  # largest joint speed of an arm at rest [rad/s]
-MAX_FORCE = 5.0  # max. external force at rest with the payload configured [N]
-MAX_RESTS = 3  # how often the time of a stop is waited for if commands cannot be sent in it
-NUM_STATUSES = 20  # statuses that are received before the checks
-
-
-MARKS = {True: "ok  ", False: "NOT ", None: "read"}  # line marks; the operator checks lines marked `read`
 
 
 class PreflightChecks:
@@ -138,7 +134,7 @@ class PreflightChecks:
         """Receive new statuses after a pause in which none were received, and repeat the checks.
 
         Raises:
-            InputError: If no statuses arrive any more, or they cannot be read.
+            InputError: If no statuses arrive, or they cannot be read.
         """
         self._clock.begin()
         self._clock.advance(self.simulator, self._station, self._num_steps)
@@ -148,16 +144,16 @@ class PreflightChecks:
         return self.run()
 
     def _receive_statuses(self) -> None:
-        """Receive `NUM_STATUSES`; nothing is sent, and a safety monitor's first heartbeat may take a status or two.
+        """Receive `NUM_STATUSES`, enough for a safety monitor's first heartbeat to arrive; no command is sent.
 
         Raises:
-            InputError: If no statuses arrive any more, the driver raises an exception while it is read, or the newest
-                status is malformed without an error of the robot.
+            InputError: If no statuses arrive, reading the driver raises an exception, or the newest status is malformed
+                although the robot reports no error.
         """
         driver, before = self.driver, self.driver.num_statuses
         self._clock.advance(self.simulator, self._station, NUM_STATUSES)
         if driver.num_statuses == before:
-            raise InputError(f"no statuses arrive any more on {driver}: start its driver again")
+            raise InputError(f"statuses stopped arriving on {driver}: start its driver again")
         driver.guard.check_readable()
         fault = check_content(driver.guard.read(), self._station.robot.num_joints)
         if fault and not self.error:
@@ -165,7 +161,7 @@ class PreflightChecks:
 
 
 def hold_where_it_is(station: HardwareStation, max_wrench: np.ndarray | None) -> Simulator:
-    """Return a simulator of a station without a valid desired pose; arguments as for `start_simulator`."""
+    """Return a simulator of a station whose desired pose is NaN; arguments as for `start_simulator`."""
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
     if max_wrench is not None:
@@ -176,10 +172,10 @@ def hold_where_it_is(station: HardwareStation, max_wrench: np.ndarray | None) ->
 def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:
     """Return an initialized simulator of a station that holds the arm where it is.
 
-    `max_wrench` is the value of the station's input of this name, (8,), or None if it has no value.
+    `max_wrench` (8,) is the value of the station's input port of this name; None leaves the port unconnected.
 
     Raises:
-        InputError: If no robot answers, or the driver raises an exception while it is read.
+        InputError: If no robot answers, or reading the driver raises an exception.
     """
     simulator = hold_where_it_is(station, max_wrench)
     station.start(simulator, clock.check_robot)
@@ -188,10 +184,10 @@ def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarr
 
 
 def advance_to_rest(clock: Clock, simulator: Simulator, station: HardwareStation) -> str:
-    """Advance a stopped station until the arm is damped and its torque is zero, longer if commands cannot be sent.
+    """Advance a stopped station until the arm is damped and its torque is zero; repeat if commands cannot be sent.
 
     Returns:
-        A sentence on commands that could not be sent, or an empty text.
+        A message about commands that could not be sent, or an empty text.
     """
     guard = station.driver.guard
     first = guard.num_failed_commands
@@ -205,10 +201,10 @@ def advance_to_rest(clock: Clock, simulator: Simulator, station: HardwareStation
 
 
 def check_robot(station: HardwareStation, context: Context, start: np.ndarray, num_commands: int) -> list[Check]:
-    """Check the status of a robot in the root context of its station, and list the assumptions about it.
+    """Check the status of a robot in the root context of its station, and list the assumptions about the robot.
 
-    `start` is the start pose of the skill, (6,), and `num_commands` the number of commands that the robot received from
-    other programs since the checks were constructed.
+    `start` (6,) is the start pose of the skill. `num_commands` is the number of commands that the robot has received
+    from other programs since the checks were constructed.
     """
     plant, arm = station.controller_plant.plant, station.controller_plant.arm
     driver, limits = station.driver, station.limits
@@ -225,7 +221,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     payload = sum(body.default_mass() for body in arm.tool)
     torque_shares, axis_limits = station.max_torque_shares(positions), station.impedance.limits[:3]
     if isinstance(driver, PoseDriver):
-        # Nothing clips the torques of the robot's own impedance controller; limits of external torque stop the arm.
+        # The torques of the robot's own impedance controller are not clipped; limits of external torque stop the arm.
         torque_share = (torque_shares * np.divide(limits.torque, limits.external_torque)).max()
         torques = f"stopped at external torques of {_numbers(limits.external_torque, 1)} Nm"
         hint = "; above 100% a firm push stops the arm: choose a smaller force_limit"
@@ -284,17 +280,17 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
 
 
 def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assume_yes: bool) -> list[Check]:
-    """Show the checks with `log` and have the operator confirm them; then repeat them: the robot may have changed.
+    """Log the checks, ask the operator to confirm them, and repeat them, because the robot may have changed meanwhile.
 
-    If the robot reports an error, such as a reflex, and the operator agrees, the error is cleared first. With
-    `assume_yes` nothing is asked, and the checks are not repeated.
+    If the robot reports an error, such as a reflex, the error is first cleared if the operator agrees. With
+    `assume_yes`, no question is asked, and the checks are not repeated.
 
     Returns:
-        The checks that were shown.
+        The logged checks.
 
     Raises:
         InputError: If a check fails, before or after the question, the operator does not confirm, or the robot has an
-            error and nothing is asked.
+            error and `assume_yes` is set.
     """
     if error := checks.error:
         if assume_yes:
@@ -306,7 +302,7 @@ def confirm_checks(checks: PreflightChecks, log: Callable[[str], None], *, assum
         log(f"{MARKS[check.passed]}  {check.name:<12}{check.description}")
     _refuse_failed(results)
     if not assume_yes:
-        confirm("Is all of this so, and is the workspace clear?")
+        confirm("Are all of these lines right, and is the workspace clear?")
         _refuse_failed(checks.repeat())
     return results
 

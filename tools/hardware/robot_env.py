@@ -28,6 +28,7 @@ from guiderail.tools.hardware.preflight import (
     PreflightChecks,
     advance_to_rest,
     describe_distance,
+    hold_where_it_is,
     is_near,
     pose_distance,
     retrace,
@@ -38,7 +39,7 @@ MIN_HOLD_FORCE = 1.5  # smallest measured force with which an inserted workpiece
 HOLD_STEPS = 25  # control steps of a push
 ANGLE_WEIGHT = 0.1  # weight of an angle in the distance to the return path [m/rad]
 RESUME_TIMEOUT = 10.0  # longest time until the arm has resumed [s]
-NO_POSE = np.full(6, np.nan)  # no valid command: the station holds the arm where it took control
+NO_POSE = np.full(6, np.nan)  # invalid command: the station holds the arm at the pose where it took control
 
 
 class RobotStoppedError(Exception):
@@ -60,14 +61,14 @@ class RobotEnv(DiagramEnv):
     reset, it comes to rest, `confirm_resume` is called, and the motion continues from where the arm is. An episode that
     was stopped is truncated with `termination` "stopped", and `info["stopped"]` has the reason.
 
-    Motions between episodes keep the force bound of the end of the episode. The first approach has the force bound
-    with which an episode begins.
+    Motions between episodes have the force bound of the episode's last step. The first approach has the force bound of
+    an episode's first step.
 
     A success by pose is confirmed by the task's `hold_tests`; if the workpiece gives way, `termination` is
     "did_not_hold". Episodes that end as "stopped" or "did_not_hold" must not be learned from.
 
-    If the way back does not release the workpiece, or the arm is too weak to release it, the arm comes to rest, and
-    `free_workpiece` has the operator release it by hand.
+    If the motion back does not release the workpiece, or the workpiece has snapped in, the arm comes to rest, and
+    `free_workpiece` asks the operator to release it by hand.
 
     Attributes:
         fault: Reason of the newest stop since the episode began, or NONE.
@@ -91,7 +92,7 @@ class RobotEnv(DiagramEnv):
 
         Args:
             task: Diagram of an insertion, built from its declaration.
-            station: Hardware station of the diagram; a clone of it makes the motions between episodes.
+            station: Hardware station of the diagram; its clone controls the motions between episodes.
             clock: Clock of both stations.
             action_repeat: Control steps per action.
             keys: The operator's keys.
@@ -113,11 +114,11 @@ class RobotEnv(DiagramEnv):
         self._hold_tests, self._snaps_in = declared.hold_tests, declared.snaps_in
         self._steps = round(task.control_period / station.period)
         self._station, self._is_stepping = self._transfer_station, False
-        # The first approach has the force bound with which an episode begins.
+        # The first approach has the force bound of an episode's first step.
         max_wrench = station.read_max_wrench(station.GetMyContextFromRoot(task.diagram.CreateDefaultContext()))
         self.preflight = PreflightChecks(self._transfer_station, clock, self._start, self._steps, max_wrench)
         self._last_transfer: Simulator | None = None
-        self._return_path: list[np.ndarray] = []  # poses (6,) of the way back; the last one is next
+        self._return_path: list[np.ndarray] = []  # poses (6,) of the motion back; the last is next
         self._must_be_freed = ""  # reason why the workpiece has to be released by hand before the arm resumes
         self.fault = Fault.NONE
 
@@ -162,12 +163,9 @@ class RobotEnv(DiagramEnv):
         self._station, self._is_stepping = station, False
 
     def _switch_to_new_transfer(self) -> None:
-        """Transfer control to the transfer station in a new simulator, which holds the present pose and bound."""
-        simulator, max_wrench = Simulator(self._transfer_station), self._station.read_max_wrench(self._context)
-        context = simulator.get_mutable_context()
-        self._transfer_station.get_desired_pose_input_port().FixValue(context, self.pose)
-        if max_wrench is not None:
-            self._transfer_station.GetInputPort("max_wrench").FixValue(context, max_wrench)
+        """Transfer control to the transfer station in a new simulator, with the present pose and force bound."""
+        simulator = hold_where_it_is(self._transfer_station, self._station.read_max_wrench(self._context))
+        self._transfer_station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), self.pose)
         self._switch_station(simulator, self._transfer_station)
 
     def _switch_to_transfer(self) -> None:
@@ -217,14 +215,15 @@ class RobotEnv(DiagramEnv):
         return observation, reward, terminated, truncated, info
 
     def _extend_return_path(self) -> None:
-        """Add the way back along the measured poses of the episode to the return path."""
+        """Extend the return path by the motion back along the measured poses of the episode."""
         self._return_path.extend(retrace(self.trace.measured, self.task.control_period)[::-1])
 
     def _statistics(self, first: int) -> tuple[float, float, float, bool]:
         """Return statistics of the control steps from `first` on.
 
-        They are the largest commanded and measured violation, the largest contact force [N], and True if a step was a
-        fallback.
+        Returns:
+            The largest commanded and measured violation, the largest contact force [N], and True if a step was a
+            fallback.
         """
         signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
         if not len(self.trace) > first:
@@ -280,34 +279,34 @@ class RobotEnv(DiagramEnv):
         self._advance()
 
     def _holds(self) -> bool:
-        """Return True if the workpiece resists every push of the hold tests; the arm returns after each."""
+        """Return True if the workpiece resists every push of the hold tests; the arm moves back after each push."""
         self._switch_to_transfer()
-        before = self.pose
+        start = self.pose
         try:
-            return all(self._resists(test, before) for test in self._hold_tests(before))
+            return all(self._resists(test, start) for test in self._hold_tests(start))
         except RobotStoppedError as stop:
             self.fault = stop.fault
             self._come_to_rest()
             return False
 
-    def _resists(self, test: HoldTest, before: np.ndarray) -> bool:
-        """Push the workpiece from the pose `before` (6,) and back; return True if it resists."""
+    def _resists(self, test: HoldTest, start: np.ndarray) -> bool:
+        """Push the workpiece from the pose `start` (6,) and move back; return True if it resists."""
         push = np.array([*test.displacement, 0.0, 0.0, 0.0])
         direction = push[:3] / np.linalg.norm(push)
-        shares = np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS
-        for share in shares:
-            self._command(before + share * push)
-        motion = float(direction @ (self.pose - before)[:3])
+        fractions = np.arange(1, HOLD_STEPS + 1) / HOLD_STEPS
+        for fraction in fractions:
+            self._command(start + fraction * push)
+        motion = float(direction @ (self.pose - start)[:3])
         force = float(-direction @ self._station.get_wrench_output_port().Eval(self._context)[:3])
-        for share in shares[::-1]:
-            self._command(before + share * push)
+        for fraction in fractions[::-1]:
+            self._command(start + fraction * push)
         return motion < test.max_motion and force > MIN_HOLD_FORCE
 
     def _return_to_start(self) -> None:
         """Move back along the return path, and slowly to the start.
 
-        Friction can leave a bayonet locked after the first return. The arm then repeats the path, forward and back.
-        If that fails as well, the operator releases the workpiece.
+        If friction leaves a bayonet locked after the first return, the arm repeats the path, forward and back. If the
+        second return fails too, the operator releases the workpiece.
         """
         self._switch_to_transfer()
         if self._must_be_freed:
@@ -325,7 +324,7 @@ class RobotEnv(DiagramEnv):
             self._return_path = path
             self._follow_return_path()
         if not self._is_at_start():
-            raise InputError(f"{describe_distance(self.pose, self._start)}; is something in its way?")
+            raise InputError(f"{describe_distance(self.pose, self._start)}; is an object in its way?")
         gc.collect()
 
     def _is_at_start(self) -> bool:
@@ -339,7 +338,7 @@ class RobotEnv(DiagramEnv):
         self._retry_until_ok(self._approach_start)
 
     def _rejoin_return_path(self) -> None:
-        """If the arm was moved by hand, begin the return path with a slow motion to its nearest pose."""
+        """If the arm was moved by hand, start the return path with a slow motion to the path's nearest pose."""
         pose = self.pose
         if not self._return_path or is_near(pose, self._return_path[-1]):
             return
@@ -365,10 +364,10 @@ class RobotEnv(DiagramEnv):
         """Hold the arm until the transfer station has full authority."""
         self._switch_to_transfer()
         if self._arm_state == ArmState.WAITING:
-            self._clock.begin()  # no command was sent yet: the time since the last status must not count as a gap
+            self._clock.begin()  # before the first command, the time since the last status is no gap
         elapsed = 0.0
         while self._arm_state != ArmState.RUNNING:
-            self._command(NO_POSE)  # not the measured pose, because a single status may be wrong
+            self._command(NO_POSE)  # not the measured pose: a single status may be wrong
             elapsed += self.task.control_period
             if elapsed > RESUME_TIMEOUT:
                 reason = describe_stop(self._active_fault, self._station.driver)
@@ -394,7 +393,7 @@ class RobotEnv(DiagramEnv):
             self._log(failure)
 
     def _resume(self) -> None:
-        """If the arm is at rest after a stop, have the operator confirm, and resume.
+        """If the arm is at rest after a stop, wait for the operator's confirmation, and resume.
 
         Raises:
             InputError: If the arm does not resume.
@@ -409,7 +408,7 @@ class RobotEnv(DiagramEnv):
             self._confirm_resume(describe_stop(self._active_fault, self._station.driver))
         self._keys.clear_stop()
         self._station.driver.guard.recover()
-        # No status was received while the operator was asked. If the arm was moved in the meantime, its statuses are
+        # No status was received during the operator's confirmation. If the arm was moved meanwhile, statuses are
         # accepted only after the settling time.
         self._clock.begin()
         settling_steps = math.ceil(self._station.status_limits.settling_time / self._station.period)

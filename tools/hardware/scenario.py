@@ -18,8 +18,8 @@ from guiderail.models.common.yaml import MAX_SIZE, check_yaml
 
 HARDWARE, SIMULATION = "hardware", "simulation"
 _TAGS = ("!IiwaDriver", "!PandaDriver", "!Rpy")  # accepted tags, which name classes
-# Supported fields of Drake's classes. Another field that differs from its default is refused, not ignored: without its
-# channel suffix, for example, a command would move another robot.
+# Supported fields of Drake's classes. Any other field that differs from its default is refused. If, for example, a
+# channel suffix were ignored, commands would move another robot.
 SUPPORTED = ("control_mode", "lcm_bus", "lcm_url")
 
 
@@ -35,7 +35,7 @@ class PandaDriver:
 class Scenario:
     """Robot, its bus and its surroundings.
 
-    All fields but `station` are those of a scenario of Drake's `hardware_sim`, whose further fields are refused.
+    All fields except `station` are fields of a scenario of Drake's `hardware_sim`; its other fields are refused.
     """
 
     station: str = SIMULATION  # "simulation" for a simulated driver, or "hardware"
@@ -62,7 +62,7 @@ class Scenario:
         return self.station == SIMULATION
 
 
-# Required kinds of YAML nodes, for which Drake's reader has no messages of its own, with their names.
+# Required kinds of YAML nodes and their names; Drake's reader has no message for another kind.
 _KINDS = {
     "model_drivers": (yaml.MappingNode, "a mapping"),
     "lcm_buses": (yaml.MappingNode, "a mapping"),
@@ -71,7 +71,7 @@ _KINDS = {
 
 
 def _check_kinds(text: str) -> None:
-    """Raise a ValueError if the root of a document, one of its collections, or an entry of these is of another kind."""
+    """Raise a ValueError if the root, a collection of the root, or an entry of a collection has the wrong kind."""
     root = yaml.compose(text, Loader=yaml.SafeLoader)
     if not isinstance(root, yaml.MappingNode):
         raise ValueError("it must be a mapping with model_drivers")
@@ -82,7 +82,7 @@ def _check_kinds(text: str) -> None:
         is_list = isinstance(node, yaml.SequenceNode)
         entries = enumerate(node.value) if is_list else ((name.value, entry) for name, entry in node.value)
         for name, entry in entries:
-            if name != "<<":  # a merge may also be of a list of mappings
+            if name != "<<":  # a merge key may have a list of mappings
                 _check_kind(entry, yaml.MappingNode, "a mapping", f"{name} of {key.value}")
 
 
@@ -109,7 +109,7 @@ def load_scenario(path: Path) -> Scenario:
     if scenario.station not in (HARDWARE, SIMULATION):
         raise InputError(f"{path}: a station is {HARDWARE} or {SIMULATION}, not {scenario.station!r}")
     if len(scenario.model_drivers) != 1:
-        raise InputError(f"{path}: exactly one robot has a driver, not {len(scenario.model_drivers)}")
+        raise InputError(f"{path}: exactly one robot must have a driver, not {len(scenario.model_drivers)}")
     driver = scenario.model_drivers[scenario.robot]
     expected = {"iiwa14": IiwaDriver, "panda": PandaDriver}.get(scenario.robot)
     if expected is not None and not isinstance(driver, expected):
@@ -134,7 +134,7 @@ def load_scenario(path: Path) -> Scenario:
             "ttl of 0 or 1, or give another address by --robot-url"
         )
     for config in (driver, scenario.lcm_buses[driver.lcm_bus]):
-        for name in (one.name for one in getattr(config, "__fields__", ()) if one.name not in SUPPORTED):
+        for name in (each.name for each in getattr(config, "__fields__", ()) if each.name not in SUPPORTED):
             value = getattr(config, name)
             if not np.array_equal(value, getattr(type(config)(), name)):
                 raise InputError(

@@ -33,11 +33,13 @@ def robot_session(
 ) -> Iterator[tuple[RobotEnv, Callable[[], Mapping[str, Any]]]]:
     """Wait for the robot, ask for confirmation of the pre-flight checks, and yield the environment.
 
-    Also yielded is a function that returns statistics of the intervals between statuses so far; empty in lockstep.
+    With a simulated driver, a reset samples the offsets of the parts as in simulation, and the fixture is removed in
+    place of an operator who releases the workpiece. With `assume_yes`, the checks need no confirmation; resuming after
+    a stop always needs one.
 
-    With a simulated driver, a reset samples the offsets of the parts as in simulation, and the fixture is taken away
-    where the operator of a robot releases the workpiece. With `assume_yes`, the checks need no confirmation; resuming
-    after a stop always does.
+    Yields:
+        The environment, and a function that returns statistics of the intervals between statuses so far, which are
+        empty in lockstep.
 
     Raises:
         InputError: If the task has no observable success, its reward needs simulation state, no robot answers, a check
@@ -85,7 +87,7 @@ def robot_session(
             clock,
             action_repeat=config.action_repeat,
             keys=keys,
-            confirm_resume=lambda reason: ask(reason, "Resume from where it is?"),
+            confirm_resume=lambda reason: ask(reason, "Resume from the arm's present pose?"),
             free_workpiece=free_workpiece,
             log=log,
             randomize_parts=randomize_parts,

@@ -32,10 +32,10 @@ from guiderail.tools.hardware.scenario import load_scenario
 DEFAULT_TASK = "BncConnector"
 # Initial pose of the default task, with the plug above the jack [m], [rad].
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
-REMOVED = (1.0, 0.0)  # offset of a fixture that is out of the arm's way [m]
+REMOVED = (1.0, 0.0)  # offset (x, y) of a removed fixture, out of the arm's reach [m]
 # Difference of the initial pose from the start pose, for tasks other than the default [m], [rad].
 START_OFFSET = np.array([0.005, -0.005, 0.01, 0.0, 0.0, 0.0])
-PLANT_STEPS_PER_STATUS = 5  # in real time, for 1 kHz, the rate of a real arm's control loop; 1 in lockstep
+PLANT_STEPS_PER_STATUS = 5  # in real time: 1 kHz, as the control loop of a real arm; in lockstep there is 1 step
 PART_OFFSETS_CHANNEL = "GUIDERAIL_PART_OFFSETS"
 
 
@@ -59,7 +59,7 @@ def run_sim_driver(
             empty.
         seconds: Simulated time to run [s].
         command_timeout: Longest time that the iiwa in lockstep waits for the acknowledgement of a status [s of wall
-            clock time]; for the first status it waits ten times as long.
+            clock time]; ten times as long for the first status.
         task: Name of an insertion task.
         rate: Rate of the robot's clock relative to the wall clock, in (0, 1]. With None, the iiwa waits for an
             acknowledgement of each status instead (lockstep), and the Franka has the rate 1.
@@ -68,8 +68,8 @@ def run_sim_driver(
             no effect. Refused with "fci".
         driver: "fci" for a Franka arm on the Franka Control Interface, otherwise the iiwa. The Franka runs in lockstep
             while a `FciLockstepClock` is connected, otherwise by the wall clock.
-        joint_friction: Friction of each joint of the Franka [Nm], by default the residual of friction compensation;
-            refused for the iiwa.
+        joint_friction: Friction of each joint of the Franka [Nm]; by default the residual of its friction compensation.
+            Refused for the iiwa.
         log: Function that shows a message.
 
     Returns:
@@ -116,7 +116,7 @@ def run_sim_driver(
             f"{scenario} has the robot {brief(surroundings.robot)}: name a scenario of the simulated {DEFAULT_ROBOT}"
         )
     lcm = open_bus(url)
-    # In real time the monitor has a bus connection of its own, as on a real robot, where it is another process.
+    # In real time, the monitor has its own bus connection, as on a real robot, where it is another process.
     robot_lcm, monitor_lcm = (DrakeLcm("memq://"),) * 2 if rate is None else (lcm, open_bus(url))
     robot = SimulatedIiwa(
         insertion.workcell(),
@@ -214,17 +214,17 @@ class PartRandomizer:
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 
     def remove_fixture(self) -> None:
-        """Move the fixture away from a held workpiece, as an operator does; the next sampled offset puts it back."""
+        """Move the fixture away from a held workpiece, as an operator would; the next sampled offset moves it back."""
         self._move_parts([list(REMOVED), [0.0, 0.0]])
 
 
 def publish_part_offsets(driver: LcmDriver, offsets: list[list[float]]) -> None:
-    """Send the offsets of fixture and workpiece, (x, y) [m] each, to a robot that uses `subscribe_part_offsets`."""
+    """Send the offsets of fixture and workpiece, (x, y) [m] each, to a simulated robot (`subscribe_part_offsets`)."""
     driver.lcm.Publish(PART_OFFSETS_CHANNEL, json.dumps(offsets).encode())
 
 
 def subscribe_part_offsets(lcm: DrakeLcmInterface, task: InsertionTask, robot: SimulatedIiwa, context: Context) -> None:
-    """Let a simulated robot apply the offsets that a `PartRandomizer` sends; `context` is the root context."""
+    """Apply the offsets that a `PartRandomizer` sends to a simulated robot; `context` is the root context."""
 
     def apply(message: bytes) -> None:
         fixture, workpiece = json.loads(message)

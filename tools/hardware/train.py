@@ -32,7 +32,7 @@ from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, w
 from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
 
 EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
-NICENESS = 5  # niceness of the training process, so that the control loop meets its deadlines
+NICENESS = 5  # niceness of the training process, which must not delay the control loop
 
 
 def train_on_robot(
@@ -59,7 +59,7 @@ def train_on_robot(
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
         settings: Settings of the learner by name.
-        resume: Continue a run from its last episode. The address of the robot may differ.
+        resume: Continue a run from its last checkpoint; the address of the robot may differ.
         assume_yes: Skip the confirmation of the checks; resuming after a stop is always confirmed.
         log: Function that shows a message.
 
@@ -71,12 +71,12 @@ def train_on_robot(
     folder = RunFolder(out)
     options = connection.environment_options(str(environment["station"]))
     if resume:
-        kept = {name: value for name, value in environment.items() if name != "robot_url"}
+        unchanged = {name: value for name, value in environment.items() if name != "robot_url"}
         choices = {name: value for name, value in given.items() if name != "imports"}
-        config = resumed_config(folder, task, kept, choices, settings)
+        config = resumed_config(folder, task, unchanged, choices, settings)
         if config.simulated_driver not in (None, connection.sim):
-            instead = "a simulated driver: give --sim" if config.simulated_driver else "a robot: leave --sim out"
-            raise InputError(f"the run in {out} was trained with {instead}, or train again in another folder")
+            hint = "a simulated driver: give --sim" if config.simulated_driver else "a robot: leave --sim out"
+            raise InputError(f"the run in {out} was trained with {hint}, or train again in another folder")
         config = replace(config, environment={**config.environment, **options})
     elif task is None:
         raise InputError("training needs a task: name a task, such as guiderail train BncConnector --out RUN")
@@ -116,12 +116,12 @@ def _train(
     resume: bool = False,
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
-    """Run all episodes; after any exception bring the arm to rest, and save what was recorded and learned."""
-    named = learner_arguments(config, env.task)
-    acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **named)
+    """Run all episodes; after any exception, bring the arm to rest, and save recorded episodes and learned weights."""
+    arguments = learner_arguments(config, env.task)
+    acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
     learner = PipelinedLearner(
         acting,
-        ((config.learner, SpacesOnlyEnv(env)), named),
+        ((config.learner, SpacesOnlyEnv(env)), arguments),
         waits=waits,
         excluded=EXCLUDED_TERMINATIONS,
         niceness=NICENESS,
@@ -180,11 +180,10 @@ def _train(
                 env.rest()
             finally:
                 # An error in one step must not skip the others: the disk or the training process may have failed. The
-                # current policy is saved before the training process finishes, and again after it. Only
-                # `wait_until_learned` is skipped, because it would resume the arm; the checkpoint waits for the weights
-                # without moving the arm.
-                left = (save for save in due if save is not wait_until_learned)
-                for save in (*left, save_learned, learner.finish, save_learned):
+                # current policy is saved before and after the training process finishes. Only `wait_until_learned` is
+                # skipped, because it would resume the arm; the checkpoint waits for the weights without the arm.
+                remaining = (save for save in due if save is not wait_until_learned)
+                for save in (*remaining, save_learned, learner.finish, save_learned):
                     with suppress(Exception):
                         save()
         raise
