@@ -47,8 +47,8 @@ from guiderail.tools.hardware.preflight import (
     advance_to_rest,
     confirm_checks,
     describe_distance,
-    hold_where_it_is,
     is_near,
+    make_holding_simulator,
     pose_distance,
     slow_approach,
     start_simulator,
@@ -175,7 +175,7 @@ class SkillExecutor:
         """
         station, root_context = self._active_station()
         context = station.GetMyContextFromRoot(root_context)
-        simulator = hold_where_it_is(self._station, self._max_wrench)
+        simulator = make_holding_simulator(self._station, self._max_wrench)
         self._station.take_over(simulator, station, context)
         self._simulator = simulator
         self._clock.begin()

@@ -55,16 +55,16 @@ def slow_approach(pose: np.ndarray, target: np.ndarray, period: float) -> np.nda
     between commands is `period` [s].
     """
     distance, angle = pose_distance(target, pose)
-    moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
-    steps = np.arange(1, moving + round(SETTLING_TIME / period))
-    return pose + np.minimum(steps / moving, 1.0)[:, None] * pose_difference(target, pose)
+    num_moving = int(np.ceil(max(distance / SPEED, angle / ANGULAR_SPEED) / period)) or 1
+    steps = np.arange(1, num_moving + round(SETTLING_TIME / period))
+    return pose + np.minimum(steps / num_moving, 1.0)[:, None] * pose_difference(target, pose)
 
 
 def retrace(path: np.ndarray, period: float) -> list[np.ndarray]:
     """Return commands backwards along poses (n, 6), at the recorded speed or the minimum speeds, if these are higher.
 
-    The time between poses is `period` [s]. A pose is skipped if both its distance and its angle from the last
-    pose that was not skipped are less than the minimum speeds cover in a period. The first pose of `path` is never
+    The time between poses is `period` [s]. A pose is skipped if its distance from the last command is below `MIN_SPEED`
+    times the period, and its angle below `MIN_ANGULAR_SPEED` times the period. The first pose of `path` is never
     skipped.
     """
     poses: list[np.ndarray] = []
@@ -160,8 +160,11 @@ class PreflightChecks:
             raise InputError(f"the arm stays where it is: {fault.description}: check the driver {driver.name}")
 
 
-def hold_where_it_is(station: HardwareStation, max_wrench: np.ndarray | None) -> Simulator:
-    """Return a simulator of a station whose desired pose is NaN; arguments as for `start_simulator`."""
+def make_holding_simulator(station: HardwareStation, max_wrench: np.ndarray | None) -> Simulator:
+    """Return a simulator of a station that holds the arm where it is; the desired pose is NaN.
+
+    The arguments are those of `start_simulator`.
+    """
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
     if max_wrench is not None:
@@ -170,14 +173,14 @@ def hold_where_it_is(station: HardwareStation, max_wrench: np.ndarray | None) ->
 
 
 def start_simulator(station: HardwareStation, clock: Clock, max_wrench: np.ndarray | None) -> Simulator:
-    """Return an initialized simulator of a station that holds the arm where it is.
+    """Return a started simulator of a station that holds the arm where it is.
 
     `max_wrench` (8,) is the value of the station's input port of this name; None leaves the port unconnected.
 
     Raises:
         InputError: If no robot answers, or reading the driver raises an exception.
     """
-    simulator = hold_where_it_is(station, max_wrench)
+    simulator = make_holding_simulator(station, max_wrench)
     station.start(simulator, clock.check_robot)
     clock.begin()
     return simulator

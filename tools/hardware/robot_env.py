@@ -28,8 +28,8 @@ from guiderail.tools.hardware.preflight import (
     PreflightChecks,
     advance_to_rest,
     describe_distance,
-    hold_where_it_is,
     is_near,
+    make_holding_simulator,
     pose_distance,
     retrace,
     slow_approach,
@@ -164,7 +164,7 @@ class RobotEnv(DiagramEnv):
 
     def _switch_to_new_transfer(self) -> None:
         """Transfer control to the transfer station in a new simulator, with the present pose and force bound."""
-        simulator = hold_where_it_is(self._transfer_station, self._station.read_max_wrench(self._context))
+        simulator = make_holding_simulator(self._transfer_station, self._station.read_max_wrench(self._context))
         self._transfer_station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), self.pose)
         self._switch_station(simulator, self._transfer_station)
 

@@ -95,7 +95,7 @@ def test_simulated_franka_is_in_lockstep():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "no other surroundings than the task's"),
+        ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "has only the task's surroundings"),
         ({"driver": "fci", "joint_friction": -0.1}, "joint_friction must be at least 0 and finite, not -0.1"),
         ({"joint_friction": "0.1"}, "joint_friction must be at least 0 and finite, not '0.1'"),
         ({"rate": "0.2"}, "the rate .* is from 0.001 to 1, not '0.2'"),
