@@ -81,9 +81,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         history: P, number of past outputs that the motion of sKGRL passes through, at least 1.
         history_variance: ρ, variance of the past outputs [output²].
         horizon: H, number of future points at which the constraints are satisfied, at least 0.
-        orientation: Meaning of the last three of six outputs: "euler_zyx" for angles [Rz Ry Rx], or "rotation_vector".
-            By default, that of the demonstrations' names ("Rz [rad]", "Ry [rad]", "Rx [rad]" are Euler angles), and
-            "rotation_vector" for other names.
+        orientation: Representation of the last three of six outputs: "euler_zyx" for angles [Rz Ry Rx], or
+            "rotation_vector". By default, "euler_zyx" if the demonstrations name them "Rz [rad]", "Ry [rad]",
+            "Rx [rad]", otherwise "rotation_vector".
         observe: Terms appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
             command in the segment's frame, scaled to the demonstrations' range. The command of a template is in the
             template's first frame, in units of 0.2 m and π.

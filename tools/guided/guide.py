@@ -222,7 +222,7 @@ class PrimitiveGuide(Guide):
                 )
         sizes = {segment.recorded.num_outputs for segment in segments}
         if len(sizes) > 1:
-            raise InputError(f"all segments need the same outputs, not {sorted(sizes)} of them")
+            raise InputError(f"all segments need the same number of outputs, not {sorted(sizes)}")
         (self.num_outputs,) = sizes
         self._period = period
         self._orientation = _orientation_of(segments, settings.orientation)
@@ -249,11 +249,11 @@ class PrimitiveGuide(Guide):
         segment = fitted.segment
         frame = segment.frame(env, observation) if segment.frame is not None else np.zeros(0)
         self.frame = frame if isinstance(frame, Frame) else Frame(frame)
-        given = segment.constraints
-        given = given(env, observation) if callable(given) else given
-        self.constraints = fitted.as_linear(given)
+        constraints = segment.constraints
+        constraints = constraints(env, observation) if callable(constraints) else constraints
+        self.constraints = fitted.as_linear(constraints)
         is_enforced = "residual" not in self.guidance
-        self._motion, motion_filter = given if isinstance(given, MotionConstraints) else None, None
+        self._motion, motion_filter = constraints if isinstance(constraints, MotionConstraints) else None, None
         if self._motion is not None and is_enforced:
             if self._period is None:
                 raise InputError("constraints of the motion need the period of the environment [s]")
@@ -349,12 +349,13 @@ def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[i
     """Return the indices of the outputs that an action moves; raise an InputError unless they are distinct indices."""
     if action_dims is None:
         return list(range(num_outputs))
-    given = list(action_dims) if isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1 else [-1]
-    if len(set(given)) < len(given) or not all(is_whole(o, 0) and o < num_outputs for o in given):
+    is_list = isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1
+    dims = list(action_dims) if is_list else [-1]
+    if len(set(dims)) < len(dims) or not all(is_whole(o, 0) and o < num_outputs for o in dims):
         raise InputError(
             f"action_dims are distinct indices of the outputs, from 0 to {num_outputs - 1}, not {brief(action_dims)}"
         )
-    return [int(o) for o in given]
+    return [int(o) for o in dims]
 
 
 def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> Orientation:
@@ -365,14 +366,14 @@ def _orientation_of(segments: Sequence[Segment], given: Orientation | None) -> O
             raise InputError(f"orientation needs poses of 6 outputs, and there are {number}: leave it out")
     orientation = given
     for segment in segments:
-        stated = orientation_of_names(segment.recorded.names)
-        if stated is not None and orientation not in (None, stated):
-            other = f"orientation={given!r}" if given is not None else f"the {orientation} of another segment"
+        named = orientation_of_names(segment.recorded.names)
+        if named is not None and orientation not in (None, named):
+            source = f"orientation={given!r}" if given is not None else f"the {orientation} of another segment"
             raise InputError(
-                f"the outputs {', '.join(segment.recorded.names[3:])} of the demonstrations are {stated}, which "
-                f"contradicts {other}: use one orientation, or rename the outputs"
+                f"the outputs {', '.join(segment.recorded.names[3:])} of the demonstrations are {named}, which "
+                f"contradicts {source}: use one orientation, or rename the outputs"
             )
-        orientation = orientation or stated
+        orientation = orientation or named
     return orientation or "rotation_vector"
 
 

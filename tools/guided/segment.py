@@ -63,7 +63,7 @@ class Frame:
 
         Args:
             output: Output (O,) in W.
-            orientation: Meaning of the last three of six entries.
+            orientation: Representation of the last three of six entries.
             near: Output (O,) in F. If O is 6, full turns are added to the orientation to bring it nearest to that of
                 `near`.
 
@@ -157,8 +157,8 @@ class Segment:
     @cached_property
     def recorded(self) -> Demonstrations:
         """Demonstrations, read from the segment's file if `demonstrations` is a path."""
-        given = self.demonstrations
-        return given if isinstance(given, Demonstrations) else Demonstrations.load(given)
+        source = self.demonstrations
+        return source if isinstance(source, Demonstrations) else Demonstrations.load(source)
 
     def steps_of(self, period: float | None) -> int:
         """Return the number of control steps.

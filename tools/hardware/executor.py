@@ -332,8 +332,8 @@ def deploy(
         run: Run folder, or `pretrained:NAME`.
         connection: Connection to the robot driver.
         station: Name of a hardware station.
-        force_limit: Contact force above which the arm is stopped [N], at most that of the training (the default);
-            a lower limit makes the first motion on a robot safer.
+        force_limit: Contact force above which the arm is stopped [N], by default the limit of the training. A lower
+            limit makes the first motion on a robot safer; a higher limit is refused.
         assume_yes: Do not ask for confirmation of the pre-flight checks.
         out: Folder of the recording; `recordings_folder` by default.
         log: Function that shows a message.
@@ -343,7 +343,7 @@ def deploy(
 
     Raises:
         InputError: If the task is no insertion, the policy cannot be executed or recorded, the folder has no room for
-            the recording, the force limit is above that of the training, no robot answers, a check fails or is not
+            the recording, the force limit is above the limit of the training, no robot answers, a check fails or is not
             confirmed, or a signal arrives before the arm may move.
     """
     folder, recordings = RunFolder(find_run(run)), out or recordings_folder(run)
@@ -406,7 +406,7 @@ def recordings_folder(run: Path) -> Path:
 
 
 def hardware_environment(task: str, environment: Mapping[str, Any], station: str) -> dict[str, Any]:
-    """Return a run's environment options without those of the station of its training.
+    """Return a run's environment options without the options of the station that it was trained on.
 
     A reward that needs simulation state is replaced by the task's first reward without it; no policy uses rewards.
 

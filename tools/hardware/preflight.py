@@ -113,7 +113,7 @@ class PreflightChecks:
 
     @property
     def error(self) -> str:
-        """Reason why the robot stopped by itself earlier; empty if there is none or it is unknown."""
+        """Reason of an earlier stop by the robot itself; empty without a stop, or if the reason is unknown."""
         return self.driver.guard.error
 
     def clear_error(self) -> None:

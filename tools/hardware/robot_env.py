@@ -97,11 +97,11 @@ class RobotEnv(DiagramEnv):
             action_repeat: Control steps per action.
             keys: The operator's keys.
             confirm_resume: Function called with the reason of a stop; returns when the arm may move again, or raises.
-            free_workpiece: Function called with the reason why a workpiece has to be released by hand; returns when it
-                is released and the arm may move again, or raises.
+            free_workpiece: Function called with the reason why a workpiece has to be released by hand; returns when
+                the workpiece is released and the arm may move again, or raises.
             log: Function that shows a message.
             randomize_parts: Function called at the start pose with a random number generator and the reset's options;
-                moves the parts as a reset in simulation does, and returns what was sampled. None for a real robot.
+                moves the parts as a reset in simulation does, and returns the sampled values. None for a real robot.
 
         Raises:
             InputError: If no robot answers.

@@ -88,8 +88,8 @@ def _check_kinds(text: str) -> None:
 
 def _check_kind(node: Any, kind: type[yaml.Node], name: str, what: str) -> None:
     if not isinstance(node, kind):
-        given = brief(node.value) if isinstance(node, yaml.ScalarNode) else f"a {node.id}"
-        raise ValueError(f"{what} must be {name}, not {given}")
+        actual = brief(node.value) if isinstance(node, yaml.ScalarNode) else f"a {node.id}"
+        raise ValueError(f"{what} must be {name}, not {actual}")
 
 
 def load_scenario(path: Path) -> Scenario:

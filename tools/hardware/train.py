@@ -54,7 +54,7 @@ def train_on_robot(
     Args:
         task: Name of an insertion task that defines `observable_success`, success estimated from the measured pose;
             optional with `resume`.
-        out: Run folder; with `resume`, that of the run to continue.
+        out: Run folder; with `resume`, the folder of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
         given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.

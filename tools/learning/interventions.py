@@ -87,7 +87,7 @@ class InterventionPolicy(Callback):
 
     @property
     def via_points(self) -> tuple[float, ...]:
-        """Via-points including those of this episode, as the option `via_points` (step, output, step, output, …)."""
+        """Via-points so far and of this episode, as the option `via_points` (step, output, step, output, …)."""
         return self._corrections.with_offsets(self._offsets, is_held=self._offset is not None)
 
     def on_episode_start(self) -> None:

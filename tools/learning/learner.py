@@ -67,7 +67,7 @@ class LearnerConfig:
             learn in turn.
         stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
             never. Resuming such a run runs no further episodes.
-        takes_images: True if the learner's networks take observations with images.
+        takes_images: True if the learner's networks accept observations with images.
     """
 
     takes_images: ClassVar[bool] = True

@@ -154,7 +154,7 @@ class Sb3Callbacks(Callback):
     """
 
     def __init__(self, callbacks: Any, learner: Learner):
-        """Construct the callback for one or several callbacks of Stable-Baselines3.
+        """Construct the adapter for one or several callbacks of Stable-Baselines3.
 
         Raises:
             InputError: If the learner has no model of Stable-Baselines3, or a callback is not a `BaseCallback`.

@@ -51,11 +51,11 @@ _LOGGER = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Run:
-    """Training run, read from its folder; functions that take the folder also take the run.
+    """Training run, read from its folder. Functions that accept the folder also accept the run.
 
     Attributes:
         path: Folder of the run.
-        pictures: Paths of the pictures drawn after training, by name; for a page that could not be drawn, the reason.
+        pictures: Paths of the pictures drawn after training, by name; if a page could not be drawn, the reason.
     """
 
     path: Path
@@ -125,12 +125,12 @@ def train(
     Args:
         task: Name of the task, or the path of a task folder; with `resume` it may be left out.
         guidance: Name of the guidance; None for the task's default.
-        out: Folder of the run; with `resume`, that of the run to continue.
+        out: Folder of the run; with `resume`, the folder of the run to continue.
         episodes: Total number of episodes; None for 60.
         seed: Seed of all random numbers, in [0, 2³¹); None for 0.
         algorithm: Registered name of the learner; None for the preset's, or without a preset the task's.
         preset: Name of the learner's preset; None for the algorithm's default, or without an algorithm the task's.
-        settings: Settings of the learner by name; they override those of the preset and of the task.
+        settings: Settings of the learner by name; they override the settings of the preset and of the task.
         log: Formats of a learning log in the folder's `logs/`: tensorboard, wandb, csv, json, log or stdout; none by
             default.
         callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after the
@@ -281,7 +281,7 @@ def configure(
 
     The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them, and
     `human_in_the_loop`: True if a supervisor corrects the policy. By default, the algorithm is the preset's, and the
-    preset is that of `default_preset`, not that of the task's learner, which `with_defaults` adds.
+    preset is `default_preset`; `with_defaults` adds the learner that the task declares.
 
     Raises:
         InputError: If a name is unknown or a value is out of range.

@@ -64,7 +64,7 @@ def run_training(
     is written before the checkpoint; episodes after the last checkpoint are run and logged again.
 
     Args:
-        folder: Folder of the run; with `resume`, that of the run to continue.
+        folder: Folder of the run; with `resume`, the folder of the run to continue.
         config: Configuration; with `resume` it must agree with the folder's.
         resume: Continue the run from its checkpoint.
         report: Called with the row of each episode.
@@ -254,7 +254,7 @@ def learned_policy(config: RunConfig, learner: Learner, env: Any) -> Policy:
 
 
 def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -> AbstractContextManager[None]:
-    """Return `naming_failures` for a learner of a user, and a context without effect for one of this package."""
+    """Return `naming_failures` for a user's learner, and a context without effect for a learner of this package."""
     return nullcontext() if LEARNERS.is_packaged(config.learner.algorithm) else naming_failures(action, *passed)
 
 
