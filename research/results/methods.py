@@ -329,7 +329,7 @@ def _compared(
 ) -> str:
     """Return a share of the guided methods, by name if they differ, and of residual RL; a dash without it."""
     shares = [share(seeds) for _, seeds in guided]
-    named = "; ".join(f"{row.name.split(',')[0]} {one}" for (row, _), one in zip(guided, shares, strict=True))
+    named = ", ".join(f"{one} ({row.name.split(',')[0]})" for (row, _), one in zip(guided, shares, strict=True))
     return f"{named if len(set(shares)) > 1 else shares[0]} / {share(residual[1]) if residual else '–'}"
 
 

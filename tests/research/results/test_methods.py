@@ -184,7 +184,7 @@ def test_results_with_the_offset_of_the_run_are_marked():
 def test_spilled_episodes_count_as_stopped():
     table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
     assert table["Pouring, hard"][4] == "31 / –"
-    assert table["Narrow passage, hard"][4] == "sKGRL 36; KGRL 41 / 63"
+    assert table["Narrow passage, hard"][4] == "36 (sKGRL), 41 (KGRL) / 63"
 
 
 def test_replace_table_refuses_a_text_without_markers():
