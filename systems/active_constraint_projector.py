@@ -22,13 +22,13 @@ class ActiveConstraintProjector(LeafSystem):
         H^ac = project_q(H^im), reachable in one period from the last command    (equation 2.21)
 
     H^im is the requested pose, q the template's state and H^ac the command; see `SharedControlTemplate.command`. The
-    last command is discrete state. Its initial value is the measured pose, moved towards the constraints as far as one
-    period allows. Between control instants the output depends only on the discrete state, the request and q.
+    last command is discrete state. The first command is the measured pose, moved towards the constraints by at most the
+    motion of one period. Between control instants, the output depends only on discrete state, H^im and q.
 
-    The last safe command is repeated, and ``fallback`` is 1, if the request or the measured pose is not finite. The
-    same happens if the tracking error exceeds its bound and the request would not reduce it, for example when the robot
-    is blocked. If a transition or a moved object puts the repeated command outside the constraints, the command moves
-    inside.
+    If the requested pose or the measured pose is not finite, the last safe command is repeated and ``fallback`` is 1.
+    The last command is also repeated if the tracking error exceeds its limit and the new command would not reduce it,
+    for example while an obstacle blocks the robot. A repeated command can be outside the constraints after a transition
+    or the motion of an object; it is then projected into the constraints.
 
     .. pydrake_system::
 
@@ -45,16 +45,16 @@ class ActiveConstraintProjector(LeafSystem):
         - measured_violation
 
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
-    template's state. Each violation output is the largest violation of an active constraint, in meters or radians, and
-    0 inside the constraints. If ``state`` is not the number of a state, the last command is repeated with ``fallback``
-    1, and the violations are the largest of all states.
+    template's state. Each violation output is the largest violation of an active constraint, in meters or radians; it
+    is 0 if all active constraints are satisfied. If ``state`` is not the number of a state, the last command is
+    repeated with ``fallback`` 1, and the violations are the maxima over all states.
 
     Args:
         template: Shared control template.
-        frames: Poses of the template's objects by name, in the frame of the poses at the ports.
+        frames: Poses of the template's object frames by name, in the reference frame of the poses at the ports.
         period: Control period [s], positive.
-        max_tracking_error: Bound of the tracking error, the distance between the last command and the position
-            measured at that time [m], positive; infinite by default.
+        max_tracking_error: Limit of the tracking error [m], positive; infinite by default. The tracking error is the
+            distance between the last command and the position measured at the same instant.
 
     Raises:
         InputError: If an argument is out of range, a frame is missing or not finite, or active constraints of a state
@@ -62,7 +62,7 @@ class ActiveConstraintProjector(LeafSystem):
             pose is more than 0.2 m or 1 rad outside of the active constraints.
 
     Attributes:
-        frames: Parameters with the poses of the template's object frames, which a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set.
     """
 
     def __init__(
@@ -82,25 +82,17 @@ class ActiveConstraintProjector(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
 
-        # The last command (6,), and the pose (6,) measured at that time.
+        # [last command (6,), pose (6,) measured at the same instant]
         self._last = self.DeclareDiscreteState(12)
         constraints = [self._state_port, self.frames.ticket]
         self._command = declare.cache(
             self, "command", self._calc_command, [*constraints, self._last, self._requested_pose_port]
         )
-        self._desired_pose_port = declare.part_output(
-            self, "desired_pose", self._command, lambda command: command[:6], 6
-        )
-        self._last_desired_pose_port = declare.part_output(
-            self, "last_desired_pose", self._last, lambda last: last[:6], 6
-        )
-        self._fallback_port = declare.part_output(self, "fallback", self._command, lambda command: command[6])
-        self._commanded_violation_port = declare.scalar_output(
-            self, "commanded_violation", self._commanded_violation, [self._command, *constraints]
-        )
-        self._measured_violation_port = declare.scalar_output(
-            self, "measured_violation", self._measured_violation, [*constraints, self._pose_port]
-        )
+        declare.part_output(self, "desired_pose", self._command, lambda command: command[:6], 6)
+        declare.part_output(self, "last_desired_pose", self._last, lambda last: last[:6], 6)
+        declare.part_output(self, "fallback", self._command, lambda command: command[6])
+        declare.scalar_output(self, "commanded_violation", self._commanded_violation, [self._command, *constraints])
+        declare.scalar_output(self, "measured_violation", self._measured_violation, [*constraints, self._pose_port])
         declare.update_after_start(self, period, self._update, self._start)
 
     get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
@@ -115,13 +107,13 @@ class ActiveConstraintProjector(LeafSystem):
     def _violation(self, context: Context, pose: np.ndarray) -> float:
         state, X_WE, frames = self._state(context), pose_to_transform(pose), self.frames.eval(context)
         states = range(len(self._template.states)) if state is None else (state,)
-        return max(self._template.violation(one, X_WE, frames) for one in states)
+        return max(self._template.violation(number, X_WE, frames) for number in states)
 
     def _state(self, context: Context) -> int | None:
         return declare.state_number(self._state_port, context, len(self._template.states))
 
     def _calc_command(self, context: Context) -> np.ndarray:
-        """Return the command (6,) and, as the seventh number, the fallback flag."""
+        """Return the command and the fallback flag, (7,)."""
         value = context.get_discrete_state().value(self._last)
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
@@ -142,7 +134,7 @@ class ActiveConstraintProjector(LeafSystem):
         return np.append(last, 1.0)
 
     def _constrained(self, context: Context, state: int, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
-        """Return the allowed pose (6,) for a request, reachable in one period."""
+        """Return the command (6,) for a requested pose."""
         command = self._template.command(
             state,
             pose_to_transform(last),
@@ -161,7 +153,7 @@ class ActiveConstraintProjector(LeafSystem):
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = declare.start_pose(self._pose_port.Eval(context))
         X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
-        # The state port cannot be used, because its source is initialized at this same instant.
+        # The state port is not read, because the system that outputs the state is initialized at the same instant.
         state = self._template.state_at(X_WE, frames)
         command = transform_to_pose(self._template.command(state, X_WE, X_WE, frames, self._period).X_WE)
         if not np.isfinite(command).all():

@@ -32,8 +32,7 @@ class ImpedanceGains:
 
     Args:
         stiffness: Stiffness matrix (6, 6), symmetric, positive definite, [translational, rotational] in N/m and Nm/rad.
-        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive and
-            finite.
+        wrench_limits: Limits (6,) of the wrench along the axes of the stiffness frame [N, Nm], positive and finite.
         damping_ratio: Damping ratio of every mode, positive and finite.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
         posture_stiffness: Stiffness of the return to the posture [Nm/rad], not negative, finite.
@@ -42,7 +41,7 @@ class ImpedanceGains:
         bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
 
     Raises:
-        InputError: If an argument is out of range or of another type, or a matrix or vector of six has the wrong shape.
+        InputError: If an argument is out of range, of another type, or of another shape.
     """
 
     stiffness: np.ndarray
@@ -76,14 +75,14 @@ class ImpedanceGains:
 
 
 class CartesianImpedanceController(LeafSystem):
-    """Joint torques that make the tool center P of an arm act as a spring and damper around a desired pose.
+    """Impedance controller: the tool center P of an arm acts as a spring and damper around a desired pose.
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
 
     J is the Jacobian of P, e the pose error, V the velocity of P and N the projector into the null space; see
-    `impedance_torques`. The stiffness K may be given in the axes of any frame. The orientation error is computed from
-    quaternions, so no orientation is singular. The damping D follows from K and the arm's inertia in its present
-    posture. If commands stop, the last valid one is followed (`LastValidPose`).
+    `impedance_torques`. The axes of K are those of `stiffness_frame`. The orientation error is computed from
+    quaternions, so no orientation is singular. The damping D is computed from K and the arm's inertia in its present
+    posture. While no valid command is available, the last valid command is followed (`LastValidPose`).
 
     .. pydrake_system::
 
@@ -103,30 +102,31 @@ class CartesianImpedanceController(LeafSystem):
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
     is not connected, commands never time out. ``max_wrench`` is (8,), limits of [fx fy fz tx ty tz] along the axes of
-    the gains, of the norm of the force and of the norm of the torque [N, Nm]; it lowers the bound and cannot raise it.
-    While one of its numbers is NaN or negative, its last valid value is used (`LastValidBound`).
-    ``generalized_force`` is (n,), joint torques [Nm], in the order of the plant's velocities, as ``estimated_state``.
-    If the plant's actuators have another order, connect its actuation port by a `MatrixGain` with the matrix
-    ``plant.MakeActuationMatrix().T``. ``impedance_wrench`` is (6,), force first, in the axes of T.
-    ``saturation`` (1,) is 1 while the wrench or a motor is at its limit. ``command_timed_out`` (1,) is 1 while no valid
-    command is available.
+    the gains, of the norm of the force and of the norm of the torque [N, Nm]. It can lower the bound but not raise it.
+    While a number of ``max_wrench`` is NaN or negative, its last valid value is used (`LastValidBound`).
+
+    ``generalized_force`` is (n,), joint torques [Nm]. Its order, as that of ``estimated_state``, is the order of the
+    plant's velocities. If the plant's actuators have another order, connect ``generalized_force`` to the plant's
+    actuation port through a `MatrixGain` with the matrix ``plant.MakeActuationMatrix().T``. ``impedance_wrench`` is
+    (6,), force first, in the axes of T. ``saturation`` (1,) is 1 while the wrench or a motor is at its limit.
+    ``command_timed_out`` (1,) is 1 while no valid command is available.
 
     Args:
-        plant: Model of the arm and its payload alone, finalized, with one actuator for each joint; its kinematics,
-            inertia and effort limits are used.
+        plant: Finalized model of only the arm and its payload, with one actuator per joint; provides kinematics,
+            inertia and effort limits.
         target: Frame T, fixed in the world.
         tool_center: Frame P.
         gains: Impedance parameters.
         period: Period of the command check [s], positive.
         stiffness_frame: Frame that defines the axes of the gains, T by default. If this frame rotates, the impedance is
-            not strictly passive: turning the axes of a loaded spring can add energy.
-        compensate_gravity: False if the robot's own controller compensates gravity.
+            not strictly passive, because a rotation of the axes of a loaded spring can add energy.
+        compensate_gravity: False if the controller of the robot compensates gravity already.
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range, the plant is not finalized, a frame is not of the plant, T is not
-            fixed in the world, the posture does not have n joints, or a joint has no actuator or several. At an
-            evaluation, if the estimated state is not finite.
+        InputError: If an argument is out of range, the plant is not finalized, a frame belongs to another plant, T is
+            not fixed in the world, the posture does not have n joints, or a joint does not have exactly one actuator.
+            At an evaluation, if the estimated state is not finite.
     """
 
     def __init__(
@@ -166,22 +166,20 @@ class CartesianImpedanceController(LeafSystem):
         )
         bound = gains.bound or WrenchBound(gains.wrench_limits, np.inf, np.inf)
         self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
-        sources = [*self._followed_pose.tickets, self._estimated_state_port, *self._requested_bound.sources]
+        sources = [*self._followed_pose.sources, self._estimated_state_port, *self._requested_bound.sources]
         self._law = declare.cache(self, "law", self._calc_law, sources)
-        self._generalized_force_port = declare.part_output(
-            self, "generalized_force", self._law, lambda law: law.torque, num_joints
-        )
-        self._pose_port = declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
-        self._impedance_wrench_port = declare.part_output(
-            self, "impedance_wrench", self._law, lambda law: law.wrench, 6
-        )
-        self._saturation_port = declare.part_output(self, "saturation", self._law, lambda law: float(law.is_saturated))
-        self._command_timed_out_port = self._followed_pose.declare_timed_out_output(self)
+        declare.part_output(self, "generalized_force", self._law, lambda law: law.torque, num_joints)
+        declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
+        declare.part_output(self, "impedance_wrench", self._law, lambda law: law.wrench, 6)
+        declare.part_output(self, "saturation", self._law, lambda law: float(law.is_saturated))
+        self._followed_pose.declare_timed_out_output(self)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
-    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
+    get_max_wrench_input_port = input_getter(
+        "max_wrench", "limits of the wrench per axis and of its norms, (8,); optional"
+    )
     get_generalized_force_output_port = output_getter("generalized_force", "joint torques, (n,) [Nm]")
     get_pose_output_port = output_getter("pose", "measured pose of the tool center, (6,)")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "wrench of spring and damper, (6,)")

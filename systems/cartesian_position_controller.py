@@ -43,18 +43,20 @@ class SpeedLimits:
 
 
 class CartesianPositionController(LeafSystem):
-    """Command joint positions that move the tool center P to a desired pose, by differential inverse kinematics.
+    """Move the tool center P to a desired pose by joint position commands from differential inverse kinematics.
 
         q[k+1] = clip(q[k] + v·period),  J v = V
 
-    V is the velocity that reaches the desired pose in one period, within the speed limits.
+    V is the velocity that reaches the desired pose in one period, scaled down to the speed limits.
     `pydrake.multibody.inverse_kinematics.DoDifferentialInverseKinematics` computes v; while no joint limit is active, a
-    closed form gives the same optimum. Position and velocity limits of the joints are satisfied and the direction of
-    the tool's motion is preserved; if this is not possible, the motion slows down or stops. A joint that starts
-    outside its position limits may return within its velocity limit and moves no farther out. While the desired pose is
-    not finite, older than the timeout, or more than one period in the future (`CommandValidity`), the joint command is
-    constant. Near a singular posture a damped pseudoinverse is used (`models.control.damped_inverse`): the direction of
-    the tool deviates slightly, the joints stay slow, and null-space control leads out of the singularity.
+    closed-form solution is the same optimum. The joints stay within their position and velocity limits, and the tool
+    moves in the direction of V. If both are not possible at the speed of V, the tool slows down or stops. A joint that
+    starts outside its position limits does not move farther out; it may return within its velocity limit.
+
+    While the desired pose is not finite, older than the timeout, or more than one period in the future
+    (`CommandValidity`), the joint command is constant. Near a singular posture, a damped pseudoinverse is used
+    (`models.control.damped_inverse`). The joint velocities then stay small, the direction of the tool deviates
+    slightly from V, and null-space control moves the arm out of the singularity.
 
     .. pydrake_system::
 
@@ -74,10 +76,10 @@ class CartesianPositionController(LeafSystem):
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
     (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 if the tool
     could not move in the desired direction at the last valid command. ``command_timed_out`` (1,) is 1 while no valid
-    command is available. All outputs depend on state alone; there is no direct feedthrough.
+    command is available. All outputs are state without direct feedthrough.
 
     Args:
-        plant: Model of the arm alone, of at least six joints, finalized; its joint limits are satisfied.
+        plant: Finalized model of only the arm, with at least six joints; provides kinematics and joint limits.
         target: Frame T, fixed in the world.
         tool_center: Frame P.
         posture: Joint positions (n,) that the null-space control returns to [rad], finite.
@@ -140,12 +142,10 @@ class CartesianPositionController(LeafSystem):
         self._is_stuck = self.DeclareDiscreteState(1)
         self._has_timed_out = self.DeclareDiscreteState(1)
         self._plant_context = declare.plant_context(self, plant, self._joint_command, [self._command])
-        self._joint_positions_port = self.DeclareStateOutputPort("joint_positions", self._command)
-        self._pose_port = declare.output(
-            self, "pose", 6, lambda context: transform_to_pose(self._X_TP(context)), [self._plant_context]
-        )
-        self._stuck_port = self.DeclareStateOutputPort("stuck", self._is_stuck)
-        self._command_timed_out_port = self.DeclareStateOutputPort("command_timed_out", self._has_timed_out)
+        self.DeclareStateOutputPort("joint_positions", self._command)
+        declare.output(self, "pose", 6, lambda context: transform_to_pose(self._X_TP(context)), [self._plant_context])
+        self.DeclareStateOutputPort("stuck", self._is_stuck)
+        self.DeclareStateOutputPort("command_timed_out", self._has_timed_out)
         declare.update(self, period, self._step, self._start_at_measured_positions)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
@@ -188,23 +188,23 @@ class CartesianPositionController(LeafSystem):
         velocities, is_stuck = self._joint_velocities(q, V, J, limits)
         discrete_state.set_value(self._is_stuck, [float(is_stuck)])
         if velocities is not None:
-            # The solver satisfies limits only to its tolerance; the command satisfies them exactly.
-            # np.clip is slower: it inspects its arguments in Python.
+            # The solver satisfies the limits only within its tolerance; the clipped command satisfies them exactly.
+            # np.clip is slower, because it inspects its arguments in Python.
             next_q = q + self._period * velocities
             discrete_state.set_value(self._command, np.minimum(np.maximum(next_q, limits[0]), limits[1]))
 
     def _desired_velocity(self, X_TP: RigidTransform, X_TPd: RigidTransform) -> np.ndarray:
-        """Return the tool velocity [rotational, translational] (6,) that reaches X_TPd in one period, within limits."""
-        turn = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
+        """Return the tool velocity [rotational, translational] (6,) towards X_TPd, within the speed limits."""
+        rotation = (X_TPd.rotation() @ X_TP.rotation().inverse()).ToAngleAxis()
         V = np.empty(6)
-        V[:3] = _limited(turn.angle() * turn.axis() / self._period, self._speed_limits.rotational)
+        V[:3] = _limited(rotation.angle() * rotation.axis() / self._period, self._speed_limits.rotational)
         V[3:] = _limited((X_TPd.translation() - X_TP.translation()) / self._period, self._speed_limits.translational)
         return V
 
     def _joint_velocities(
         self, q: np.ndarray, V: np.ndarray, J: np.ndarray, position_limits: tuple[np.ndarray, np.ndarray]
     ) -> tuple[np.ndarray | None, bool]:
-        """Return joint velocities for the tool velocity V, or None on failure, and True if V cannot be followed."""
+        """Return the joint velocities for a tool velocity V, or None on failure, and True if V cannot be followed."""
         velocities, is_regular = damped_joint_velocities(J, V, self._posture_gain * (self._posture - q))
         if not is_regular:
             lower, upper = self._velocity_limits

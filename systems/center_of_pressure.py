@@ -29,7 +29,7 @@ class CenterOfPressure(LeafSystem):
     ``wrench`` is (6,), force and torque about the tool center [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
 
     Args:
-        min_force: Force along z below which there is no contact [N], positive and finite.
+        min_force: Force along z below which the output is 0 [N], positive and finite.
 
     Raises:
         InputError: If `min_force` is out of range.
@@ -40,7 +40,7 @@ class CenterOfPressure(LeafSystem):
         if not 0.0 < as_number(min_force, "min_force") < np.inf:
             raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
-        self._center_of_pressure_port = declare.output(
+        declare.output(
             self,
             "center_of_pressure",
             2,

@@ -1,4 +1,4 @@
-"""Chunks of a base policy as the reference window of a movement primitive."""
+"""Reference window of a movement primitive, predicted by a base policy."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -8,17 +8,17 @@ from guiderail.models.policy import BasePolicy, chunk_samples, mean_and_variance
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.policy_system import PolicyError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class ChunkReference(LeafSystem):
-    """Predict the reference window of the next H+1 control steps with a base policy.
+    """Predict the reference window of H+1 control steps with a base policy.
 
         mean = mean of the chunks;  covariance = diag(variance of the chunks) + covariance_floor · Σ_n
 
-    Every ``replan_steps`` control steps the policy predicts chunks from the observation just before that instant; in
-    between, the window advances along them. Σ_n are the covariances of a reference trajectory of O outputs. Until the
-    first prediction, the output is the window of this trajectory.
+    Every ``replan_steps`` control steps, the policy predicts chunks from the observation just before that step. Between
+    two predictions, the window advances along the chunks. Σ_n are the covariances of a reference trajectory of O
+    outputs. Before the first prediction, the output is the window of this trajectory.
 
     .. pydrake_system::
 
@@ -29,15 +29,16 @@ class ChunkReference(LeafSystem):
         - reference_window
 
     ``observation`` is (n,). ``reference_window`` is ((H+1)(O + O²),): means (H+1, O) and covariances (H+1, O, O),
-    row-major, in the units of the outputs; the first point is the current control step. The port depends on state
-    alone, so that an observation of the command does not cause an algebraic loop.
+    row-major, in the units of the outputs; the first point is the current control step. The output depends only on
+    state, so that a policy that observes the command does not cause an algebraic loop.
 
     Args:
-        policy: Base policy (`models.policy`), a pure function; if None, the window always comes from `reference`.
+        policy: Base policy (`models.policy`), a pure function. If it is None, the output is always the window of
+            `reference`.
         observation_size: Size n of the observation, at least 1.
         reference: Reference trajectory with one point per control step, for Σ_n and the first window.
-        horizon: Number of future points H after the current one, not negative.
-        replan_steps: Control steps between two predictions, at least 1.
+        horizon: Number H of points after the current one, at least 0.
+        replan_steps: Number of control steps from one prediction to the next, at least 1.
         covariance_floor: Factor of Σ_n in the covariance, positive, finite.
         period: Control period [s], positive.
 
@@ -58,29 +59,28 @@ class ChunkReference(LeafSystem):
         period: float,
     ):
         super().__init__()
-        if observation_size < 1 or horizon < 0 or replan_steps < 1:
-            raise InputError(
-                f"observation_size and replan_steps are at least 1 and horizon at least 0, not {observation_size}, "
-                f"{replan_steps} and {horizon}"
-            )
+        observation_size = as_count(observation_size, "observation_size")
+        horizon, replan_steps = as_count(horizon, "horizon", 0), as_count(replan_steps, "replan_steps")
         if not (np.isfinite(covariance_floor) and covariance_floor > 0):
             raise InputError(f"covariance_floor must be positive and finite, not {covariance_floor}")
         self._policy, self._reference, self._horizon = policy, reference, horizon
         self._replan_steps, self._floor = replan_steps, covariance_floor
         self._num_points, outputs = horizon + replan_steps, reference.num_outputs
         self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
-        # [means and variances of the chunk (2, H + replan_steps, O); control steps since the start, −1 before it]
+        # [means and variances of the chunk (2, H + replan_steps, O); number of the control step, −1 before the first]
         self._state = self.DeclareDiscreteState(np.append(np.zeros(2 * self._num_points * outputs), -1.0))
-        self._reference_window_port = declare.output(
-            self, "reference_window", (horizon + 1) * (outputs + outputs**2), self._window, [self._state]
-        )
+        declare.output(self, "reference_window", (horizon + 1) * (outputs + outputs**2), self._window, [self._state])
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_observation_input_port = input_getter("observation", "observation of the base policy, (n,)")
     get_reference_window_output_port = output_getter("reference_window", "means and covariances, ((H+1)(O + O²),)")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        """Advance by a control step; raise a `PolicyError` if the base policy does not return chunks."""
+        """Advance by one control step.
+
+        Raises:
+            PolicyError: If the base policy does not return chunks.
+        """
         state = context.get_discrete_state().value(self._state).copy()
         state[-1] += 1.0
         if self._policy is not None and state[-1] % self._replan_steps == 0:
@@ -95,12 +95,12 @@ class ChunkReference(LeafSystem):
     def _window(self, context: Context) -> np.ndarray:
         state = context.get_discrete_state().value(self._state)
         step, outputs = int(state[-1]), self._reference.num_outputs
-        at = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
+        indices = np.minimum(max(step, 0) + np.arange(self._horizon + 1), self._reference.num_steps - 1)
         if step < 0 or self._policy is None:
-            means, covariances = self._reference.means[at], self._reference.covariances[at]
+            means, covariances = self._reference.means[indices], self._reference.covariances[indices]
         else:
             first = step % self._replan_steps
             chunk = state[:-1].reshape(2, self._num_points, outputs)[:, first : first + self._horizon + 1]
             means = chunk[0]
-            covariances = self._floor * self._reference.covariances[at] + chunk[1][:, :, None] * np.eye(outputs)
+            covariances = self._floor * self._reference.covariances[indices] + chunk[1][:, :, None] * np.eye(outputs)
         return np.concatenate([means.ravel(), covariances.ravel()])

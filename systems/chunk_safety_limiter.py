@@ -1,4 +1,4 @@
-"""Limiter that keeps the chunks of a policy within bounds, velocity limits and jerk limits."""
+"""Limiter of a policy's chunks: bounds, velocity limits and jerk limits."""
 
 import math
 from dataclasses import dataclass
@@ -22,10 +22,10 @@ class _Plan:
 class ChunkSafetyLimiter(LeafSystem):
     """Execute the chunks of a policy within bounds, velocity limits and jerk limits (`ChunkGuard`).
 
-    Every ``replan_steps`` control steps, from the first one on, the chunk is limited as a continuation of the last
-    three commands. In between, the limited chunk is executed. The motion starts at rest at the measured pose. If it is
-    outside the bounds, the first command leads inside, or the pose is held, with a fallback, if no step within the
-    limits leads inside.
+    At the first control step, and then every ``replan_steps`` control steps, the chunk is limited as a continuation of
+    the last three commands. At the other control steps, the limited chunk is executed. The motion starts at rest at the
+    measured pose. If the measured pose is outside the bounds, the first command is inside. If no step within the limits
+    leads inside, the measured pose is commanded and ``fallback`` is 1.
 
     .. pydrake_system::
 
@@ -38,17 +38,17 @@ class ChunkSafetyLimiter(LeafSystem):
         - rate
         - fallback
 
-    ``chunk`` (K*O,) has the requested outputs (K, O) in row-major order, from the current control step on. Its value
-    must be constant during a control step. ``pose`` is the measured pose (O,), read at initialization. ``desired_pose``
-    is (O,). ``rate`` (1,) is the executed speed relative to that of the requested chunk, below 1 only with the mode
-    "slowdown" or at a fallback. ``fallback`` (1,) is 1 if the rest of the previous chunk is executed because no chunk
-    within the limits was found, or because the requested chunk is not finite.
+    ``chunk`` (K*O,) contains the requested outputs (K, O) in row-major order; the first is for the current control
+    step. It must be constant during a control step. ``pose`` is the measured pose (O,), read at initialization.
+    ``desired_pose`` is (O,). ``rate`` (1,) is the executed speed divided by the speed of the requested chunk. It is
+    less than 1 only in the mode "slowdown" or if ``fallback`` is 1. ``fallback`` (1,) is 1 if no chunk within the
+    limits was found or the requested chunk is not finite; the rest of the previous chunk is then executed.
 
     Args:
-        guard: Limits and mode, for O outputs; its state is not used.
+        guard: Limits and mode for O outputs; its state is not used.
         num_steps: Number K of steps of a chunk, at least 4 and at least `replan_steps`.
-        replan_steps: Number of control steps that are executed of each chunk, at least 1.
-        period: Control period [s], positive, that of the guard.
+        replan_steps: Number of executed control steps of each chunk, at least 1.
+        period: Control period [s], positive, equal to the period of the guard.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
@@ -68,14 +68,12 @@ class ChunkSafetyLimiter(LeafSystem):
         self._outputs = guard.constraints.num_outputs
         self._chunk_port = self.DeclareVectorInputPort("chunk", num_steps * self._outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", self._outputs)
-        # [last three commands and rest of the limited chunk (3 + K, O); rate, fallback, control steps since the start]
+        # [last three commands and rest of the limited chunk (3 + K, O); rate; fallback; number of the control step]
         self._state = self.DeclareDiscreteState((3 + num_steps) * self._outputs + 3)
         self._plan = declare.cache(self, "plan", self._calc_plan, [self._chunk_port, self._state])
-        self._desired_pose_port = declare.part_output(
-            self, "desired_pose", self._plan, lambda plan: plan.outputs[0], self._outputs
-        )
-        self._rate_port = declare.part_output(self, "rate", self._plan, lambda plan: plan.rate)
-        self._fallback_port = declare.part_output(self, "fallback", self._plan, lambda plan: plan.fallback)
+        declare.part_output(self, "desired_pose", self._plan, lambda plan: plan.outputs[0], self._outputs)
+        declare.part_output(self, "rate", self._plan, lambda plan: plan.rate)
+        declare.part_output(self, "fallback", self._plan, lambda plan: plan.fallback)
         declare.update_after_start(self, period, self._advance, self._reset)
 
     get_chunk_input_port = input_getter("chunk", "requested outputs, (K*O,)")
@@ -88,7 +86,7 @@ class ChunkSafetyLimiter(LeafSystem):
         measured = declare.start_pose(self._pose_port.Eval(context))
         try:
             first = self._guard.nearest_start(measured)
-        except InputError:  # too far outside
+        except InputError:  # no step within the limits leads inside the bounds
             first = measured
         motion = np.concatenate([np.tile(measured, 3), np.tile(first, self._num_steps)])
         discrete_state.set_value(self._state, np.append(motion, np.zeros(3)))

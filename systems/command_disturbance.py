@@ -3,19 +3,19 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number, as_whole
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class CommandDisturbance(LeafSystem):
-    """Delay commands and lose some of them at random; a lost command is replaced by the last delivered one.
+    """Delay commands and lose some at random; a lost command is replaced by the last delivered command.
 
         y_t = y_{t−1} with probability p, otherwise u_{t−k},  t = 0, 1, …
 
-    where u_t is the command of period t and y_t the delivered one. y_{−1} and u_{−1}, …, u_{−k} are the measured pose
-    at initialization. Every command, also the first one, is therefore delayed by k periods.
+    u_t is the command of period t, and y_t is the delivered command. y_{−1} and u_{−1}, …, u_{−k} are the measured pose
+    at initialization. Every command, including the first, is therefore delayed by k periods.
 
     .. pydrake_system::
 
@@ -40,13 +40,9 @@ class CommandDisturbance(LeafSystem):
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
         super().__init__()
-        size, delay = as_whole(size, "size of a command"), as_whole(delay, "delay of commands")
-        if size < 1:
-            raise InputError(f"a command has at least one number, not {size}")
+        size, delay = as_count(size, "the size of a command"), as_count(delay, "the delay of commands", 0)
         if not 0.0 <= as_number(loss_probability, "loss_probability") < 1.0:
             raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {loss_probability}")
-        if delay < 0:
-            raise InputError(f"the delay of commands is a number of periods from 0, not {delay}")
         self._loss_probability, self._delay = loss_probability, delay
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self._count = self.DeclareDiscreteState(1)
@@ -56,9 +52,7 @@ class CommandDisturbance(LeafSystem):
         self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
         source = self._command_port if self._delay_line is None else self._delay_line
-        self._delivered_command_port = declare.output(
-            self, "delivered_command", size, self._delivered, [self._is_lost, self._last_delivered, source]
-        )
+        declare.output(self, "delivered_command", size, self._delivered, [self._is_lost, self._last_delivered, source])
         declare.update(self, period, self._update, self._reset)
         self._start = declare.start_time(self)
 
@@ -67,7 +61,7 @@ class CommandDisturbance(LeafSystem):
     get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Set the seed of the losses; `context` is this system's.
+        """Set the seed of the random losses; `context` is this system's.
 
         Raises:
             InputError: If the seed is not a whole number of at least 0.
@@ -85,7 +79,7 @@ class CommandDisturbance(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         count = context.get_discrete_state().value(self._count).item() + 1.0
         discrete_state.set_value(self._count, [count])
-        # At the start no period has ended: the value of the port before this instant's updates is not a command.
+        # At initialization no period has ended, and the value at the port is not a command.
         has_ended = declare.has_started(context, self._start)
         if has_ended:
             discrete_state.set_value(self._last_delivered, self._delivered(context))

@@ -14,10 +14,10 @@ class CommandFilter(LeafSystem):
 
         safe_pose = law(last safe_pose, desired_pose)
 
-    See `BarrierFilter`, `TangentSpaceFilter` and `MotionConstraintFilter`. The last of these laws uses the last two
-    commands. At initialization, the last command is the measured pose. If the desired pose is not finite, the first two
-    laws repeat the last command, and the third one brakes. If a law returns numbers that are not finite, the last
-    command is repeated.
+    The law is a `BarrierFilter`, a `TangentSpaceFilter` or a `MotionConstraintFilter`, which uses the last two
+    commands. At initialization, the last command is the measured pose. If the desired pose is not finite, a
+    `MotionConstraintFilter` brakes, and the other laws repeat the last command. If the result of a law is not finite,
+    the last command is repeated.
 
     .. pydrake_system::
 
@@ -30,7 +30,7 @@ class CommandFilter(LeafSystem):
         - intervention
 
     ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
-    if the law intervened (see its class), or the last command is repeated.
+    if the law intervened (see the class of the law) or the last command is repeated.
 
     Args:
         law: Law of the filter.
@@ -48,10 +48,8 @@ class CommandFilter(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
         self._last = self.DeclareDiscreteState(size)  # state of the law, which begins with the last command
         self._command = declare.cache(self, "command", self._calc_command, [self._desired_pose_port, self._last])
-        self._safe_pose_port = declare.part_output(
-            self, "safe_pose", self._command, lambda command: command[:outputs], outputs
-        )
-        self._intervention_port = declare.part_output(self, "intervention", self._command, lambda command: command[-1])
+        declare.part_output(self, "safe_pose", self._command, lambda command: command[:outputs], outputs)
+        declare.part_output(self, "intervention", self._command, lambda command: command[-1])
         declare.update_after_start(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")

@@ -2,10 +2,8 @@
 
 from pydrake.systems.framework import LeafSystem
 
-from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
 
@@ -14,7 +12,8 @@ class CommandWatchdog(LeafSystem):
 
     This system is for robot controllers without a command timeout. A command is valid while it is finite, not older
     than the timeout, and not more than one period in the future; see `LastValidPose`. While the blend factor is zero,
-    the last valid pose is the measured one, so that a robot without a valid command is held where control begins.
+    the last valid pose is the measured pose. If there is no valid command when control begins, the robot therefore
+    stays where it is.
 
     .. pydrake_system::
 
@@ -30,7 +29,7 @@ class CommandWatchdog(LeafSystem):
 
     ``desired_pose``, ``pose`` (measured, read at initialization and while the blend factor is zero) and ``safe_pose``
     are (O,). ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it is not connected, commands never
-    time out. ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`; if it is not connected, it counts as 1.
+    time out. ``blend_factor`` is (1,), from a `TorqueSafetyLimiter`, and 1 by default.
     ``command_timed_out`` (1,) is 1 while no valid command is available.
 
     Args:
@@ -44,9 +43,7 @@ class CommandWatchdog(LeafSystem):
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):
         super().__init__()
-        pose_size = as_whole(pose_size, "pose_size")
-        if pose_size < 1:
-            raise InputError(f"a pose has at least one coordinate, not {pose_size}")
+        pose_size = as_count(pose_size, "pose_size")
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", pose_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
@@ -60,8 +57,8 @@ class CommandWatchdog(LeafSystem):
             timeout=timeout,
             blend_factor=self._blend_factor_port,
         )
-        self._safe_pose_port = declare.output(self, "safe_pose", pose_size, followed_pose.eval, followed_pose.tickets)
-        self._command_timed_out_port = followed_pose.declare_timed_out_output(self)
+        declare.output(self, "safe_pose", pose_size, followed_pose.eval, followed_pose.sources)
+        followed_pose.declare_timed_out_output(self)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")

@@ -23,8 +23,8 @@ class ConstraintViolation(LeafSystem):
         - violation
 
     ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c, or as in
-    `MotionConstraints.violation`; it is `UNCONSTRAINED` if there is no constraint. The violation depends on the pose
-    and the control step alone, so every guidance is evaluated in the same way.
+    `MotionConstraints.violation`; it is `UNCONSTRAINED` if there is no constraint. The violation depends only on the
+    pose and the control step, so that all guidance is evaluated in the same way.
 
     Args:
         constraints: Linear constraints (constant, or one set per control step) or motion constraints, on O outputs.
@@ -48,7 +48,7 @@ class ConstraintViolation(LeafSystem):
             self._step = self.DeclareDiscreteState(1)
             declare.update(self, period, self._advance)
             sources.append(self._step)
-        self._violation_port = declare.scalar_output(self, "violation", self._violation, sources)
+        declare.scalar_output(self, "violation", self._violation, sources)
 
     get_pose_input_port = input_getter("pose", "pose, (O,)")
     get_violation_output_port = output_getter("violation", "violation max(c − G y), (1,)")

@@ -14,14 +14,14 @@ from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_bodies
 
-ZERO, ONE = np.zeros(1), np.ones(1)  # the values of flags; converting lists takes longer than the check of a contact
+ZERO, ONE = np.zeros(1), np.ones(1)  # values of flags, because converting a list takes longer than the contact check
 
 
 class ContactDetector(LeafSystem):
-    """Detect contact between bodies and obstacles, at the last plant step and since the episode started.
+    """Detect contact between bodies and obstacles at the last plant step and since the start of the episode.
 
-    The contact results are evaluated at every plant step, so collisions shorter than a control step count. All outputs
-    are state: they are one plant step old, without direct feedthrough.
+    The contact results are evaluated at every plant step, so collisions that are shorter than a control step are
+    detected. All outputs are state without direct feedthrough, delayed by one plant step.
 
     .. pydrake_system::
 
@@ -54,10 +54,11 @@ class ContactDetector(LeafSystem):
         super().__init__()
         check_bodies(plant, "bodies", bodies)
         check_bodies(plant, "obstacles", obstacles)
-        indices, others = ({int(body.index()) for body in group} for group in (bodies, obstacles))
-        if indices & others:
+        bodies_indices, obstacles_indices = ({int(body.index()) for body in group} for group in (bodies, obstacles))
+        if bodies_indices & obstacles_indices:
             raise InputError("a body can't collide with itself: bodies and obstacles overlap")
-        self._pairs = set(product(indices, others)) | set(product(others, indices))
+        pairs = list(product(bodies_indices, obstacles_indices))
+        self._pairs = {*pairs, *((obstacle, body) for body, obstacle in pairs)}
         self._body_of = {
             geometry: int(body.index())
             for body in (*bodies, *obstacles)
@@ -65,9 +66,9 @@ class ContactDetector(LeafSystem):
         }
         self._contact_results_port = self.DeclareAbstractInputPort("contact_results", Value(ContactResults()))
         self._collision, self._has_collided, self._contact_force = (self.DeclareDiscreteState(1) for _ in range(3))
-        self._collision_port = self.DeclareStateOutputPort("collision", self._collision)
-        self._has_collided_port = self.DeclareStateOutputPort("has_collided", self._has_collided)
-        self._contact_force_port = self.DeclareStateOutputPort("contact_force", self._contact_force)
+        self.DeclareStateOutputPort("collision", self._collision)
+        self.DeclareStateOutputPort("has_collided", self._has_collided)
+        self.DeclareStateOutputPort("contact_force", self._contact_force)
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_contact_results_input_port = input_getter("contact_results", "plant's contact results")

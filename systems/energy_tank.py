@@ -1,4 +1,4 @@
-"""Energy tank that makes an impedance with a moving reference and a changing bound passive."""
+"""Energy tank that makes an impedance passive while its reference and its wrench bound change."""
 
 from typing import NamedTuple
 
@@ -30,16 +30,16 @@ class _Admitted(NamedTuple):
 
 
 class EnergyTank(LeafSystem):
-    """Limit changes of a reference and a wrench bound, so that they use no more energy than the tank holds.
+    """Limit changes of a reference and a wrench bound, so that they use at most the energy in the tank.
 
         T' = T + Σ D Δx² / h − (U(x_r', F') − U(x_r, F)) ≥ 0
 
-    T is the energy in the tank, and U that of the clipped spring at the measured pose x; a prime marks the values after
-    a change. The energy that a change of the reference x_r or of the limits F adds to the spring is taken from the
-    tank. The energy that the damper dissipates, at least Σ D Δx² / h for a displacement Δx in a period h, refills the
-    tank up to its capacity. If the tank holds too little energy, only a share of the change is passed on. A decrease of
-    a limit applies at once. The energy of spring, tank and motion therefore increases only by work of the environment,
-    which cannot extract more than the initial content (Ferraguti, Secchi, Fantuzzi 2013).
+    T is the energy in the tank, and U the energy of the clipped spring at the measured pose x. A prime marks the values
+    after a change. The energy that a change of the reference x_r or of the limits F adds to the spring is taken from
+    the tank. The energy that the damper dissipates, at least Σ D Δx² / h for a displacement Δx in a period h, refills
+    the tank up to its capacity. If the energy in the tank does not suffice, only a share of the change is applied. A
+    decrease of a limit applies at once. Only work of the environment therefore increases the total energy of spring,
+    tank and motion, and the environment cannot extract more than the initial energy (Ferraguti, Secchi, Fantuzzi 2013).
 
     .. pydrake_system::
 
@@ -54,17 +54,17 @@ class EnergyTank(LeafSystem):
         - energy
 
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
-    desired pose that is not finite is passed on and takes no energy. While the measured pose is not finite, reference
-    and content are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,), limits of
-    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. While a number of
-    ``max_wrench`` is NaN or negative, the last valid one applies (`LastValidBound`). ``energy`` is (1,), the
-    content [J].
+    desired pose that is not finite is output unchanged and uses no energy. While the measured pose is not finite, the
+    reference and the energy are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,),
+    limits of [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. While a number of
+    ``max_wrench`` is NaN or negative, its last valid value applies (`LastValidBound`). ``energy`` is (1,), the energy
+    in the tank [J].
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
         damping: Smallest damping (6,) of each coordinate [N s/m, Nm s/rad], not negative.
         bound: Bound of the wrench, with finite limits per axis.
-        capacity: Initial and largest content [J], positive, finite.
+        capacity: Initial and largest energy [J], positive, finite.
         period: Sampling period [s], positive.
 
     Raises:
@@ -94,18 +94,16 @@ class EnergyTank(LeafSystem):
         inputs = (self._desired_pose_port, self._pose_port, *self._requested_bound.sources)
         states = (self._last_reference, self._last_limits, self._last_pose, self._content)
         self._admitted = declare.cache(self, "admitted", self._calc_admitted, [*inputs, *states])
-        self._reference_pose_port = declare.output(
-            self, "reference_pose", POSE_SIZE, self._reference_pose, [self._admitted]
-        )
-        self._admitted_wrench_port = declare.output(
-            self, "admitted_wrench", MAX_WRENCH_SIZE, self._admitted_wrench, [self._admitted]
-        )
-        self._energy_port = self.DeclareStateOutputPort("energy", self._content)
+        declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, [self._admitted])
+        declare.output(self, "admitted_wrench", MAX_WRENCH_SIZE, self._admitted_wrench, [self._admitted])
+        self.DeclareStateOutputPort("energy", self._content)
         declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
-    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
+    get_max_wrench_input_port = input_getter(
+        "max_wrench", "limits of the wrench per axis and of its norms, (8,); optional"
+    )
     get_reference_pose_output_port = output_getter("reference_pose", "reference that the tank admits, (6,)")
     get_admitted_wrench_output_port = output_getter("admitted_wrench", "bound that the tank admits, (8,)")
     get_energy_output_port = output_getter("energy", "energy in the tank, (1,) [J]")
@@ -121,10 +119,10 @@ class EnergyTank(LeafSystem):
         limits, K = np.minimum(last_limits, requested), self._stiffness
         if not is_finite(pose):  # NaN would fill the tank and remain in its state
             return _Admitted(reference, limits, content)
-        if not is_finite(reference):  # the pose was not finite at initialization: start here
+        if not is_finite(reference):  # the pose was not finite at initialization: the reference starts here
             reference = pose
-        moved = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
-        dissipated = float(self._damping.dot(moved * moved)) / self._period
+        displacement = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
+        dissipated = float(self._damping.dot(displacement * displacement)) / self._period
         error, desired_error = pose_difference(reference, pose), pose_difference(desired, pose)
         # Energy of tank and spring together.
         energy = min(self._capacity, content + dissipated) + spring_energy(K, last_limits, error)

@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, check_takes, check_terms, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
 
 TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
 """Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
@@ -26,16 +26,16 @@ TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "ti
 
 @dataclass(frozen=True)
 class TerminationTerm:
-    """A condition that terminates an episode.
+    """Condition that terminates an episode.
 
     Args:
         termination: Reason that is reported, one of `TERMINATIONS`.
         inputs: Size of each signal that the condition depends on, by name. Terms of one monitor that name the same
             signal share its port.
-        condition: Pure function of these signals, called by name, that returns True if the condition is met.
+        condition: Pure function with these signals as keyword arguments; returns True if the condition is met.
         steps: Number of control steps in which the condition must be met before the episode ends, at least 1.
-        progress: Optional function of the same signals. Without this function, the steps must be consecutive. With it,
-            they need not be consecutive, but their count is reset when the value of the function exceeds its value at
+        progress: Optional function of the same signals. Without this function, the steps must be consecutive. With this
+            function, they need not be consecutive; their count is reset when the function's value exceeds its value at
             the previous reset by more than `min_progress`.
         min_progress: Increase of the value of `progress` up to which the count is not reset, not negative, finite.
 
@@ -60,10 +60,11 @@ class TerminationTerm:
 
 
 class EpisodeMonitor(LeafSystem):
-    """Evaluate termination terms in order of precedence and output the reason of the first one that is met.
+    """Evaluate termination terms and output the reason of the first term, in order of precedence, that is met.
 
-    Each term counts a control step once. At the end of a step, the output already includes this step; the state
-    includes it after the update event of that instant. Once a term has terminated the episode, the output is constant.
+    Each term counts the control steps in which its condition is met. At the end of a step, the output already counts
+    this step, and the update event of the same instant stores the count. The output is constant after a term has
+    terminated the episode.
 
     .. pydrake_system::
 
@@ -76,7 +77,7 @@ class EpisodeMonitor(LeafSystem):
     ``termination`` is (1,), an index into `TERMINATIONS`; 0 while the episode continues.
 
     Args:
-        terms: Termination terms, at least one; the first one that is met takes precedence.
+        terms: Termination terms in order of precedence, at least one.
         period: Control period [s], positive.
         task_name: Name of the task, for messages.
 
@@ -94,7 +95,7 @@ class EpisodeMonitor(LeafSystem):
             raise InputError("a monitor needs at least one condition")
         for term in terms:
             for function in filter(None, (term.condition, term.progress)):
-                check_takes(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")
+                check_signature(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")
         self._terms = tuple(terms)
         self._indices = [TERMINATIONS.index(term.termination) for term in terms]
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
@@ -103,7 +104,7 @@ class EpisodeMonitor(LeafSystem):
         self._state = self.DeclareDiscreteState(np.append(np.tile([0.0, -np.inf], len(self._terms)), 0.0))
         # The output and the event of the same instant share one evaluation.
         self._next = declare.cache(self, "next_state", self._calc_next, [*self._signals.tickets, self._state])
-        self._termination_port = declare.part_output(self, "termination", self._next, lambda state: state[-1])
+        declare.part_output(self, "termination", self._next, lambda state: state[-1])
         declare.update_after_start(self, period, self._update, declare.reset_to_default(self))
 
     get_signal_input_port = declare.get_signal_input_port
@@ -127,13 +128,13 @@ class EpisodeMonitor(LeafSystem):
         return state
 
     def _is_met(self, term: TerminationTerm, inputs: Mapping[str, np.ndarray]) -> bool:
-        met = term.condition(**inputs)
-        if isinstance(met, bool | np.bool_):
-            return bool(met)
-        array = np.asarray(met)
+        result = term.condition(**inputs)
+        if isinstance(result, bool | np.bool_):
+            return bool(result)
+        array = np.asarray(result)
         if array.size != 1 or array.dtype.kind not in "fiub" or not np.isfinite(array).all():
             raise InputError(
-                f"the condition {term.termination!r}{self._of_task} must be true or false, and it is {brief(met)}"
+                f"the condition {term.termination!r}{self._of_task} must be true or false, and it is {brief(result)}"
             )
         return bool(array.item())
 

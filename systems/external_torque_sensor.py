@@ -1,4 +1,4 @@
-"""External joint torques as an arm with joint torque sensors measures them."""
+"""Measurement of external joint torques by an arm with joint torque sensors."""
 
 from dataclasses import dataclass
 
@@ -42,10 +42,11 @@ class ExternalTorqueSensor(LeafSystem):
 
         τ = τ_c + ε ∘ (τ_c + g(q)) + g'(q) − g(q) − c ∘ tanh(v / v₀) + b + d + σ ∘ w,  w ~ N(0, 1) once per period
 
-    An arm computes its external torques as the measured torques minus the torques of its model. τ_c are the torques of
-    contact forces, ε relative errors of the sensors, g(q) the gravity torques of the model and g'(q) those of the
-    actual bodies, c friction torques with v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are
-    compensated exactly. The errors are parameters, which `set_errors` sets at a reset.
+    An arm computes its external torques as the measured torques minus the torques of its model. q and v are the joint
+    positions and velocities. τ_c are the torques of contact forces. g(q) are the gravity torques of the model, and
+    g'(q) the gravity torques of the actual bodies. ε are relative errors of the sensors, c friction torques with
+    v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are compensated exactly. ε, c, b and the
+    actual bodies are parameters, which `set_errors` sets at a reset.
 
     .. pydrake_system::
 
@@ -60,8 +61,8 @@ class ExternalTorqueSensor(LeafSystem):
     are (n,) [Nm].
 
     Args:
-        plant: Model of the arm alone, finalized.
-        payload_body: Body of the plant, not the world, to whose center of mass a payload is rigidly attached.
+        plant: Finalized model of only the arm.
+        payload_body: Body of the plant, not the world; a payload is rigidly attached at its center of mass.
         noise: Standard deviations σ, (n,) [Nm], not negative, finite.
         drift: Standard deviations of d after `DRIFT_TIME`, (n,) [Nm], not negative, finite.
         period: Period of noise and drift [s], positive.
@@ -102,7 +103,8 @@ class ExternalTorqueSensor(LeafSystem):
         self._contact_torque_port = self.DeclareVectorInputPort("contact_torque", n)
         self._model = declare.plant_context(self, plant, self._positions, [self._state_port])
         self._bodies_set = declare.cache(self, "actual_bodies", self._actual_bodies, [self.all_parameters_ticket()])
-        # The value is [plant context, bodies set in it]: bodies change only at a reset, positions at every step.
+        # The value is [plant context, result of `_actual_bodies` that is set in it]. Masses and centers of mass change
+        # only at a reset, positions at every step.
         self._actual = self.DeclareCacheEntry(
             description="actual_arm",
             value_producer=ValueProducer(
@@ -111,7 +113,7 @@ class ExternalTorqueSensor(LeafSystem):
             prerequisites_of_calc={self._state_port.ticket(), self._bodies_set.ticket()},
         )
         sources = [self._contact_torque_port, self._model, self._actual, self._noise_sample, self._walk]
-        self._external_torque_port = declare.output(self, "external_torque", n, self._external_torque, sources)
+        declare.output(self, "external_torque", n, self._external_torque, sources)
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_state_input_port = input_getter("state", "positions and velocities of the joints, (2n,)")
@@ -120,11 +122,11 @@ class ExternalTorqueSensor(LeafSystem):
 
     @property
     def bodies(self) -> tuple[RigidBody, ...]:
-        """The B bodies of `JointTorqueErrors` in its order, all but the world."""
+        """Bodies of the plant without the world, (B,), in the order of `JointTorqueErrors`."""
         return tuple(self._bodies)
 
     def set_errors(self, context: Context, errors: JointTorqueErrors, seed: int) -> None:
-        """Set the errors of an episode and the seed of noise and drift; `context` is this system's.
+        """Set the errors of an episode, and the seed of noise and drift; `context` is this system's.
 
         Raises:
             InputError: If an error has the wrong shape or is not finite, or the seed is not a whole number of at
@@ -147,7 +149,7 @@ class ExternalTorqueSensor(LeafSystem):
             context.get_mutable_numeric_parameter(index).SetFromVector(values)
 
     def add_payload(self, context: Context, mass: float) -> None:
-        """Add a payload of a mass [kg] that is not in the arm's model; `context` is this system's."""
+        """Add a payload of `mass` [kg] that the model of the arm does not contain; `context` is this system's."""
         masses = context.get_mutable_numeric_parameter(self._mass)
         masses.SetAtIndex(self._payload_index, masses.GetAtIndex(self._payload_index) + mass)
 
@@ -155,7 +157,7 @@ class ExternalTorqueSensor(LeafSystem):
         return self._state_port.Eval(context)[: len(self._noise)]
 
     def _actual_bodies(self, context: Context) -> list[tuple[float, np.ndarray]]:
-        """Return actual mass [kg] and center of mass (3,) [m] of each body."""
+        """Return the actual mass [kg] and center of mass (3,) [m] of each body."""
         masses = context.get_numeric_parameter(self._mass).value()
         centers = context.get_numeric_parameter(self._center).value().reshape(-1, 3)
         return [

@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 GuidanceFunction = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 """Function of action (A,), pose (O,) and wrench (W,) that returns the desired pose (O,)."""
@@ -22,7 +21,7 @@ class FunctionGuidanceSystem(LeafSystem):
         desired_pose[k] = function(action[k], pose[k], wrench[k])
 
     If the function does not return O finite numbers, the previous desired pose is repeated (initially the measured
-    pose) and ``fallback`` is 1, so that NaN is never commanded. At initialization, anything but O numbers is refused.
+    pose) and ``fallback`` is 1, so that NaN is never commanded.
 
     .. pydrake_system::
 
@@ -36,40 +35,36 @@ class FunctionGuidanceSystem(LeafSystem):
         - held_action
         - fallback
 
-    ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,). The
-    outputs are state without direct feedthrough, so that feedback of the measured pose causes no algebraic loop.
+    ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,).
+    ``held_action`` is the action of the present control step. The outputs are state without direct feedthrough, so that
+    feedback of the measured pose causes no algebraic loop.
 
     Args:
-        function: Pure function (action, pose, wrench) → desired pose; a reset cannot restore internal memory.
+        function: Pure function (action, pose, wrench) → desired pose, because a reset cannot restore internal memory.
         action_size: Size A of the action, at least 1.
         pose_size: Size O of the poses, at least 1.
         wrench_size: Size W of the wrench, at least 1.
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a size or the period is out of range, or `function` is no function of three arguments; at
+        InputError: If a size or the period is out of range, or `function` is not a function of three arguments. At
             initialization, if the measured pose is not finite, or the function does not return O numbers.
     """
 
     def __init__(self, function: GuidanceFunction, action_size: int, pose_size: int, wrench_size: int, period: float):
         super().__init__()
-        if not all(is_whole(size, 1) for size in (action_size, pose_size, wrench_size)):
-            raise InputError(
-                f"guidance needs whole sizes of at least 1, not {brief(action_size)}, "
-                f"{brief(pose_size)} and {brief(wrench_size)}"
-            )
+        action_size, pose_size = as_count(action_size, "action_size"), as_count(pose_size, "pose_size")
         _check_function(function)
-        action_size, pose_size, wrench_size = int(action_size), int(pose_size), int(wrench_size)
         self._function = function
         self._action_port = self.DeclareVectorInputPort("action", action_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
-        self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
+        self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
         self._desired_pose = self.DeclareDiscreteState(pose_size)
         self._held_action = self.DeclareDiscreteState(action_size)
         self._fallback = self.DeclareDiscreteState(1)
         self._desired_pose_port = self.DeclareStateOutputPort("desired_pose", self._desired_pose)
-        self._held_action_port = self.DeclareStateOutputPort("held_action", self._held_action)
-        self._fallback_port = self.DeclareStateOutputPort("fallback", self._fallback)
+        self.DeclareStateOutputPort("held_action", self._held_action)
+        self.DeclareStateOutputPort("fallback", self._fallback)
         declare.update(self, period, self._step, self._reset)
 
     get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
@@ -104,24 +99,24 @@ class FunctionGuidanceSystem(LeafSystem):
 
 
 def _check_function(function: Any) -> None:
-    """Raise an `InputError` if `function` is no function, or does not take three arguments by position."""
+    """Raise an `InputError` unless `function` can be called with three positional arguments."""
     if not callable(function):
         raise InputError(f"guidance needs a function of action, pose and wrench, not {brief(function)}")
     try:
-        takes = signature(function)
+        accepted = signature(function)
     except (ValueError, TypeError):
         return  # functions written in C may have no signature
     try:
-        takes.bind("action", "pose", "wrench")
+        accepted.bind("action", "pose", "wrench")
     except TypeError:
         raise InputError(
             "guidance needs a function of action, pose and wrench, and this one has the parameters "
-            f"({', '.join(takes.parameters)})"
+            f"({', '.join(accepted.parameters)})"
         ) from None
 
 
 def _numbers(returned: Any, size: int) -> np.ndarray | None:
-    """Return an array (size,) of numbers, finite or not; None if the function returned anything else."""
+    """Return an array (size,) of numbers, which need not be finite; None if `returned` is anything else."""
     try:
         desired = np.asarray(returned)
     except ValueError:

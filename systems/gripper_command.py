@@ -1,4 +1,4 @@
-"""Desired state of the position drives of a gripper."""
+"""Desired joint state of a gripper with position drives."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -12,8 +12,8 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class GripperCommand(LeafSystem):
     """Desired state of gripper joints: the last finite desired positions, with zero velocity.
 
-    Desired positions are clipped to the joint limits. If a position is not finite, or the port is not connected, the
-    previous desired position applies. After an initialization, the previous desired position is `opening`.
+    Desired positions are clipped to the joint limits. If a desired position is not finite, or the port is not
+    connected, the previous desired position applies, which is `opening` after an initialization.
 
     .. pydrake_system::
 
@@ -32,7 +32,7 @@ class GripperCommand(LeafSystem):
         period: Period at which the desired position is stored [s], positive.
 
     Raises:
-        InputError: If the sizes differ, or an argument is out of range.
+        InputError: If the sizes differ or an argument is out of range.
     """
 
     def __init__(self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float):
@@ -46,7 +46,7 @@ class GripperCommand(LeafSystem):
         num_joints = len(opening)
         self._position_port = self.DeclareVectorInputPort("position", num_joints)
         self._last_position = self.DeclareDiscreteState(opening)
-        self._desired_state_port = declare.output(
+        declare.output(
             self, "desired_state", 2 * num_joints, self._desired_state, [self._position_port, self._last_position]
         )
         declare.update(self, period, self._update, declare.reset_to_default(self))

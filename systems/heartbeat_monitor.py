@@ -16,9 +16,9 @@ FORGET_TIME = 1.0  # age of a heartbeat above which its sender is ignored while 
 class HeartbeatMonitor(LeafSystem):
     """Raise a fault when a robot-side safety monitor reports a stop or its heartbeat times out.
 
-    The age of each sender's heartbeat is checked, so that the exit of one monitor is detected while another one is
-    alive. To allow the replacement of a monitor, a heartbeat older than `FORGET_TIME` is ignored while another monitor
-    is alive. No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
+    The age of each sender's heartbeat is checked, so that the exit of one monitor is detected while another monitor is
+    alive. So that a monitor can be replaced, a heartbeat older than `FORGET_TIME` is ignored while another monitor is
+    alive. No fault is raised before the first heartbeat, so that a robot without a safety monitor can be used.
 
     .. pydrake_system::
 
@@ -34,8 +34,8 @@ class HeartbeatMonitor(LeafSystem):
 
     Args:
         period: Sampling period [s], positive.
-        timeout: Largest accepted age of a heartbeat [s], positive and less than `FORGET_TIME`. With a larger one,
-            the exit of one monitor would never be detected while another one is alive.
+        timeout: Largest accepted age of a heartbeat [s], positive and less than `FORGET_TIME`. With a larger timeout,
+            the exit of one monitor would never be detected while another monitor is alive.
 
     Raises:
         InputError: If an argument is out of range.
@@ -48,11 +48,9 @@ class HeartbeatMonitor(LeafSystem):
         self._period, self._timeout = period, timeout
         self._heartbeats_port = self.DeclareAbstractInputPort("heartbeats", Value[object]())
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
-        # For each sender [sender; its last sequence number; time since that heartbeat in s]; NaN if unused.
+        # [sender; its last sequence number; time since that heartbeat in s] of each sender; NaN if unused.
         self._state = self.DeclareDiscreteState(np.full(3 * MAX_SENDERS, np.nan))
-        self._fault_port = declare.scalar_output(
-            self, "fault", self._fault, [self._heartbeats_port, self._status_fault_port, self._state]
-        )
+        declare.scalar_output(self, "fault", self._fault, [self._heartbeats_port, self._status_fault_port, self._state])
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_heartbeats_input_port = input_getter("heartbeats", "newest `Heartbeat` of each sender; other types are ignored")
@@ -92,6 +90,6 @@ class HeartbeatMonitor(LeafSystem):
     def _is_stopping_or_missing(self, context: Context) -> bool:
         ages = {sender: age for sender, _, age in self._senders(context).tolist()}
         is_alive = {sender: age <= self._timeout for sender, age in ages.items()}
-        is_stopping = any(each.is_stopping and is_alive.get(each.sender) for each in self._heartbeats(context))
+        is_stopping = any(beat.is_stopping and is_alive.get(beat.sender) for beat in self._heartbeats(context))
         is_missing = any(not alive and ages[sender] <= FORGET_TIME for sender, alive in is_alive.items())
         return is_stopping or is_missing or (bool(ages) and not any(is_alive.values()))

@@ -3,10 +3,10 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_whole, is_finite
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 MAX_NUMBERS = 1_000_000  # largest number of stored numbers (8 MB)
 
@@ -16,9 +16,9 @@ class HistoryBuffer(LeafSystem):
 
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
-    At every control step the newest output replaces the oldest. Initialization fills all P entries with
-    ``initial_output`` if it is connected, otherwise with ``output``. If ``output`` is a command, connect the measured
-    pose to ``initial_output``.
+    At every control step, the newest output replaces the oldest. An initialization fills all P entries with
+    ``initial_output`` if this port is connected, otherwise with ``output``. If ``output`` is a command, connect the
+    measured pose to ``initial_output``.
 
     .. pydrake_system::
 
@@ -30,11 +30,11 @@ class HistoryBuffer(LeafSystem):
         - history
 
     ``output`` and ``initial_output`` are (O,), ``history`` is (P*O,), row-major, oldest first, in the units of
-    ``output``. ``history`` is a discrete state without direct feedthrough, so a feedback loop with the primitive is not
-    algebraic.
+    ``output``. ``history`` is a discrete state without direct feedthrough, so that the feedback loop with the primitive
+    is not algebraic.
 
     Args:
-        num_outputs: Number O of outputs, at least 1.
+        num_outputs: Size O of an output, at least 1.
         length: Number P of stored outputs, at least 1; P·O is at most a million.
         period: Control period [s], positive.
 
@@ -45,9 +45,7 @@ class HistoryBuffer(LeafSystem):
 
     def __init__(self, num_outputs: int, length: int, period: float):
         super().__init__()
-        num_outputs, length = as_whole(num_outputs, "num_outputs of a history"), as_whole(length, "length of a history")
-        if num_outputs < 1 or length < 1:
-            raise InputError(f"a history needs at least one output and one step, not {num_outputs} and {length}")
+        num_outputs, length = as_count(num_outputs, "num_outputs of a history"), as_count(length, "length of a history")
         if length * num_outputs > MAX_NUMBERS:
             raise InputError(f"a history has at most {MAX_NUMBERS} numbers, not {length} times {num_outputs}")
         self._shape = (length, num_outputs)
@@ -55,7 +53,7 @@ class HistoryBuffer(LeafSystem):
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)
         self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
         self._state = self.DeclareDiscreteState(length * num_outputs)
-        self._history_port = self.DeclareStateOutputPort("history", self._state)
+        self.DeclareStateOutputPort("history", self._state)
         declare.update_after_start(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
@@ -63,8 +61,8 @@ class HistoryBuffer(LeafSystem):
     get_history_output_port = output_getter("history", "last P outputs, (P*O,), oldest first")
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
-        is_given = self._initial_output_port.HasValue(context)
-        initial = (self._initial_output_port if is_given else self._output_port).Eval(context)
+        has_initial = self._initial_output_port.HasValue(context)
+        initial = (self._initial_output_port if has_initial else self._output_port).Eval(context)
         if not is_finite(initial):
             raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
         discrete_state.set_value(self._state, np.tile(initial, self._shape[0]))

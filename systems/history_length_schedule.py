@@ -5,19 +5,19 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number, as_whole
+from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class HistoryLengthSchedule(LeafSystem):
     """Shorten the history of sKGRL in contact and lengthen it again in free space.
 
-    In contact, the length decreases to the next shorter one of `lengths` at every control step. In free space, it
-    increases to the next longer one after every `dwell_steps` control steps. Contact is detected with hysteresis: it
-    begins if the measured force exceeds `contact_threshold` and ends if the force falls to `release_threshold`. A force
-    that is NaN counts as contact.
+    In contact, the length changes to the next shorter of `lengths` at every control step. In free space, it changes to
+    the next longer of `lengths` after every `dwell_steps` control steps. Contact is detected with hysteresis: it begins
+    when the measured force exceeds `contact_threshold` and ends when the force is at most `release_threshold`. A force
+    of NaN counts as contact.
 
     .. pydrake_system::
 
@@ -31,12 +31,12 @@ class HistoryLengthSchedule(LeafSystem):
     ``history_length`` is (1,), the number P of stored outputs; it is discrete state, initially the longest length.
 
     Args:
-        lengths: History lengths in any order, at least one, whole numbers from 1. Without a history a command would not
-            start where the previous one ended.
+        lengths: History lengths in any order, whole numbers of at least 1, at least one. 0 is refused, because without
+            a history a command would not start at the end of the previous command.
         period: Control period [s], positive.
         contact_threshold: Force above which contact begins [N], finite.
-        release_threshold: Force at which contact ends [N], from 0 to `contact_threshold`.
-        dwell_steps: Control steps in free space before the next longer length, at least 1.
+        release_threshold: Force at or below which contact ends [N], from 0 to `contact_threshold`.
+        dwell_steps: Number of control steps in free space before the next longer length, at least 1.
         wrench_size: Size W of the wrench, at least 1.
 
     Raises:
@@ -59,19 +59,16 @@ class HistoryLengthSchedule(LeafSystem):
         contact_threshold = as_number(contact_threshold, "contact_threshold")
         if not 0.0 <= as_number(release_threshold, "release_threshold") <= contact_threshold < np.inf:
             raise InputError(
-                f"contact must begin at a finite force and end at a force from 0 to that, not at {contact_threshold} N "
-                f"and {release_threshold} N"
+                "contact_threshold must be finite and release_threshold from 0 to contact_threshold, not "
+                f"{contact_threshold} N and {release_threshold} N"
             )
-        dwell_steps, wrench_size = as_whole(dwell_steps, "dwell_steps"), as_whole(wrench_size, "wrench_size")
-        if dwell_steps < 1 or wrench_size < 1:
-            raise InputError(f"dwell steps and wrench size must be at least 1, not {dwell_steps} and {wrench_size}")
         self._lengths = sorted({int(length) for length in lengths}, reverse=True)
         self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
-        self._dwell_steps = dwell_steps
-        self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
-        # [index into `_lengths`, longest first; 1 in contact, else 0; free steps since contact or the last increase]
+        self._dwell_steps = as_count(dwell_steps, "dwell_steps")
+        self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
+        # [index into `_lengths`, longest first; 1 in contact, else 0; steps in free space since contact or an increase]
         self._state = self.DeclareDiscreteState(3)
-        self._history_length_port = declare.scalar_output(
+        declare.scalar_output(
             self,
             "history_length",
             lambda context: self._lengths[int(context.get_discrete_state().value(self._state)[0])],

@@ -1,17 +1,16 @@
-"""Observation vector of a camera image and further entries."""
+"""Observation vector that contains a camera image and further entries."""
 
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class ImageObservation(LeafSystem):
-    """Concatenation of an image and a vector.
+    """Concatenate a camera image and a vector.
 
         observation = [image / 255, state]
 
@@ -35,21 +34,18 @@ class ImageObservation(LeafSystem):
         state_size: Size n of the state, at least 1.
 
     Raises:
-        InputError: If a size is below 1.
+        InputError: If a size is not a whole number of at least 1.
     """
 
     def __init__(self, width: int, height: int, state_size: int):
         super().__init__()
-        if min(width, height, state_size) < 1:
-            raise InputError(
-                f"an image observation needs at least one pixel and one number, not {width} x {height} pixels and "
-                f"{state_size} numbers"
-            )
+        width, height = as_count(width, "the width of an image"), as_count(height, "the height of an image")
+        state_size = as_count(state_size, "state_size")
         self._image_port = self.DeclareAbstractInputPort("image", Value(ImageRgba8U(width, height)))
         self._state_port = self.DeclareVectorInputPort("state", state_size)
         size = 3 * height * width + state_size
         sources = [self._image_port, self._state_port]
-        self._observation_port = declare.output(self, "observation", size, self._observation, sources)
+        declare.output(self, "observation", size, self._observation, sources)
 
     get_image_input_port = input_getter("image", "color image, an abstract `ImageRgba8U`")
     get_state_input_port = input_getter("state", "further entries of the observation, (n,)")

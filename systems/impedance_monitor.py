@@ -14,9 +14,9 @@ class ImpedanceMonitor(LeafSystem):
 
         contact_force = ‖f‖,  at rest f = K (x_d − x)
 
-    where K is the stiffness, x_d the desired and x the measured pose. In a collision this estimate is a better measure
-    than the simulated contact force: the instantaneous force of an impact depends on the time step of the simulation,
-    and the force of the impedance does not.
+    K is the stiffness, x_d the desired and x the measured pose. In a collision, this estimate is a better measure than
+    the simulated contact force: the instantaneous force of an impact depends on the time step of the simulation, but
+    the force of the impedance does not.
 
     .. pydrake_system::
 
@@ -45,8 +45,8 @@ class ImpedanceMonitor(LeafSystem):
         self._saturated = 0.999 * checked  # magnitudes from which a component counts as saturated
         self._impedance_wrench_port = self.DeclareVectorInputPort("impedance_wrench", 6)
         sources = [self._impedance_wrench_port]
-        self._contact_force_port = declare.scalar_output(self, "contact_force", self._contact_force, sources)
-        self._saturation_port = declare.scalar_output(self, "saturation", self._saturation, sources)
+        declare.scalar_output(self, "contact_force", self._contact_force, sources)
+        declare.scalar_output(self, "saturation", self._saturation, sources)
 
     get_impedance_wrench_input_port = input_getter("impedance_wrench", "wrench that the impedance applies, (6,)")
     get_contact_force_output_port = output_getter("contact_force", "norm of the force of the impedance, (1,) [N]")

@@ -11,7 +11,7 @@ from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant
 
-MAX_TORQUE = 1e4  # torque to which samples are clipped [Nm]; no arm of this size has such a torque
+MAX_TORQUE = 1e4  # torque to which samples are clipped [Nm], far above the joint torques of an arm
 
 
 class JointTorqueWrench(LeafSystem):
@@ -20,8 +20,8 @@ class JointTorqueWrench(LeafSystem):
         F = (Jᵀ)⁺ τ_external,  t_f y' = F − y
 
     J is the Jacobian of the tool center, and y the output. τ_external are the measured joint torques minus the torques
-    of the arm's weight and inertia; the controller of an arm with torque sensors provides them. The pseudoinverse is
-    damped, so that near a singular posture the estimate tends to zero instead of diverging.
+    of the arm's weight and inertia. The controller of an arm with torque sensors provides τ_external. The pseudoinverse
+    is damped, so that the estimate tends to zero near a singular posture instead of diverging.
 
     .. pydrake_system::
 
@@ -34,13 +34,13 @@ class JointTorqueWrench(LeafSystem):
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,), in the order of the plant's joint positions. ``wrench``
     is (6,), at the tool center P in the axes of T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without
-    direct feedthrough: one sample old, and zero after an initialization. The first sample initializes the filter,
-    because a filter that starts at zero would not have reached the sensors' bias when it is tared. Samples that are not
+    direct feedthrough, delayed by one sample, and zero after an initialization. The first sample initializes the
+    filter, because a filter that starts at zero would not have settled when the wrench is tared. Samples that are not
     finite are skipped. Torques are clipped to `MAX_TORQUE`, so that the effect of a single false sample of any size
-    decays within some time constants.
+    decays within a few time constants.
 
     Args:
-        plant: Model of the arm alone, finalized.
+        plant: Finalized model of only the arm.
         target: Frame T.
         tool_center: Frame P.
         period: Sampling period [s], positive.
@@ -75,7 +75,7 @@ class JointTorqueWrench(LeafSystem):
         self._external_torque_port = self.DeclareVectorInputPort("external_torque", num_joints)
         self._state = self.DeclareDiscreteState(6)
         self._has_sample = self.DeclareDiscreteState(1)
-        self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
+        self.DeclareStateOutputPort("wrench", self._state)
         self._plant_context = declare.plant_context(self, plant, self._positions_port.Eval, [self._positions_port])
         declare.update(self, period, self._sample, declare.reset_to_default(self))
 
@@ -92,7 +92,7 @@ class JointTorqueWrench(LeafSystem):
         J = self._plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), target, target
         )
-        # [torque, force], as the Jacobian's rows are [rotational, translational]
+        # [torque, force], because the rows of the Jacobian are [rotational, translational]
         F = np.linalg.solve(J @ J.T + self._damping, J @ np.clip(external_torque, -MAX_TORQUE, MAX_TORQUE))
         newest = np.concatenate([F[3:], F[:3]])
         if context.get_discrete_state().value(self._has_sample)[0]:

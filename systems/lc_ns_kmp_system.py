@@ -118,15 +118,9 @@ class LcNsKmpSystem(LeafSystem):
         optional = [port for port in (self._history_port, self._history_length_port) if port is not None]
         ports = [self._null_space_action_port, self._motion_time_port, self._reference_window_port, *optional]
         self._prediction = declare.cache(self, "prediction", self._predict, [*ports, self._step, self._last_command])
-        self._command_port = declare.part_output(
-            self, "command", self._prediction, lambda prediction: prediction.output, outputs
-        )
-        self._constraint_violation_port = declare.part_output(
-            self, "constraint_violation", self._prediction, self._violation
-        )
-        self._fallback_port = declare.part_output(
-            self, "fallback", self._prediction, lambda prediction: prediction.fallback
-        )
+        declare.part_output(self, "command", self._prediction, lambda prediction: prediction.output, outputs)
+        declare.part_output(self, "constraint_violation", self._prediction, self._violation)
+        declare.part_output(self, "fallback", self._prediction, lambda prediction: prediction.fallback)
 
     @property
     def gain(self) -> np.ndarray:

@@ -47,10 +47,8 @@ class MeanForce(LeafSystem):
         self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
         self._last_sum = declare.sample(self, self._force_sum_port, period)
         sources = [self._force_sum_port, self._last_sum]
-        self._force_port = declare.output(self, "force", size, self._mean, sources)
-        self._magnitude_port = declare.scalar_output(
-            self, "magnitude", lambda context: float(np.linalg.norm(self._mean(context))), sources
-        )
+        declare.output(self, "force", size, self._mean, sources)
+        declare.scalar_output(self, "magnitude", lambda context: float(np.linalg.norm(self._mean(context))), sources)
 
     get_force_sum_input_port = input_getter("force_sum", "sum of the forces of all plant steps so far, (D,) [N]")
     get_force_output_port = output_getter("force", "mean force of the control step, (D,) [N]")

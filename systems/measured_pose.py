@@ -46,7 +46,7 @@ class MeasuredPose(LeafSystem):
         self._body_poses_port = self.DeclareAbstractInputPort(
             "body_poses", plant.get_body_poses_output_port().Allocate()
         )
-        self._pose_port = declare.output(self, "pose", 6, self._pose, [self._body_poses_port])
+        declare.output(self, "pose", 6, self._pose, [self._body_poses_port])
 
     get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
     get_pose_output_port = output_getter("pose", "pose X_TP, (6,)")

@@ -49,7 +49,7 @@ class MeshcatDevice(LeafSystem):
         for name, (lower, higher) in zip(self._sliders, keys, strict=True):
             meshcat.AddSlider(name, -1.0, 1.0, 0.25, 0.0, lower, higher)
         self._state = self.DeclareDiscreteState(len(axes))
-        self._action_port = self.DeclareStateOutputPort("action", self._state)
+        self.DeclareStateOutputPort("action", self._state)
         declare.update(self, period, self._sample, self._sample)
 
     get_action_output_port = output_getter("action", "operator's input, (n,), in [−1, 1]")

@@ -137,22 +137,18 @@ class MujocoGantry(LeafSystem):
         self._factors = self.DeclareNumericParameter(BasicVector(np.ones(2)))
         self._state = self.DeclareDiscreteState(self._at_rest(np.zeros(POSE_SIZE)))
         body_poses = declare.tickets(self, [self._state, self._nominal_body_poses_port])
-        self._pose_port = declare.part_output(
-            self, "pose", self._state, lambda state: state[self._positions], POSE_SIZE
-        )
-        self._state_port = declare.part_output(
+        declare.part_output(self, "pose", self._state, lambda state: state[self._positions], POSE_SIZE)
+        declare.part_output(
             self, "state", self._state, lambda state: [*state[self._positions], *state[self._velocities]], 2 * POSE_SIZE
         )
-        self._wrench_port = declare.part_output(
-            self, "wrench", self._state, lambda state: state[self._filtered], WRENCH_SIZE
-        )
-        self._impedance_wrench_port = declare.output(
+        declare.part_output(self, "wrench", self._state, lambda state: state[self._filtered], WRENCH_SIZE)
+        declare.output(
             self, "impedance_wrench", WRENCH_SIZE, self._impedance_wrench, [self._state, self._desired_pose_port]
         )
         self._body_poses_port = self.DeclareAbstractOutputPort(
             "body_poses", poses.Allocate, self._calc_body_poses, prerequisites_of_calc=body_poses
         )
-        self._geometry_poses_port = self.DeclareAbstractOutputPort(
+        self.DeclareAbstractOutputPort(
             "geometry_poses",
             lambda: Value(FramePoseVector()),
             self._calc_geometry_poses,

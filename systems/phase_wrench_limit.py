@@ -57,9 +57,7 @@ class PhaseWrenchLimit(LeafSystem):
         # NaN until the first update: the state at the port is initialized at the same instant as this system.
         self._bound = self.DeclareDiscreteState(np.full(MAX_WRENCH_SIZE, np.nan))
         sources = [self._state_port, self._max_wrench_port, self._bound]
-        self._phase_max_wrench_port = declare.output(
-            self, "phase_max_wrench", MAX_WRENCH_SIZE, self._phase_max_wrench, sources
-        )
+        declare.output(self, "phase_max_wrench", MAX_WRENCH_SIZE, self._phase_max_wrench, sources)
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")

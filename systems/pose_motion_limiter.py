@@ -68,7 +68,7 @@ class PoseMotionLimiter(LeafSystem):
         self._state = self.DeclareDiscreteState(28)
         ports = (self._desired_pose_port, self._pose_port, self._blend_factor_port)
         self._next_state = declare.cache(self, "next_state", self._calc_next_state, [*ports, self._state])
-        self._limited_pose_port = declare.output(self, "limited_pose", 6, self._limited_pose, [self._next_state])
+        declare.output(self, "limited_pose", 6, self._limited_pose, [self._next_state])
         declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")

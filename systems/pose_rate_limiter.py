@@ -52,7 +52,7 @@ class PoseRateLimiter(LeafSystem):
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         self._last_pose = self.DeclareDiscreteState(6)
         sources = [self._desired_pose_port, self._pose_port, self._blend_factor_port, self._last_pose]
-        self._limited_pose_port = declare.output(self, "limited_pose", 6, self._limited_pose, sources)
+        declare.output(self, "limited_pose", 6, self._limited_pose, sources)
         declare.update(self, period, self._update, self._reset)
 
     get_desired_pose_input_port = input_getter("desired_pose", "commanded pose, (6,)")

@@ -36,7 +36,7 @@ class PoseWrench(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._generalized_force_port = self.DeclareVectorInputPort("generalized_force", POSE_SIZE)
         sources = [self._pose_port, self._generalized_force_port]
-        self._wrench_port = declare.output(self, "wrench", WRENCH_SIZE, self._wrench, sources)
+        declare.output(self, "wrench", WRENCH_SIZE, self._wrench, sources)
 
     get_pose_input_port = input_getter("pose", "pose X_TP, (6,)")
     get_generalized_force_input_port = input_getter("generalized_force", "generalized forces, (6,) [N, Nm]")

@@ -37,7 +37,7 @@ class ProgressClock(LeafSystem):
         self._command_port = self.DeclareVectorInputPort("command", num_outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", num_outputs)
         self._time = self.DeclareDiscreteState(1)
-        self._motion_time_port = self.DeclareStateOutputPort("motion_time", self._time)
+        self.DeclareStateOutputPort("motion_time", self._time)
         reset = declare.reset_to_default(self)
         self._start = declare.update_after_start(self, period, self._update, reset)
 

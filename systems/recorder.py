@@ -64,7 +64,7 @@ class Recorder(LeafSystem):
         self._width, self._num_samples, self._period = sum(self._sizes.values()), num_samples, period
         self._count = self.DeclareDiscreteState(1)
         self._samples = self.DeclareDiscreteState(num_samples * self._width)
-        self._num_recorded_port = self.DeclareStateOutputPort("num_recorded", self._count)
+        self.DeclareStateOutputPort("num_recorded", self._count)
         self._start = declare.update_after_start(self, period, self._record, declare.reset_to_default(self))
 
     get_signal_input_port = declare.get_signal_input_port

@@ -57,7 +57,7 @@ class ReferenceGovernor(LeafSystem):
         self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
         sources = [self._desired_pose_port, self._state_port, self._max_wrench_port]
-        self._reference_pose_port = declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, sources)
+        declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, sources)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_state_input_port = input_getter("state", "measured pose and its velocity, (12,)")

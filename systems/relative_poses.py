@@ -46,9 +46,7 @@ class RelativePoses(LeafSystem):
         self._body_poses_port = self.DeclareAbstractInputPort(
             "body_poses", plant.get_body_poses_output_port().Allocate()
         )
-        self._relative_poses_port = declare.output(
-            self, "relative_poses", 6 * len(self._bodies), self._relative_poses, [self._body_poses_port]
-        )
+        declare.output(self, "relative_poses", 6 * len(self._bodies), self._relative_poses, [self._body_poses_port])
 
     get_body_poses_input_port = input_getter("body_poses", "plant's body poses")
     get_relative_poses_output_port = output_getter("relative_poses", "poses relative to the reference, (6·n,)")

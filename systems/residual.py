@@ -41,7 +41,7 @@ class Residual(LeafSystem):
         self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
         self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
         sources = [self._reference_port, self._action_port]
-        self._desired_pose_port = declare.output(self, "desired_pose", self._gain.size, self._desired_pose, sources)
+        declare.output(self, "desired_pose", self._gain.size, self._desired_pose, sources)
 
     get_reference_input_port = input_getter("reference", "reference, (O,)")
     get_action_input_port = input_getter("action", "policy's action, (O,)")

@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, LeafSystem, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, check_takes, check_terms, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
 
 
 @dataclass(frozen=True)
@@ -67,11 +67,11 @@ class RewardSystem(LeafSystem):
                 f"not {brief(names)}"
             )
         for term in terms:
-            check_takes(term.value, term.inputs, f"reward term {term.name!r}{self._of_task}")
+            check_signature(term.value, term.inputs, f"reward term {term.name!r}{self._of_task}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         sources = self._signals.tickets or {self.nothing_ticket()}
         self._values = declare.cache(self, "terms", self._calc_terms, sources)
-        self._reward_port = declare.part_output(self, "reward", self._values, self._sum)
+        declare.part_output(self, "reward", self._values, self._sum)
         self._term_ports = {
             term.name: declare.part_output(self, term.name, self._values, itemgetter(i)) for i, term in enumerate(terms)
         }

@@ -47,12 +47,8 @@ class SafetyFilter(LeafSystem):
         self._sampled_pose = declare.sample(self, self._pose_port, period)
         sources = [self._desired_pose_port, self._sampled_pose]
         self._projection = declare.cache(self, "projection", self._calc_projection, sources)
-        self._safe_pose_port = declare.part_output(
-            self, "safe_pose", self._projection, lambda projection: projection[:-1], outputs
-        )
-        self._intervention_port = declare.part_output(
-            self, "intervention", self._projection, lambda projection: projection[-1]
-        )
+        declare.part_output(self, "safe_pose", self._projection, lambda projection: projection[:-1], outputs)
+        declare.part_output(self, "intervention", self._projection, lambda projection: projection[-1])
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")

@@ -56,7 +56,7 @@ class SctInputMapping(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
         sources = [self._action_port, self._pose_port, self._state_port, self.frames.ticket]
-        self._requested_pose_port = declare.output(self, "requested_pose", 6, self._requested_pose, sources)
+        declare.output(self, "requested_pose", 6, self._requested_pose, sources)
 
     get_action_input_port = input_getter("action", "inputs u of a policy or a user, (n,), in [−1, 1]")
     get_pose_input_port = input_getter("pose", "pose H to displace, (6,)")

@@ -59,12 +59,12 @@ class SctStateMachine(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
         self._state = self.DeclareDiscreteState([float(template.initial_state)])
-        self._state_port = self.DeclareStateOutputPort("state", self._state)
+        self.DeclareStateOutputPort("state", self._state)
         sources = [self._pose_port, self._state, self.frames.ticket]
-        self._transition_distance_port = declare.scalar_output(
+        declare.scalar_output(
             self, "transition_distance", lambda context: template.distance(*self._state_pose_frames(context)), sources
         )
-        self._progress_port = declare.scalar_output(
+        declare.scalar_output(
             self, "progress", lambda context: template.progress(*self._state_pose_frames(context)), sources
         )
         declare.update_after_start(self, period, self._update, self._start)

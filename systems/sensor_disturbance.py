@@ -92,9 +92,7 @@ class SensorDisturbance(LeafSystem):
         if self._configuration_port is not None:
             sources += [self._configuration_port, self._first_configuration]
         sources += [self._noise_sample, self._walk, self.all_parameters_ticket()]
-        self._disturbed_measurement_port = declare.output(
-            self, "disturbed_measurement", size, self._disturbed_measurement, sources
-        )
+        declare.output(self, "disturbed_measurement", size, self._disturbed_measurement, sources)
         self._set_default = declare.reset_to_default(self)
         declare.update(self, period, self._update, self._reset)
         self._step = np.sqrt(period / DRIFT_TIME)

@@ -72,17 +72,15 @@ class StatusWatchdog(LeafSystem):
         self._plant_context = declare.plant_context(self, plant, self._joint_state, [self._state])
         sources = [self._state, self._status_port, self._clock_port, self._last_clock]
         self._estimate = declare.cache(self, "estimate", self._evaluate, sources)
-        self._estimated_state_port = declare.part_output(
+        declare.part_output(
             self, "estimated_state", self._estimate, lambda estimate: estimate.state.accepted_values[: 2 * n], 2 * n
         )
-        self._velocity_port = declare.part_output(
-            self, "velocity", self._estimate, lambda estimate: estimate.state.velocity, n
-        )
-        self._external_torque_port = declare.part_output(
+        declare.part_output(self, "velocity", self._estimate, lambda estimate: estimate.state.velocity, n)
+        declare.part_output(
             self, "external_torque", self._estimate, lambda estimate: estimate.state.accepted_values[2 * n :], n
         )
-        self._fault_port = declare.part_output(self, "fault", self._estimate, lambda estimate: float(estimate.fault))
-        self._age_port = declare.part_output(self, "age", self._estimate, lambda estimate: estimate.age)
+        declare.part_output(self, "fault", self._estimate, lambda estimate: float(estimate.fault))
+        declare.part_output(self, "age", self._estimate, lambda estimate: estimate.age)
         declare.update(self, period, self._update)
 
     get_status_input_port = input_getter("status", "newest `JointStatus`; any other object counts as none")

@@ -170,21 +170,13 @@ class TorqueSafetyLimiter(LeafSystem):
         )
         fault_and_state = [self._present_fault, self._state]
         inputs = [self._torque_port, self._estimated_state_port, self._status_age_port, self._velocity_port]
-        self._safe_torque_port = declare.output(
-            self, "safe_torque", num_joints, self._safe_torque, [*fault_and_state, *inputs]
-        )
-        self._fault_port = declare.scalar_output(self, "fault", self._fault, fault_and_state)
-        self._arm_state_port = declare.part_output(self, "arm_state", self._state, lambda state: state[_ARM_STATE])
-        self._blend_factor_port = declare.part_output(
-            self, "blend_factor", self._state, lambda state: state[_BLEND_FACTOR]
-        )
-        self._is_sending_port = declare.scalar_output(
-            self, "is_sending", self._is_sending, [self._state, self._status_fault_port]
-        )
-        self._is_holding_port = declare.scalar_output(self, "is_holding", self._is_holding, fault_and_state)
-        self._not_following_port = declare.scalar_output(
-            self, "not_following", self._not_following, [self._state, self._command_timed_out_port]
-        )
+        declare.output(self, "safe_torque", num_joints, self._safe_torque, [*fault_and_state, *inputs])
+        declare.scalar_output(self, "fault", self._fault, fault_and_state)
+        declare.part_output(self, "arm_state", self._state, lambda state: state[_ARM_STATE])
+        declare.part_output(self, "blend_factor", self._state, lambda state: state[_BLEND_FACTOR])
+        declare.scalar_output(self, "is_sending", self._is_sending, [self._state, self._status_fault_port])
+        declare.scalar_output(self, "is_holding", self._is_holding, fault_and_state)
+        declare.scalar_output(self, "not_following", self._not_following, [self._state, self._command_timed_out_port])
         declare.update(self, period, self._update, self._stop_at_initialization)
 
     get_torque_input_port = input_getter("torque", "commanded torques, (n,) [Nm]")

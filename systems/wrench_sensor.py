@@ -109,7 +109,7 @@ class WrenchSensor(LeafSystem):
             "body_spatial_accelerations", Value([SpatialAcceleration()])
         )
         self._state = self.DeclareDiscreteState(6)
-        self._wrench_port = self.DeclareStateOutputPort("wrench", self._state)
+        self.DeclareStateOutputPort("wrench", self._state)
         declare.update(self, period, self._sample, declare.reset_to_default(self))
 
     def connect(self, builder: DiagramBuilder, plant: MultibodyPlant) -> None:

@@ -49,7 +49,7 @@ class WrenchTare(LeafSystem):
         self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # mean of the averaged samples so far
         self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)
         sources = [self._measured_wrench_port, self._count, self._offset]
-        self._tared_wrench_port = declare.output(self, "tared_wrench", WRENCH_SIZE, self._tared_wrench, sources)
+        declare.output(self, "tared_wrench", WRENCH_SIZE, self._tared_wrench, sources)
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_measured_wrench_input_port = input_getter("measured_wrench", "wrench with a bias, (6,)")

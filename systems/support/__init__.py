@@ -1,1 +1,1 @@
-"""Building blocks shared by several systems."""
+"""Building blocks that several systems share."""

@@ -1,4 +1,4 @@
-"""Declarations that systems share: periods, samples, cache entries, and ports with their getters."""
+"""Declarations that systems share: checked arguments, ports and their getters, states, updates and cache entries."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -46,9 +46,7 @@ class SignalPorts:
         for name, size in (item for mapping in signals for item in mapping.items()):
             if not (isinstance(name, str) and name):
                 raise InputError(f"a signal needs a name, not {brief(name)}")
-            size = as_whole(size, f"the size of signal '{name}'")
-            if size < 1:
-                raise InputError(f"signal '{name}' needs a size of at least 1, not {size}")
+            size = as_count(size, f"the size of signal '{name}'")
             if sizes.setdefault(name, size) != size:
                 raise InputError(f"signal '{name}' can't be of size {sizes[name]} and {size}: give it one size")
         self._ports = {name: system.DeclareVectorInputPort(name, size) for name, size in sizes.items()}
@@ -83,31 +81,48 @@ def get_signal_input_port(self: Any, name: str) -> InputPort:
 
 
 def check_terms(terms: Sequence[Any], kind: type, owner: str) -> None:
-    """Raise an `InputError` unless `terms` are a sequence of a `kind` of terms; `owner` has the terms."""
+    """Raise an `InputError` unless `terms` is a sequence of `kind` objects; `owner` is a name for messages."""
     if not isinstance(terms, Sequence) or not all(isinstance(term, kind) for term in terms):
         raise InputError(f"{owner} needs a list of {kind.__name__} objects, not {brief(terms)}")
 
 
-def check_takes(function: Callable[..., Any], names: Mapping[str, int], what: str) -> None:
-    """Raise an `InputError` if a function does not accept `names` as keyword arguments; `what` names the function.
+def check_signature(function: Callable[..., Any], signals: Mapping[str, int], what: str) -> None:
+    """Check that a function can be called with the signals as keyword arguments.
 
-    It also raises one if `function` is no function, or `names` are not the keys of a mapping from signal to size.
+    Args:
+        function: Function of a reward term or a termination term.
+        signals: Sizes of its signals by name.
+        what: Name of the term for messages.
+
+    Raises:
+        InputError: If `function` is not callable or does not accept these arguments, or `signals` is not a mapping.
     """
     if not callable(function):
         raise InputError(f"{what} needs a function of its signals, not {brief(function)}")
-    if not isinstance(names, Mapping):
-        raise InputError(f"{what} needs the sizes of its signals by name, such as {{'pose': 6}}, not {brief(names)}")
+    if not isinstance(signals, Mapping):
+        raise InputError(f"{what} needs the sizes of its signals by name, such as {{'pose': 6}}, not {brief(signals)}")
     try:
-        takes = signature(function)
+        accepted = signature(function)
     except (ValueError, TypeError):
         return  # functions written in C may have no signature
     try:
-        takes.bind(**dict.fromkeys(names))
+        accepted.bind(**dict.fromkeys(signals))
     except TypeError:
         raise InputError(
-            f"{what} is called with the keyword arguments ({', '.join(names)}), but its function has the parameters "
-            f"({', '.join(takes.parameters)}): give its inputs the names of the parameters"
+            f"{what} is called with the keyword arguments ({', '.join(signals)}), but its function has the parameters "
+            f"({', '.join(accepted.parameters)}): give its inputs the names of the parameters"
         ) from None
+
+
+def as_count(value: object, what: str, least: int = 1) -> int:
+    """Return a whole number of at least `least` as an int; `what` is its name in messages.
+
+    Raises:
+        InputError: If the value is anything else.
+    """
+    if not is_whole(value, least):
+        raise InputError(f"{what} must be a whole number of at least {least}, not {brief(value)}")
+    return as_whole(value, what)
 
 
 def check_period(period: float) -> None:
@@ -120,19 +135,17 @@ def seed_parameter(seed: object) -> list[float]:
     """Return a seed as the value of a numeric parameter (1,).
 
     Raises:
-        InputError: If it is not a whole number of at least 0.
+        InputError: If the seed is not a whole number of at least 0.
     """
-    if not is_whole(seed, 0):
-        raise InputError(f"a seed is a whole number of at least 0, not {brief(seed)}")
-    return [float(as_whole(seed, "a seed"))]
+    return [float(as_count(seed, "a seed", 0))]
 
 
 Source: TypeAlias = InputPort | CacheEntry | DiscreteStateIndex | DependencyTicket
-"""Value that an output or a cache entry is computed from."""
+"""Input port, state or cache entry from which an output or a cache entry is computed."""
 
 
 def tickets(system: LeafSystem, sources: Iterable[Source]) -> set[DependencyTicket]:
-    """Return the dependency tickets of a system's sources; tickets among them are returned unchanged."""
+    """Return the dependency tickets of sources of a system."""
 
     def ticket(source: Source) -> DependencyTicket:
         if isinstance(source, DiscreteStateIndex):
@@ -149,7 +162,7 @@ def output(
     value: Callable[[Context], np.ndarray | Sequence[float]],
     sources: Iterable[Source],
 ) -> OutputPort:
-    """Declare a vector output port with the `value` (size,) that is computed from `sources`."""
+    """Declare a vector output port; `value` computes its numbers (size,) from `sources`."""
 
     def calc(context: Context, vector: BasicVector) -> None:
         vector.SetFromVector(value(context))
@@ -160,7 +173,7 @@ def output(
 def scalar_output(
     system: LeafSystem, name: str, value: Callable[[Context], float], sources: Iterable[Source]
 ) -> OutputPort:
-    """Declare a vector output port (1,) with the `value` that is computed from `sources`."""
+    """Declare a vector output port (1,); `value` computes its number from `sources`."""
 
     def calc(context: Context, vector: BasicVector) -> None:
         vector.SetAtIndex(0, value(context))
@@ -175,9 +188,9 @@ def part_output(
     part: Callable[[Any], Any],
     size: int | None = None,
 ) -> OutputPort:
-    """Declare a vector output port with a part of the value of a cache entry or a discrete state.
+    """Declare a vector output port for a part of a cache entry or a discrete state.
 
-    `part` returns an array (size,) of this value; without a size, it returns a number and the port is (1,).
+    `part` maps the value of `source` to an array (size,). Without `size`, it returns a number, and the port is (1,).
     """
 
     def value_of_state(context: Context) -> Any:
@@ -193,7 +206,7 @@ def part_output(
 
 
 def start_pose(pose: np.ndarray) -> np.ndarray:
-    """Return the measured pose (O,), which is the first command of a motion.
+    """Check the measured pose (O,) at initialization and return it; it is the first command of a motion.
 
     Raises:
         InputError: If the pose is not finite.
@@ -209,7 +222,7 @@ def update(
     calc: Callable[[Context, DiscreteValues], Any],
     reset: Callable[[Context, DiscreteValues], Any] | None = None,
 ) -> None:
-    """Declare the update `calc` of the discrete state once per period [s], and an optional reset at initialization.
+    """Declare the periodic update `calc` of the discrete state, every `period` [s], and a `reset` at initialization.
 
     Raises:
         InputError: If the period is not positive and finite.
@@ -235,16 +248,20 @@ def start_time(system: LeafSystem) -> DiscreteStateIndex:
 
 
 def has_started(context: Context, start: DiscreteStateIndex) -> bool:
-    """Return False at the time of initialization, when no step has ended; `start` is a system's `start_time`.
+    """Return True after the time of initialization, which the discrete state `start` contains (`start_time`).
 
-    Drake triggers the periodic events of the time of initialization, too. An event offset of one period cannot be used:
-    period + k * period differs from (k + 1) * period in the last bit for about a quarter of all k.
+    Drake also triggers periodic events at the time of initialization, when no step has ended yet. An event offset of
+    one period cannot avoid this: period + k * period differs from (k + 1) * period in the last bit for about a quarter
+    of all k.
     """
     return bool(context.get_time() > context.get_discrete_state().value(start).item() + _TIME_TOLERANCE)
 
 
 def start_step(context: Context, start: DiscreteStateIndex, period: float) -> int:
-    """Return the number of the control step of a `period` [s], counted from time zero, in which a system started."""
+    """Return the number of the control step in which a system was initialized; step 0 starts at time zero.
+
+    `start` is the system's `start_time`, and `period` is the control period [s].
+    """
     time = context.get_discrete_state().value(start).item()
     return math.floor((time + _TIME_TOLERANCE) / period)
 
@@ -258,7 +275,8 @@ def update_after_start(
     """Declare an `update` that is omitted at the time of initialization, when no step has ended.
 
     Returns:
-        State with the `start_time`, a further group of the discrete state: read the other groups by their indices.
+        Discrete state of the `start_time`. Because of this further group of discrete state, all groups of the system
+        are accessed by their indices.
 
     Raises:
         InputError: If the period is not positive and finite.
@@ -268,17 +286,17 @@ def update_after_start(
         return calc(context, discrete_state) if has_started(context, start) else EventStatus.DidNothing()
 
     update(system, period, calc_after_start, reset)
-    start = start_time(system)  # after the reset, which may restore the default of every state
+    start = start_time(system)  # declared after the reset, which may restore the defaults of all states
     return start
 
 
 def reset_to_default(system: LeafSystem) -> Callable[[Context, DiscreteValues], None]:
-    """Return a reset that restores the defaults of the discrete states."""
+    """Return a reset that sets all discrete states to their defaults."""
     return lambda context, discrete_state: discrete_state.SetFrom(system.AllocateDiscreteVariables())
 
 
 def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateIndex:
-    """Declare and return a discrete state with samples of a vector port, at initialization and once per period [s].
+    """Declare a discrete state that samples a vector input port, at initialization and every `period` [s].
 
     Raises:
         InputError: If the period is not positive and finite.
@@ -293,7 +311,7 @@ def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateI
 
 
 def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sources: Iterable[Source]) -> CacheEntry:
-    """Declare a cache entry with the description `name` and the value that `calc` computes from `sources`."""
+    """Declare a cache entry; `calc` computes its value from `sources`, and `name` is its description."""
     return system.DeclareCacheEntry(
         description=name,
         value_producer=ValueProducer(
@@ -306,16 +324,16 @@ def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sour
 def plant_context(
     system: LeafSystem, plant: MultibodyPlant, state: Callable[[Context], np.ndarray], sources: Iterable[Source]
 ) -> CacheEntry:
-    """Declare a cache entry with a context of the finalized plant, from which kinematics and inertia are computed.
+    """Declare a cache entry with a context of a finalized plant, for computing kinematics and inertia.
 
-    `state` computes the joint positions, or the positions followed by the velocities, from `sources`. An evaluation
-    with numbers that are not finite raises an `InputError`.
+    `state` computes the joint positions, or the positions followed by the velocities, from `sources`. If one of these
+    numbers is not finite, the evaluation of the entry raises an `InputError`.
     """
     num_positions = plant.num_positions()
 
     def calc(context: Context, value: AbstractValue) -> None:
         numbers, plant_context = state(context), value.get_mutable_value()
-        if not is_finite(numbers):  # Drake would end the process
+        if not is_finite(numbers):  # Drake would abort the process
             raise InputError(f"joint positions and velocities must be finite, not {numbers}")
         if len(numbers) == num_positions:
             plant.SetPositions(plant_context, numbers)
@@ -330,31 +348,32 @@ def plant_context(
 
 
 def input_getter(name: str, description: str) -> Callable[[System], InputPort]:
-    """Return a method of a system that returns the input port `name`, stored as `_<name>_port` or found by name.
+    """Return a method of a system that returns the input port `name`.
 
-    The method's docstring is "Return the port of the", followed by `description`, which states signal, shape and unit.
+    `description` states signal, shape and unit. The method's docstring is "Return the port of the" with `description`.
     """
 
     def getter(self: System) -> InputPort:
-        port = getattr(self, f"_{name}_port", None)
-        return self.GetInputPort(name) if port is None else port
+        return self.GetInputPort(name)
 
     getter.__name__, getter.__doc__ = f"get_{name}_input_port", f"Return the port of the {description}."
     return getter
 
 
 def output_getter(name: str, description: str) -> Callable[[System], OutputPort]:
-    """Return a method that returns the output port `name`; see `input_getter`."""
+    """Return a method of a system that returns the output port `name`; see `input_getter`."""
 
     def getter(self: System) -> OutputPort:
-        port = getattr(self, f"_{name}_port", None)
-        return self.GetOutputPort(name) if port is None else port
+        return self.GetOutputPort(name)
 
     getter.__name__, getter.__doc__ = f"get_{name}_output_port", f"Return the port of the {description}."
     return getter
 
 
 def state_number(port: InputPort, context: Context, count: int) -> int | None:
-    """Return the number of a template's state at a port (1,), or None if it is not one of `count` states."""
+    """Return the state number of a template at an input port (1,), or None if it is not the number of a state.
+
+    The numbers of the `count` states begin at 0.
+    """
     number = float(port.Eval(context)[0])
     return int(number) if 0.0 <= number < count and number.is_integer() else None

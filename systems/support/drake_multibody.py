@@ -12,16 +12,16 @@ from guiderail.models.common.errors import InputError, brief
 
 
 class JointDynamics:
-    """Mass matrix and torques of Coriolis forces and joint damping.
+    """Mass matrix of an arm, and its joint torques of Coriolis forces and joint damping.
 
     Args:
-        plant: Model of the arm and its payload alone, finalized.
+        plant: Finalized model of only the arm and its payload.
     """
 
     def __init__(self, plant: MultibodyPlant):
         self._plant, self._damping = plant, np.zeros(plant.num_velocities())
         for joint in (plant.get_joint(index) for index in plant.GetJointIndices()):
-            start = joint.velocity_start()  # joints are numbered in the order of the model file, velocities by the tree
+            start = joint.velocity_start()  # the order of velocities can differ from the order of joints
             self._damping[start : start + joint.num_velocities()] = joint.default_damping_vector()
 
     def evaluate(self, plant_context: Context) -> tuple[np.ndarray, np.ndarray]:
@@ -31,12 +31,12 @@ class JointDynamics:
 
 
 def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Frame) -> None:
-    """Check a plant and its frames, the arguments of a system.
+    """Check the arguments of a system: a plant and frames of the plant.
 
     Args:
         plant: Plant, which must be finalized.
-        fixed: Frame that must be fixed in the world, if any.
-        **frames: Frames by the names of their arguments.
+        fixed: Frame that must be fixed in the world, or None.
+        **frames: Frames by argument name.
 
     Raises:
         InputError: If the plant or a frame has another type, the plant is not finalized, a frame belongs to another
@@ -56,10 +56,10 @@ def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Fra
 
 
 def check_bodies(plant: MultibodyPlant, what: str, bodies: Sequence[RigidBody]) -> None:
-    """Check a plant and a list of its bodies, the arguments of a system; `what` names the bodies.
+    """Check the arguments of a system: a plant and a list of its bodies; `what` is the list's name in messages.
 
     Raises:
-        InputError: If `check_plant` refuses the plant, there is no body, or one is of another type or plant.
+        InputError: If `check_plant` refuses the plant, or `bodies` is not a list of at least one body of the plant.
     """
     check_plant(plant)
     if not isinstance(bodies, Sequence) or not bodies:
@@ -72,9 +72,9 @@ def check_bodies(plant: MultibodyPlant, what: str, bodies: Sequence[RigidBody]) 
 
 
 def effort_limits(plant: MultibodyPlant) -> np.ndarray:
-    """Return the effort limits of the joints of a plant, (n,) [Nm], in the order of its velocities.
+    """Return the effort limits of the joints of a plant, (n,) [Nm], in the order of the plant's velocities.
 
-    `MultibodyPlant.GetEffortUpperLimits` has the order of the actuators, which may be another one.
+    `MultibodyPlant.GetEffortUpperLimits` returns them in the order of the actuators, which can differ.
 
     Raises:
         InputError: If a joint has no actuator or several.
@@ -103,13 +103,13 @@ def transform_to_pose(X: RigidTransform) -> np.ndarray:
 
 
 def transform_to_vector(X: RigidTransform) -> np.ndarray:
-    """Return the position and the rotation vector, of at most π, of a transform (6,) [m, rad]."""
-    turn = X.rotation().ToAngleAxis()
-    return np.concatenate([X.translation(), turn.angle() * turn.axis()])
+    """Return position [m] and rotation vector [rad] of a transform as (6,); the angle is at most π."""
+    rotation = X.rotation().ToAngleAxis()
+    return np.concatenate([X.translation(), rotation.angle() * rotation.axis()])
 
 
 def orientation_error(R_desired: RotationMatrix, R: RotationMatrix) -> tuple[float, np.ndarray]:
-    """Return the quaternion η, ε (3,) of R_desired Rᵀ with η ≥ 0, which is the shorter rotation."""
+    """Return the quaternion (η, ε) of R_desired Rᵀ, with ε (3,); its sign is chosen so that η ≥ 0."""
     q = (R_desired @ R.inverse()).ToQuaternion()
     sign = 1.0 if q.w() >= 0.0 else -1.0
     return sign * q.w(), sign * q.xyz()

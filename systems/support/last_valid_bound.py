@@ -1,4 +1,4 @@
-"""Bound of an impedance's wrench that is lowered at run time."""
+"""Wrench bound of an impedance that an input port lowers at run time."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
@@ -8,20 +8,20 @@ from guiderail.systems.support import declarations as declare
 
 
 class LastValidBound:
-    """Configured bound of a wrench, lowered to the numbers at an optional input port.
+    """Configured wrench bound, lowered to the numbers at an optional input port.
 
-    While a number at the port is NaN or negative, the last valid one applies, before the first one 0. It does
-    not count as 0: with a bound of 0 there is no damping either, and a moving arm would coast. The last valid numbers
-    are a discrete state, updated by a periodic event.
+    While a number at the port is NaN or negative, its last valid value applies, or 0 before the first valid value. An
+    invalid number is not replaced by 0, because a bound of 0 also disables damping, and a moving arm would coast. The
+    last valid numbers are a discrete state, which a periodic event updates.
 
     Args:
         system: System under construction, in which a state and two events are declared.
         bound: Configured bound.
-        max_wrench: Input port of the numbers, (8,) [N, Nm]; if it is not connected, the configured bound is in force.
-        period: Period at which the numbers are stored [s], positive.
+        max_wrench: Input port of the numbers, (8,) [N, Nm]; if it is not connected, the configured bound applies.
+        period: Sampling period of the numbers [s], positive.
 
     Attributes:
-        sources: Values that `eval` depends on.
+        sources: Sources of `eval`, for the declaration of outputs and cache entries.
 
     Raises:
         InputError: If the period is out of range.
@@ -34,7 +34,7 @@ class LastValidBound:
         declare.update(system, period, self._update, self._reset)
 
     def eval(self, context: Context) -> WrenchBound:
-        """Return the bound in force; `context` is the system's."""
+        """Return the present bound; `context` is the context of the system."""
         if not self._max_wrench.HasValue(context):
             return self._bound
         return self._bound.lowered_to(self._numbers(context, context.get_discrete_state().value(self._last)))

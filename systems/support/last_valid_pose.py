@@ -1,4 +1,4 @@
-"""Validity check of timed commands, and the last valid desired pose."""
+"""Validity check of commands with time stamps, and the last valid desired pose."""
 
 from collections.abc import Callable
 
@@ -9,25 +9,26 @@ from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 
-_TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s], far above rounding errors after days, far below any period
-_MAX_COORDINATE = 1e6  # largest number in a command [m, rad], so that no wrench overflows
+_TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s]: far above rounding errors after days, far below any period
+_MAX_COORDINATE = 1e6  # largest coordinate of a command [m, rad]; with larger ones a wrench could overflow
 
 
 class CommandValidity:
-    """Check of a command: its numbers are finite and at most 1e6, and it is neither stale nor in the future.
+    """Validity check of a command: its coordinates are finite and at most 1e6, and its age is within bounds.
 
-    A command with time stamp t_c is valid at t if −period ≤ t − t_c ≤ timeout. A command from further in the future is
-    not valid, because it would time out too late. A time stamp that is not finite is not valid either.
+    A command with time stamp t_c is valid at time t if −period ≤ t − t_c ≤ timeout. A command that is more than one
+    period in the future is not valid, because it would time out too late. A command whose time stamp is not finite is
+    not valid.
 
     Args:
-        desired_pose: Input port of the system, (O,).
+        desired_pose: Input port of the command, (O,).
         command_time: Input port of the time stamp of the command, (1,) [s]; if it is not connected, commands never time
             out.
         period: Period of the check [s], positive.
         timeout: Age above which a command is stale [s], positive and finite.
 
     Raises:
-        InputError: If the timeout is out of range.
+        InputError: If an argument is out of range.
     """
 
     def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
@@ -38,13 +39,13 @@ class CommandValidity:
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
 
     def is_valid(self, context: Context, time: float) -> bool:
-        """Return True if the present command is valid; `context` is the system's.
+        """Return True if the present command is valid; `context` is the context of the system.
 
-        Staleness is checked for `time` [s], the time of a check. Whether the time stamp is in the future is checked for
-        the time of the context, which may be up to a period later.
+        `time` [s] is the time of the last check. The command is stale if its age at this time exceeds the timeout. A
+        time stamp in the future is compared with the time of the context, which is up to a period later.
         """
         if not all(abs(number) <= _MAX_COORDINATE for number in self._desired_pose.Eval(context).tolist()):
-            return False  # for NaN too
+            return False  # also for NaN
         if not self._command_time.HasValue(context):
             return True
         stamp = float(self._command_time.Eval(context)[0])
@@ -54,28 +55,28 @@ class CommandValidity:
 class LastValidPose:
     """Desired pose to follow: the present command while it is valid, otherwise the last valid one.
 
-    The last valid pose and the time of the last check are discrete states, updated by a periodic event. A command's age
-    is computed at the last check, not at the present time, so that outputs are computed again only when the command
-    changes or an event occurs. A command becomes stale at the first event after its timeout; a new command is valid at
-    once, unless its time stamp is then too far in the future. Before the first valid command the pose is the one
-    measured at initialization, which must be finite. While the blend factor is zero, the robot is not controlled, and
-    the last valid pose is the measured one: a robot without a valid command is held where control begins.
+    The last valid pose and the time of the last check are discrete states, which a periodic event updates. The age of a
+    command refers to the last check instead of the present time, so that outputs are computed again only when the
+    command changes or an event occurs. A command becomes stale at the first event after its timeout. A new command is
+    valid at once, unless its time stamp is too far in the future. Before the first valid command, the pose measured at
+    initialization is followed. While the blend factor is zero, the robot is not controlled and the last valid pose
+    follows the measured pose. If there is no valid command when control begins, the robot therefore stays where it is.
 
     Args:
         system: System under construction, in which two states and two events are declared.
         desired_pose: Input port of the command, (O,).
         command_time: Input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
-        measured_pose: Function of the system's context that returns the measured pose, (O,), for initialization.
+        measured_pose: Function of the system's context that returns the measured pose, (O,).
         period: Period of the check [s], positive; ideally the period of the commands.
         timeout: Age above which a command is stale [s], positive and finite.
-        blend_factor: Input port of the blend factor, (1,), or None; if it is not connected, the robot is always
+        blend_factor: Input port of the blend factor, (1,). If it is None or not connected, the robot is always
             controlled.
 
     Attributes:
-        tickets: Dependencies of `eval`.
+        sources: Sources of `eval`, for the declaration of outputs and cache entries.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range. At initialization, if the measured pose is not finite.
     """
 
     def __init__(
@@ -94,9 +95,9 @@ class LastValidPose:
         self._last_pose = system.DeclareDiscreteState(desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
         declare.update(system, period, self._update, self._reset)
-        # The outputs and the event share one check of a command.
+        # Outputs and event share one check of a command.
         self._valid = declare.cache(system, "valid", self._check, [desired_pose, command_time, self._check_time])
-        self.tickets = declare.tickets(system, [desired_pose, self._valid, self._last_pose])
+        self.sources: list[declare.Source] = [desired_pose, self._valid, self._last_pose]
 
     def eval(self, context: Context) -> np.ndarray:
         """Return the desired pose to follow, (O,)."""
@@ -105,7 +106,7 @@ class LastValidPose:
         return context.get_discrete_state().value(self._last_pose)
 
     def declare_timed_out_output(self, system: LeafSystem) -> OutputPort:
-        """Declare the output port ``command_timed_out`` (1,), 1 if the present command is not valid, otherwise 0."""
+        """Declare the output port ``command_timed_out`` (1,), which is 1 if the present command is not valid."""
         return declare.scalar_output(
             system, "command_timed_out", lambda context: float(not self._valid.Eval(context)), [self._valid]
         )
@@ -126,7 +127,7 @@ class LastValidPose:
             measured = self._measured_pose(context)
             if is_finite(measured):
                 discrete_state.set_value(self._last_pose, measured)
-        # Validity at the last check: the pose followed until now is stored, even if it becomes stale now.
+        # The validity refers to the last check: the pose followed until now is stored even if it becomes stale now.
         elif self._valid.Eval(context):
             discrete_state.set_value(self._last_pose, self._desired_pose.Eval(context))
         discrete_state.set_value(self._check_time, [context.get_time()])

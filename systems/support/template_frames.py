@@ -13,22 +13,22 @@ from guiderail.systems.support import declarations as declare
 
 
 class TemplateFrames:
-    """Object frames of a template, declared as numeric parameters of a LeafSystem.
+    """Poses of a template's object frames, declared as numeric parameters of a LeafSystem.
 
-    The frames are constant during an episode, so they are parameters instead of input ports: a guidance diagram needs
-    no additional port, and a reset moves an object with `set`.
+    The poses are constant during an episode. They are therefore parameters instead of input ports: a guidance diagram
+    needs no additional port, and a reset moves an object with `set`.
 
     Args:
         system: System under construction; outputs that use the frames must depend on `ticket`.
-        template: Template with the frames.
-        frames: Default poses in the world, by name of the frame.
+        template: Template that uses the frames.
+        frames: Default poses in the world by frame name.
 
     Attributes:
         names: Names of the frames.
 
     Raises:
-        InputError: If the template is not a `SharedControlTemplate`, or the frames are not transforms by name. A
-            missing frame, a pose that is not finite and a pose of the world are refused.
+        InputError: If the template is not a `SharedControlTemplate`, `frames` are not transforms by name, a frame is
+            missing, a pose is not finite, or a pose of the world is given.
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
@@ -44,15 +44,15 @@ class TemplateFrames:
 
     @property
     def ticket(self) -> DependencyTicket:
-        """Dependency ticket of values computed from the frames."""
+        """Dependency ticket of values that are computed from the frames."""
         return self._cache.ticket()
 
     def eval(self, context: Context) -> dict[str, RigidTransform]:
-        """Return the poses by name; `context` is the system's."""
+        """Return the poses by name; `context` is the context of the system."""
         return self._cache.Eval(context)
 
     def set(self, context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of some frames in the system's context; other frames do not move.
+        """Set the poses of frames by name in the context of the system; other frames do not move.
 
         Raises:
             InputError: If the template has no such frame, or a pose is not finite.

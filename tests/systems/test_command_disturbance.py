@@ -86,7 +86,7 @@ def test_constructor_refuses_arguments_out_of_range(wrong):
 @pytest.mark.parametrize("seed", [-1, 1.5, np.nan])
 def test_seed_is_refused_when_it_is_no_whole_number_from_zero(seed):
     system = CommandDisturbance(1, PERIOD)
-    with pytest.raises(InputError, match="a seed is a whole number of at least 0, not"):
+    with pytest.raises(InputError, match="a seed must be a whole number of at least 0, not"):
         system.set_seed(system.CreateDefaultContext(), seed)
 
 

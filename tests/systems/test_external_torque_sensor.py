@@ -71,7 +71,7 @@ def test_gain_acts_on_gravity_too(arm):
         ({"friction": np.full(7, np.nan)}, "friction"),
         ({"mass": np.zeros(7)}, "mass"),
         ({"center": np.zeros(3)}, "center"),
-        ({"seed": -1}, "a seed is a whole number of at least 0, not -1"),
+        ({"seed": -1}, "a seed must be a whole number of at least 0, not -1"),
     ],
 )
 def test_errors_are_refused_when_they_are_out_of_range(arm, wrong, words):

@@ -85,7 +85,7 @@ def test_no_direct_feedthrough():
 
 @pytest.mark.parametrize("sizes", [(0, 1, 1), (1, 0, 1), (1, 1, 0)])
 def test_constructor_refuses_arguments_out_of_range(sizes):
-    with pytest.raises(InputError, match="sizes of at least 1"):
+    with pytest.raises(InputError, match="_size must be a whole number of at least 1"):
         FunctionGuidanceSystem(lambda action, pose, wrench: pose, *sizes, PERIOD)
     with pytest.raises(InputError, match="guidance needs a function"):
         FunctionGuidanceSystem(5, 1, 1, 1, PERIOD)

@@ -18,5 +18,5 @@ def test_observation_is_the_image_by_channel_and_the_state():
 
 
 def test_no_pixels_are_refused():
-    with pytest.raises(InputError, match="at least one pixel"):
+    with pytest.raises(InputError, match="at least 1"):
         ImageObservation(0, 3, 2)
