@@ -177,9 +177,7 @@ class CartesianImpedanceController(LeafSystem):
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose of the tool center, (6,)")
     get_estimated_state_input_port = input_getter("estimated_state", "joint state, (2n,) [rad, rad/s]")
     get_command_time_input_port = input_getter("command_time", "time stamp of the desired pose, (1,) [s]; optional")
-    get_max_wrench_input_port = input_getter(
-        "max_wrench", "limits of the wrench per axis and of its norms, (8,); optional"
-    )
+    get_max_wrench_input_port = input_getter("max_wrench", "limits per axis and of the norms, (8,) [N, Nm]; optional")
     get_generalized_force_output_port = output_getter("generalized_force", "joint torques, (n,) [Nm]")
     get_pose_output_port = output_getter("pose", "measured pose of the tool center, (6,)")
     get_impedance_wrench_output_port = output_getter("impedance_wrench", "wrench of spring and damper, (6,)")

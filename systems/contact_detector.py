@@ -54,11 +54,10 @@ class ContactDetector(LeafSystem):
         super().__init__()
         check_bodies(plant, "bodies", bodies)
         check_bodies(plant, "obstacles", obstacles)
-        bodies_indices, obstacles_indices = ({int(body.index()) for body in group} for group in (bodies, obstacles))
-        if bodies_indices & obstacles_indices:
+        body_indices, obstacle_indices = ({int(body.index()) for body in group} for group in (bodies, obstacles))
+        if body_indices & obstacle_indices:
             raise InputError("a body can't collide with itself: bodies and obstacles overlap")
-        pairs = list(product(bodies_indices, obstacles_indices))
-        self._pairs = {*pairs, *((obstacle, body) for body, obstacle in pairs)}
+        self._pairs = {*product(body_indices, obstacle_indices), *product(obstacle_indices, body_indices)}
         self._body_of = {
             geometry: int(body.index())
             for body in (*bodies, *obstacles)

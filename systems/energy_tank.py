@@ -101,9 +101,7 @@ class EnergyTank(LeafSystem):
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
-    get_max_wrench_input_port = input_getter(
-        "max_wrench", "limits of the wrench per axis and of its norms, (8,); optional"
-    )
+    get_max_wrench_input_port = input_getter("max_wrench", "limits per axis and of the norms, (8,) [N, Nm]; optional")
     get_reference_pose_output_port = output_getter("reference_pose", "reference that the tank admits, (6,)")
     get_admitted_wrench_output_port = output_getter("admitted_wrench", "bound that the tank admits, (8,)")
     get_energy_output_port = output_getter("energy", "energy in the tank, (1,) [J]")

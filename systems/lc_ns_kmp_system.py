@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import LcNsKmp, UnsolvableError
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,25 +44,26 @@ class LcNsKmpSystem(LeafSystem):
 
     ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
     (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
-    length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so its command
-    starts at the end of the previous one. ``reference_window`` is ((H+1)(O + O²),) for the horizon H of `primitive`. If
-    it is connected, its means and covariances, the current step first, replace those of the reference
-    (`ChunkReference`); all primitives must then have this horizon. ``command`` is (O,).
-    ``constraint_violation`` (1,) is max(c − G y) of the command: negative if all constraints are slack,
-    `ConstraintViolation.UNCONSTRAINED` if there is none. ``fallback`` (1,) is 1 if no window within the constraints
-    was found; the command is then the point nearest to the last command within the constraints of the current step.
+    length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so that its
+    command starts at the end of the previous command. ``reference_window`` is ((H+1)(O + O²),) for the horizon H of
+    `primitive`: means and covariances, the current step first. If this port is connected, they replace those of the
+    reference trajectory (`ChunkReference`), and all primitives must have the horizon H. ``command`` is (O,).
+    ``constraint_violation`` (1,) is max(c − G y) of the command y: negative if all constraints are slack, and
+    `ConstraintViolation.UNCONSTRAINED` if there is no constraint. ``fallback`` (1,) is 1 if no window within the
+    constraints was found. The command is then the point within the constraints of the current step that is nearest to
+    the last command.
 
-    The step is discrete state that counts control periods since time zero. If ``motion_time`` (1,) [s] is connected
-    (`ProgressClock`), it determines the step instead. The command is a pure function of step, action and history,
-    evaluated once per control step (see docs/concepts/rates.md).
+    The step is a discrete state that counts control periods since time zero. If ``motion_time`` (1,) [s] is connected
+    (`ProgressClock`), it determines the step instead. The command is a pure function of step, action and history. It is
+    computed once per control step (see docs/concepts/rates.md).
 
     Args:
         primitive: Primitive with O outputs and a history of P outputs.
         gain: Raw null-space action per unit of the policy's action (`models.primitives.gains`), (O,); None: ones.
-        period: Control period [s], positive. It is not compared with the period of the reference trajectory: the
-            motion is faster or slower than the demonstrations if they differ (`ReferenceTrajectory.resampled`).
-        shorter: Primitives of the same motion and constraints with histories of 1 to P − 1 outputs, and their gains
-            (O,).
+        period: Control period [s], positive. It is not checked against the period of the reference trajectory. If the
+            two differ, the motion is faster or slower than the demonstrations (`ReferenceTrajectory.resampled`).
+        shorter: Pairs of a primitive with a history of 1 to P − 1 outputs and its gain (O,). Motion and constraints of
+            these primitives are the same as those of `primitive`.
 
     Attributes:
         primitive: Primitive with the longest history.
@@ -83,23 +84,23 @@ class LcNsKmpSystem(LeafSystem):
         shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
     ):
         super().__init__()
-        check_period(period)
         shorter = _checked_pairs(shorter)
-        for one in (primitive, *(other for other, _ in shorter)):
-            if not isinstance(one, LcNsKmp):
-                raise InputError(f"a primitive of this system is an LcNsKmp, not {brief(one)}")
+        for candidate in (primitive, *(other for other, _ in shorter)):
+            if not isinstance(candidate, LcNsKmp):
+                raise InputError(f"a primitive of this system is an LcNsKmp, not {brief(candidate)}")
         outputs = primitive.num_outputs
         if any(other.history not in range(1, primitive.history) for other, _ in shorter):
             raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
         if len({other.history for other, _ in shorter}) < len(shorter):
             raise InputError("two shorter histories have the same length")
         for other, _ in shorter:
-            constraints, others = primitive.constraints, other.constraints
-            if not (np.array_equal(constraints.G, others.G) and np.array_equal(constraints.c, others.c)):
+            first, second = primitive.constraints, other.constraints
+            if not (np.array_equal(first.G, second.G) and np.array_equal(first.c, second.c)):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         self.primitive, self._period = primitive, period
         self._by_history_length = {
-            one.history: (one, _checked_gain(one_gain, outputs)) for one, one_gain in [(primitive, gain), *shorter]
+            other.history: (other, _checked_gain(own_gain, outputs))
+            for other, own_gain in [(primitive, gain), *shorter]
         }
 
         self._null_space_action_port = self.DeclareVectorInputPort("null_space_action", outputs)
@@ -163,7 +164,7 @@ class LcNsKmpSystem(LeafSystem):
             raise InputError(f"with a reference window all primitives must have one horizon, not {horizons}")
         step = round(context.get_time() / self._period)
         discrete_state.set_value(self._step, [step])
-        if step == 0:  # an initialization at a later time keeps the last command for fallbacks
+        if step == 0:  # after a later initialization, a fallback still uses the last command
             discrete_state.set_value(self._last_command, self._initial_command)
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
@@ -202,7 +203,7 @@ class LcNsKmpSystem(LeafSystem):
                 prediction = primitive.predict_window(step, means, covariances, action, history)
             output, fallback = prediction.output, 0.0
         except UnsolvableError:
-            # The constraints may differ from those of the previous step: the last command itself might violate them.
+            # The last command may violate the constraints of this step, which can differ from those of its own step.
             last_command = context.get_discrete_state().value(self._last_command)
             output, fallback = self.primitive.constraints.nearest(last_command, step), 1.0
         return _Prediction(step, output, fallback)

@@ -3,19 +3,17 @@
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class MeanForce(LeafSystem):
-    """Mean force of the last control step, from the running sum of the forces of all plant steps.
+    """Compute the mean force of the last control step from the running sum of the forces of all plant steps.
 
         force = (force_sum − force_sum at the last control step) / substeps
 
-    A control step consists of many plant steps. The force at the end of the last plant step misses contacts that
-    are already over, and during an impact it depends on the length of the plant step. The mean has neither problem.
+    A control step consists of many plant steps. The force of the last plant step does not include contacts that ended
+    earlier in the control step, and during an impact it depends on the length of the plant step. The mean avoids both.
 
     .. pydrake_system::
 
@@ -31,7 +29,7 @@ class MeanForce(LeafSystem):
 
     Args:
         size: Number D of force components, at least 1.
-        substeps: Plant steps per control step, at least 1.
+        substeps: Number of plant steps per control step, at least 1.
         period: Control period [s], positive.
 
     Raises:
@@ -40,10 +38,8 @@ class MeanForce(LeafSystem):
 
     def __init__(self, size: int, substeps: int, period: float):
         super().__init__()
-        size, substeps = as_whole(size, "size of a mean force"), as_whole(substeps, "substeps of a mean force")
-        if size < 1 or substeps < 1:
-            raise InputError(f"a mean needs at least one component and one substep, not {size} and {substeps}")
-        self._scale = 1.0 / substeps
+        size = as_count(size, "the size of a mean force")
+        self._scale = 1.0 / as_count(substeps, "the substeps of a mean force")
         self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
         self._last_sum = declare.sample(self, self._force_sum_port, period)
         sources = [self._force_sum_port, self._last_sum]

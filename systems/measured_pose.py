@@ -13,7 +13,7 @@ from guiderail.systems.support.drake_multibody import check_bodies, transform_to
 
 
 class MeasuredPose(LeafSystem):
-    """Pose of a body P in a frame T that is fixed in the world.
+    """Compute the pose of a body P in a frame T that is fixed in the world.
 
         X_TP = X_TW X_WP
 

@@ -11,11 +11,11 @@ from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import output_getter
 
 DEAD_ZONE = 0.1
-"""Dead zone of the gamepad axes, because a released stick is rarely exactly at zero."""
+"""Magnitude up to which the value of a gamepad axis is ignored; a released stick is rarely exactly at zero."""
 
 
 class MeshcatDevice(LeafSystem):
-    """Sample the operator's input, which replaces the action of a policy.
+    """Sample the input of an operator, which replaces the action of a policy.
 
     .. pydrake_system::
 
@@ -23,11 +23,11 @@ class MeshcatDevice(LeafSystem):
         output_ports:
         - action
 
-    ``action`` is (n,), in [−1, 1], sampled once per period. An entry is the value of its gamepad axis times its sign
-    outside the dead zone, otherwise the value of its slider, which two keys move.
+    ``action`` is (n,), in [−1, 1], sampled once per period. Outside the dead zone, an entry is the value of its gamepad
+    axis times its sign. Inside the dead zone, it is the value of its slider, which two keys move.
 
     Args:
-        meshcat: Meshcat instance that shows the sliders and reads the gamepad.
+        meshcat: Meshcat instance with the sliders and the gamepad.
         axes: Index and sign of the gamepad axis of each entry.
         keys: JavaScript codes of the keys that decrease and increase the slider of each entry.
         period: Sampling period [s], positive.
@@ -42,7 +42,7 @@ class MeshcatDevice(LeafSystem):
         super().__init__()
         if len(axes) != len(keys) or not axes:
             raise InputError(
-                f"a device needs one or more axes and as many pairs of keys, not {len(axes)} and {len(keys)}"
+                f"a device needs at least one axis and a pair of keys per axis, not {len(axes)} and {len(keys)}"
             )
         self._meshcat, self._axes = meshcat, tuple(axes)
         self._sliders = [f"input {i + 1}" for i in range(len(axes))]
@@ -55,7 +55,7 @@ class MeshcatDevice(LeafSystem):
     get_action_output_port = output_getter("action", "operator's input, (n,), in [−1, 1]")
 
     def read(self) -> np.ndarray:
-        """Return the operator's present input, (n,), in [−1, 1]."""
+        """Return the present input of the operator, (n,), in [−1, 1]."""
         gamepad = self._meshcat.GetGamepad()
         values = []
         for (axis, sign), slider in zip(self._axes, self._sliders, strict=True):

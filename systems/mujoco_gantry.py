@@ -24,11 +24,11 @@ MAX_JOINT_SPEED = 1e3  # joint speed above which a simulation counts as diverged
 
 
 class DivergedError(RuntimeError):
-    """Raised if the state of the physics engine has diverged, or its contact or constraint buffer is full."""
+    """Error for a diverged state of the physics engine, or for a full contact or constraint buffer."""
 
 
 class MovedBodies(NamedTuple):
-    """Bodies of a plant that the MuJoCo model contains: the fixture, the tool, and the workpiece fixed to the tool."""
+    """Bodies of a plant that the MuJoCo model also contains: fixture, tool, and the workpiece fixed to the tool."""
 
     fixture: RigidBody
     tool: RigidBody
@@ -50,10 +50,11 @@ class MujocoGantry(LeafSystem):
 
         M q'' + c = clip(K (x_d − q) − D q', ± limits) + J^T f,  τ y' = w − y
 
-    with the pose q of the tool, its inertia M and bias forces c, and the desired pose x_d. K, D and the limits belong
-    to the six motors. The engine computes the contact forces f. w is the wrench of f on the tool at its center in the
-    axes of T, and y the filtered wrench. A static plant defines the pose of the fixture and the pose of the workpiece
-    in the tool, offsets included. Before every update, the bodies of the model are placed at these poses.
+    q is the pose of the tool, M and c are its inertia and bias forces, and x_d is the desired pose. K, D and the limits
+    are parameters of the six motors. The engine computes the contact forces f. w is the wrench of f on the tool, at the
+    tool center in the axes of T, and y is the filtered wrench. A static plant defines the pose of the fixture, and the
+    pose of the workpiece relative to the tool, including their offsets. Before every update, the bodies of the model
+    are placed at these poses.
 
     .. pydrake_system::
 
@@ -70,11 +71,11 @@ class MujocoGantry(LeafSystem):
         - geometry_poses
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``nominal_body_poses`` is the
-    output of the static plant; ``body_poses`` contains the same poses, but tool and workpiece are at their simulated
-    poses. ``state`` is (12,), the pose and its time derivative. ``geometry_poses`` contains the poses of all frames
-    with geometry. ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is (6,),
-    the forces and torques of the six motors in the order of the pose. Positions, velocities and warm start of the
-    engine and the state of the filter are declared state.
+    output of the static plant. ``body_poses`` contains the same poses, except that tool and workpiece have their
+    simulated poses. ``state`` is (12,), the pose and its time derivative. ``geometry_poses`` contains the poses of all
+    frames with geometry. ``wrench`` is the filtered wrench y, (6,), force first, in N and Nm. ``impedance_wrench`` is
+    (6,), the forces and torques of the six motors in the order of the pose. Positions, velocities and warm start of the
+    engine and the state of the filter are declared discrete state.
 
     The engine's automatic reset after a divergence is disabled, because it would move the tool to the target.
 
@@ -82,7 +83,7 @@ class MujocoGantry(LeafSystem):
         model: MuJoCo model with bodies `fixture` and `workpiece`, whose first six joints and motors move the tool; this
             system writes to it.
         plant: Finalized plant without joints, registered as a source of geometry.
-        moved: Bodies of the plant that the model contains.
+        moved: Bodies of the plant that the model also contains.
         X_WT: Pose of the target frame in the world of the plant. The target frame is the world of the model.
         period: Update period [s], positive, an integer multiple of the model's step.
         time_constant: τ of the wrench filter [s], not negative, finite; 0 disables it.
@@ -113,7 +114,7 @@ class MujocoGantry(LeafSystem):
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_AUTORESET)
         # Scratch memory: every update first writes all values that it reads, so `_data` keeps no state between updates.
         self.model, self._data = model, self._mujoco.MjData(model)
-        # Warnings of divergence, and of a full contact or constraint buffer: the engine ignores what no longer fits.
+        # Warnings of divergence and of a full buffer: the engine ignores contacts and constraints that exceed a buffer.
         failures = ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL", "CONTACTFULL", "CNSTRFULL")
         self._failures = [self._mujoco.mjtWarning.__members__[f"mjWARN_{name}"].value for name in failures]
         # Stored parts of the engine's state, including the warm start, so that a restored state continues identically.
@@ -166,22 +167,22 @@ class MujocoGantry(LeafSystem):
     get_geometry_poses_output_port = output_getter("geometry_poses", "poses of all frames with geometry")
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the tool at rest at `pose`, (6,) [m, rad]; `context` is this system's."""
+        """Set the tool to `pose` (6,) [m, rad] at rest; `context` is this system's."""
         context.SetDiscreteState(self._state, self._at_rest(pose))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Scale all friction coefficients, and the stiffness of contacts and springs; `context` is this system's.
+        """Scale all friction coefficients and the stiffness of contacts and springs; `context` is this system's.
 
-        `friction` and `modulus` are factors. For a modulus above 1 the step of the engine is divided by √modulus,
-        rounded up.
+        `friction` and `modulus` are the factors. If `modulus` is above 1, the time step of the engine is divided by
+        √modulus, rounded up.
 
         Raises:
             InputError: If a factor is not finite, the friction is negative, or the modulus is not positive.
         """
         if not 0.0 <= friction < math.inf:
-            raise InputError(f"the factor of the friction is finite and not negative, not {brief(friction)}")
+            raise InputError(f"the factor of the friction must be finite and not negative, not {brief(friction)}")
         if not 0.0 < modulus < math.inf:
-            raise InputError(f"the factor of the contact's stiffness is finite and positive, not {brief(modulus)}")
+            raise InputError(f"the factor of the contact stiffness must be finite and positive, not {brief(modulus)}")
         context.get_mutable_numeric_parameter(self._factors).SetFromVector([friction, modulus])
 
     def _at_rest(self, pose: np.ndarray) -> np.ndarray:
@@ -204,7 +205,8 @@ class MujocoGantry(LeafSystem):
         num_substeps = self._scale_contact(*context.get_numeric_parameter(self._factors).value())
         self._mujoco.mj_setState(model, data, state[self._physics].copy(), self._parts)
         data.ctrl[:POSE_SIZE] = self._desired_pose_port.Eval(context)
-        # Counts start at 1: from 0, the first warning makes the engine write a log file to the working directory.
+        # Warning counts start at 1, because at 0 the engine would write a log file to the working directory at the
+        # first warning.
         for warning in self._failures:
             data.warning[warning].number = 1
         filtered = state[self._filtered]
@@ -240,8 +242,8 @@ class MujocoGantry(LeafSystem):
     def _scale_contact(self, friction: float, modulus: float) -> int:
         """Scale the model's contact parameters and return the number of substeps that replace one step.
 
-        The step is short enough that the engine can integrate the stiffer springs, and the time constant of a contact
-        is at least two steps. A stiffer spring keeps its damping ratio.
+        With the substeps, the engine can integrate stiffer springs. The time constant of a contact is at least two
+        substeps. The damping of stiffer springs is increased so that their damping ratio is constant.
         """
         model, nominal = self.model, self._nominal
         num_substeps = max(math.ceil(math.sqrt(modulus) - 1e-9), 1)
@@ -256,7 +258,8 @@ class MujocoGantry(LeafSystem):
     def _contact_wrench(self) -> np.ndarray:
         """Return the wrench of the generalized contact forces.
 
-        The slide joints are along the axes of T. The generalized force of a hinge about axis a is a · t for a torque t.
+        The prismatic joints are along the axes of T. For a torque t, the generalized force of a hinge about an axis a
+        is a · t.
         """
         generalized, axes = self._data.qfrc_constraint[:POSE_SIZE], self._data.xaxis[3:POSE_SIZE]
         return np.concatenate([generalized[:3], np.linalg.solve(axes, generalized[3:])])

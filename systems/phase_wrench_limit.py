@@ -1,4 +1,4 @@
-"""Limits of force and torque that change with the state of a shared control template."""
+"""Wrench limits that change with the state of a shared control template."""
 
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
@@ -11,13 +11,13 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PhaseWrenchLimit(LeafSystem):
-    """Select the wrench limit of the current state, and change it at a bounded rate from state to state.
+    """Output the wrench limit of a template's current state, with a bounded rate of change after a transition.
 
         b_k = b_{k-1} + s (B_q - b_{k-1}),  with the largest s <= 1 such that |b_k - b_{k-1}| <= r h
 
-    B_q is the limit of state q, r the largest rate and h the period. The rate is bounded in both directions: a limit
-    that falls at once would make the force jump. An episode begins with the limit of its first state. If ``state`` is
-    not the number of a state, B_q is the element-wise minimum of the limits of all states.
+    B_q is the limit of state q, r the largest rate and h the period. The rate of decreases is bounded as well, because
+    the force would jump after a sudden decrease of the limit. An episode begins with the limit of its first state. If
+    ``state`` is not the number of a state, B_q is the element-wise minimum of the limits of all states.
 
     .. pydrake_system::
 
@@ -29,12 +29,12 @@ class PhaseWrenchLimit(LeafSystem):
         - phase_max_wrench
 
     ``state`` is (1,), the number of the state. ``max_wrench`` and ``phase_max_wrench`` are (8,), the limits of
-    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. The output is the minimum of b
-    and ``max_wrench``, the task's own limit, which applies at once.
+    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. ``max_wrench`` is the limit of
+    the task, whose changes apply at once. The output is the element-wise minimum of b and ``max_wrench``.
 
     Args:
-        limits: Limits of each state (n, 8) [N, Nm], finite and not negative.
-        max_rate: Largest rates (8,) [N/s, Nm/s], positive, finite.
+        limits: Limits of the n states (n, 8) [N, Nm], finite and not negative.
+        max_rate: Largest rates of change (8,) [N/s, Nm/s], positive, finite.
         period: Sampling period [s], positive.
 
     Raises:
@@ -46,11 +46,15 @@ class PhaseWrenchLimit(LeafSystem):
         declare.check_period(period)
         self._limits, rate = as_numbers(limits, "limits"), as_numbers(max_rate, "max_rate")
         if self._limits.ndim != 2 or not len(self._limits) or self._limits.shape[1] != MAX_WRENCH_SIZE:
-            raise InputError(f"the wrench limits of states are rows of {MAX_WRENCH_SIZE}, not {self._limits.shape}")
+            raise InputError(
+                f"the wrench limits of n states must have the shape (n, {MAX_WRENCH_SIZE}), not {self._limits.shape}"
+            )
         if not ((self._limits >= 0.0) & (self._limits < np.inf)).all():
             raise InputError("the wrench limits of states must be finite and not negative")
         if rate.shape != (MAX_WRENCH_SIZE,) or not ((rate > 0.0) & (rate < np.inf)).all():
-            raise InputError(f"the rates of wrench limits are {MAX_WRENCH_SIZE} positive numbers, not {max_rate}")
+            raise InputError(
+                f"the rates of wrench limits must be {MAX_WRENCH_SIZE} positive, finite numbers, not {max_rate}"
+            )
         self._max_change = rate * period
         self._state_port = self.DeclareVectorInputPort("state", 1)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
@@ -61,7 +65,7 @@ class PhaseWrenchLimit(LeafSystem):
         declare.update(self, period, self._update, declare.reset_to_default(self))
 
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
-    get_max_wrench_input_port = input_getter("max_wrench", "task's limit of the wrench, (8,); optional")
+    get_max_wrench_input_port = input_getter("max_wrench", "wrench limit of the task, (8,); optional")
     get_phase_max_wrench_output_port = output_getter("phase_max_wrench", "limit in the present state, (8,)")
 
     def _limit(self, context: Context) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""System that evaluates a policy, for simulations of a task diagram without an environment."""
+"""Policy as a system, for simulations of a task diagram without an environment."""
 
 from collections.abc import Callable
 
@@ -6,27 +6,23 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State, System
 
-from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, check_period, input_getter, output_getter
 
 
 class PolicyError(RuntimeError):
-    """Error raised if a policy does not return an action.
-
-    The robot must stop, because no other action is known to be safe.
-    """
+    """Error for a policy that does not return an action; the robot must stop, because no action is known to be safe."""
 
 
 class PolicySystem(LeafSystem):
-    """Evaluate a policy once per action period, before all other updates of that instant.
+    """Evaluate a policy once per action period, before all other updates of the same instant.
 
         action[k] = clip(policy(observation[k]), −1, 1)
 
-    The observation is the one just before the instant k·period. The action is set by an unrestricted update. Drake
-    performs it before the discrete updates of the same instant, so a `ZeroOrderHold` of the control period outputs the
-    new action from that instant on. A `Simulator` of a task diagram with this system therefore gives bit for bit
-    the results of `DiagramEnv` with the same policy (see docs/concepts/rates.md).
+    observation[k] is the value just before the instant k·period. An unrestricted update sets the action. Drake performs
+    this update before the discrete updates of the same instant, so that a `ZeroOrderHold` of the control period outputs
+    the new action from that instant on. The results of a `Simulator` of a task diagram with this system are therefore
+    bit-identical to those of `DiagramEnv` with the same policy (see docs/concepts/rates.md).
 
     .. pydrake_system::
 
@@ -63,18 +59,14 @@ class PolicySystem(LeafSystem):
         check_period(period)
         if not callable(policy):
             raise InputError(f"a policy is a function from an observation to an action, not {brief(policy)}")
-        action_size = as_whole(action_size, "action_size")
-        if action_size < 1:
-            raise InputError(f"a policy's action has at least one number, not {action_size}")
         self._policy = policy
         self._is_image = isinstance(observation, AbstractValue)
         if isinstance(observation, AbstractValue):
             self._observation_port = self.DeclareAbstractInputPort("observation", observation)
-        elif as_whole(observation, "the size of an observation") >= 1:
-            self._observation_port = self.DeclareVectorInputPort("observation", int(observation))
         else:
-            raise InputError(f"a policy's observation has at least one number, not {observation}")
-        self._action = self.DeclareDiscreteState(action_size)
+            observation_size = as_count(observation, "the size of an observation")
+            self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
+        self._action = self.DeclareDiscreteState(as_count(action_size, "action_size"))
         self._action_port = self.DeclareStateOutputPort("action", self._action)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
@@ -82,7 +74,11 @@ class PolicySystem(LeafSystem):
     get_action_output_port = output_getter("action", "last action, (A,), in [−1, 1]")
 
     def _update(self, context: Context, state: State) -> None:
-        """Evaluate the policy and set the action; raise a `PolicyError` if it does not return A finite numbers."""
+        """Evaluate the policy and set the action.
+
+        Raises:
+            PolicyError: If the policy does not return A finite numbers.
+        """
         returned = self._policy(self._observe(context))
         try:
             action = np.asarray(returned, dtype=float)
@@ -108,12 +104,12 @@ def check_policy_ports(policy: System, observation_size: int, action_size: int, 
     """
     if not (policy.HasInputPort("observation") and policy.HasOutputPort("action")):
         raise InputError(
-            f"a policy of {task_name} that is a system has an input 'observation' and an output 'action', unlike "
+            f"a policy of {task_name} that is a system needs an input 'observation' and an output 'action', unlike "
             f"{type(policy).__name__}: rename or export its ports"
         )
     observation, action = policy.GetInputPort("observation"), policy.GetOutputPort("action")
     if observation.size() != observation_size or action.size() != action_size:
         raise InputError(
-            f"a policy of {task_name} takes {observation_size} numbers and returns {action_size}, "
-            f"this one {observation.size()} and {action.size()}: it was trained with other options"
+            f"a policy of {task_name} needs an observation of size {observation_size} and an action of size "
+            f"{action_size}, not {observation.size()} and {action.size()}: use the options with which it was trained"
         )

@@ -11,8 +11,8 @@ from guiderail.models.control.motion_constraints import MotionLimits
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 
-# Modes in order of preference. If the axes cannot be synchronized for numerical reasons (about one of 10,000
-# adversarial commands), each axis has its own trajectory; if that fails too, the motion is braked to rest.
+# Modes in order of preference: synchronized axes, independent axes, braking to rest. For numerical reasons, the axes
+# cannot be synchronized for about one of 10,000 adversarial commands.
 MODES = (
     (ControlInterface.Position, Synchronization.Time),
     (ControlInterface.Position, Synchronization.No),
@@ -24,15 +24,15 @@ POSE_AXES = [5, 4, 3]  # indices of Rx, Ry, Rz in a pose, in the order of SciPy'
 class PoseMotionLimiter(LeafSystem):
     """Follow a desired pose with limited velocity, acceleration and jerk, starting from the measured pose at rest.
 
-    While the blend factor is zero or NaN the output is the measured pose. When the factor becomes positive, the output
+    While the blend factor is zero or NaN, the output is the measured pose. When the factor becomes positive, the output
     moves from the measured pose to the desired pose on the time-optimal trajectory within the limits. The trajectory is
     computed again in each period (Berscheid and Kröger, "Jerk-limited Real-time Trajectory Generation with Arbitrary
-    Target States", RSS 2021). The orientation is represented by the rotation vector from the orientation at the start
-    (`MotionLimits.rotation_vector_limits`). Each axis has a share of 1/√3 of the limit, so that the norms are within
-    the limits. A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the
-    output comes to rest at the last valid one. While the desired pose is so far away that no trajectory to it can be
-    computed, such as 10 km, the motion is braked to rest. A measured pose that is not finite is ignored: the last
-    output is kept.
+    Target States", RSS 2021). The orientation is represented by the rotation vector relative to the start of the motion
+    (`MotionLimits.rotation_vector_limits`). The limit of each axis is 1/√3 of the limit of the norm.
+
+    A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the output comes
+    to rest at the last valid desired pose. If the desired pose is too far away for the computation of a trajectory,
+    such as 10 km, the motion is braked to rest. If the measured pose is not finite, the last output is repeated.
 
     .. pydrake_system::
 
@@ -45,7 +45,7 @@ class PoseMotionLimiter(LeafSystem):
         - limited_pose
 
     ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians.
-    ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
+    ``blend_factor`` is (1,), from a `TorqueSafetyLimiter`.
 
     Args:
         limits: Limits of the motion.
@@ -87,10 +87,10 @@ class PoseMotionLimiter(LeafSystem):
         start = Rotation.from_quat(state[24:])
         desired = self._desired_pose_port.Eval(context)
         if np.isfinite(desired).all():
-            turn = (start.inv() * Rotation.from_euler("xyz", desired[POSE_AXES])).as_rotvec()
-            # At half a turn the rotation vector jumps to the opposite direction.
-            if np.linalg.norm(turn) < 0.9 * np.pi:
-                state[18:24] = np.concatenate([desired[:3], turn])
+            rotation_vector = (start.inv() * Rotation.from_euler("xyz", desired[POSE_AXES])).as_rotvec()
+            # At an angle of π, the rotation vector jumps to the opposite direction.
+            if np.linalg.norm(rotation_vector) < 0.9 * np.pi:
+                state[18:24] = np.concatenate([desired[:3], rotation_vector])
         motion = InputParameter(6)
         motion.current_position, motion.current_velocity, motion.current_acceleration = state[:18].reshape(3, 6)
         motion.target_position = state[18:24]
@@ -111,25 +111,25 @@ class PoseMotionLimiter(LeafSystem):
 
 
 def _plan(motion: InputParameter) -> Trajectory:
-    """Return a trajectory to the target, or a trajectory to rest if none to the target is found.
+    """Return a trajectory to the target, or to rest if no trajectory to the target is found.
 
     Raises:
-        InputError: If neither is found.
+        InputError: If no trajectory is found.
     """
     for motion.control_interface, motion.synchronization in MODES:
         trajectory = Trajectory(6)
         try:
-            # Constructed on every call: an instance stored in a system would be reported as leaked when Python exits.
+            # A new instance on every call: an instance stored in a system would be reported as leaked at exit.
             if Ruckig(6).calculate(motion, trajectory) in (Result.Working, Result.Finished):
                 return trajectory
         except (RuckigError, ValueError):
-            # A ValueError: the bindings have no name for the result of a motion that would take too long (-101).
+            # The bindings raise a ValueError for the result code -101 (too long duration), for which they have no name.
             continue
     raise InputError(f"no trajectory from {motion.current_position} is within the limits of the motion")
 
 
 def _at_rest(pose: np.ndarray) -> np.ndarray:
-    """Return the state of a trajectory that rests at a pose (6,)."""
+    """Return the state (28,) of a trajectory at rest at a pose (6,)."""
     state = np.zeros(28)
     state[:3] = state[18:21] = pose[:3]
     state[24:] = Rotation.from_euler("xyz", pose[POSE_AXES]).as_quat()

@@ -1,4 +1,4 @@
-"""Publisher of desired poses to a robot that runs the impedance itself."""
+"""Publisher of desired poses to a robot whose own controller is the impedance controller."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ from guiderail.systems.torque_safety_limiter import ArmState
 class PosePublisher(LeafSystem):
     """Publish a desired pose once per period while the arm is controlled; otherwise stop the robot.
 
-    A pose that is not finite stops the robot, too. Before the arm is controlled for the first time nothing is sent.
+    If the pose is not finite, the robot is stopped as well. Nothing is sent while the arm state is `ArmState.WAITING`.
 
     .. pydrake_system::
 

@@ -13,11 +13,11 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class PoseRateLimiter(LeafSystem):
     """Follow a desired pose with limited speed, starting from the measured pose.
 
-    While the blend factor is zero or NaN, the output is the measured pose. While it is positive the output moves from
-    there towards the desired pose; if it is positive at initialization, the output starts from the pose measured then.
-    In each period the position moves along a straight line by at most speed times period; each angle turns separately,
-    in the shorter direction. A desired pose within the speed limits is output unchanged. A desired or measured
-    pose that is not finite is ignored: the last output is kept.
+    While the blend factor is zero or NaN, the output is the measured pose. While the factor is positive, the output
+    moves from there, or from the pose measured at initialization, towards the desired pose. In each period, the
+    position moves along a straight line by at most speed times period, and each angle changes separately in the shorter
+    direction. If the desired pose can be reached within the speed limits, it is output unchanged. If the desired pose
+    or the measured pose is not finite, the last output is repeated.
 
     .. pydrake_system::
 
@@ -30,7 +30,7 @@ class PoseRateLimiter(LeafSystem):
         - limited_pose
 
     ``desired_pose``, ``pose`` (measured) and ``limited_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians.
-    ``blend_factor`` is (1,), the output of a `TorqueSafetyLimiter`.
+    ``blend_factor`` is (1,), from a `TorqueSafetyLimiter`.
 
     Args:
         period: Sampling period [s], positive.
@@ -67,7 +67,7 @@ class PoseRateLimiter(LeafSystem):
             return measured if is_finite(measured) else last
         desired = self._desired_pose_port.Eval(context)
         if not np.isfinite(desired).all():
-            return last  # NaN would remain in the state for ever
+            return last  # NaN would remain in the state
         change = pose_difference(desired, last)
         distance = float(np.linalg.norm(change[:3]))
         if distance <= self._step and (np.abs(change[3:]) <= self._angular_step).all():

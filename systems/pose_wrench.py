@@ -13,9 +13,9 @@ class PoseWrench(LeafSystem):
 
         f = τ_xyz,  [ez, Rz(a) ey, Rz(a) Ry(b) ex]ᵀ t = τ_abc
 
-    with force f, torque t and generalized forces τ (see `wrench_of_generalized_force`). On a gantry the joint positions
-    are the tool's pose coordinates. The plant's generalized contact forces therefore give the wrench of the environment
-    on the tool, without the tool's weight and inertia.
+    f is the force, t the torque and τ the generalized force (see `wrench_of_generalized_force`). On a gantry, the joint
+    positions are the tool's pose coordinates. The wrench of the environment on the tool, without the tool's weight and
+    inertia, is therefore computed from the plant's generalized contact forces.
 
     .. pydrake_system::
 

@@ -1,4 +1,4 @@
-"""Clock of a movement primitive that waits while the robot does not follow the commands."""
+"""Clock of a movement primitive, which stops while the robot does not follow the commands."""
 
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
@@ -8,7 +8,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ProgressClock(LeafSystem):
-    """Count the steps of a movement primitive, and wait while the robot does not follow (`StateProgress`).
+    """Count the steps of a movement primitive while the robot follows the commands (`StateProgress`).
 
     .. pydrake_system::
 
@@ -23,7 +23,7 @@ class ProgressClock(LeafSystem):
     of the period; it is a discrete state, and zero at initialization.
 
     Args:
-        rule: Rule that decides in each control step whether the motion progresses.
+        rule: Rule that determines the next step of the motion in each control step.
         num_outputs: Number O of outputs.
         period: Control period [s], positive.
 
@@ -38,15 +38,14 @@ class ProgressClock(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", num_outputs)
         self._time = self.DeclareDiscreteState(1)
         self.DeclareStateOutputPort("motion_time", self._time)
-        reset = declare.reset_to_default(self)
-        self._start = declare.update_after_start(self, period, self._update, reset)
+        self._start = declare.update_after_start(self, period, self._update, declare.reset_to_default(self))
 
     get_command_input_port = input_getter("command", "last command, (O,)")
     get_pose_input_port = input_getter("pose", "measured pose, (O,)")
     get_motion_time_output_port = output_getter("motion_time", "time of the motion, (1,) [s]")
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        clock = round(context.get_time() / self._period) - declare.start_step(context, self._start, self._period)
+        elapsed = round(context.get_time() / self._period) - declare.start_step(context, self._start, self._period)
         step = round(context.get_discrete_state().value(self._time).item() / self._period)
         command, pose = self._command_port.Eval(context), self._pose_port.Eval(context)
-        discrete_state.set_value(self._time, [self._period * self._rule.next_step(step, clock, command, pose)])
+        discrete_state.set_value(self._time, [self._period * self._rule.next_step(step, elapsed, command, pose)])

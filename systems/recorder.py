@@ -6,10 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
-from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, output_getter
+from guiderail.systems.support.declarations import SignalPorts, as_count, output_getter
 
 
 @dataclass(frozen=True)
@@ -17,7 +16,7 @@ class Recording:
     """Samples of named signals.
 
     Args:
-        times: Start times of the N recorded control periods, (N,) [s]; the signals are sampled at the end of each.
+        times: Start times of the N recorded control periods, (N,) [s]; signals are sampled at the end of each period.
         signals: Samples of each signal by name, (N, size).
     """
 
@@ -31,9 +30,9 @@ class Recording:
 class Recorder(LeafSystem):
     """Record named signals at the end of each control period.
 
-    The sample at the instant k·period contains the values just before that instant: the command since (k−1)·period and
-    the resulting motion, as one row of a demonstration. Recording stops after `num_samples` samples. The samples are
-    declared state, which a reset or an initialization clears.
+    The sample at the instant k·period contains the values just before this instant. As in a row of a demonstration,
+    these are the command since (k−1)·period and the resulting motion. Recording stops after `num_samples` samples. The
+    samples are declared state, which a reset or an initialization clears.
 
     .. pydrake_system::
 
@@ -56,10 +55,10 @@ class Recorder(LeafSystem):
 
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
         super().__init__()
-        num_samples = as_whole(num_samples, "num_samples of a recorder")
+        num_samples = as_count(num_samples, "num_samples of a recorder")
         self._signals = SignalPorts(self, signals)
-        if not signals or num_samples < 1:
-            raise InputError("a recorder needs at least one signal, and room for one sample")
+        if not signals:
+            raise InputError("a recorder needs at least one signal")
         self._sizes = {name: self._signals.port(name).size() for name in signals}
         self._width, self._num_samples, self._period = sum(self._sizes.values()), num_samples, period
         self._count = self.DeclareDiscreteState(1)
@@ -74,7 +73,7 @@ class Recorder(LeafSystem):
         """Return a copy of the samples so far; `context` is this system's.
 
         Raises:
-            RuntimeError: If it is the context of another system or the root context.
+            RuntimeError: If `context` is the root context or belongs to another system.
         """
         self.ValidateContext(context)
         count = int(context.get_discrete_state().value(self._count)[0])

@@ -12,13 +12,14 @@ from guiderail.systems.support.declarations import check_period, input_getter, o
 
 
 class ReferenceGovernor(LeafSystem):
-    """Move a desired pose towards the measured one, so that the force of a spring and damper stays inside a bound.
+    """Move a desired pose towards the measured pose, so that the force of a spring and damper stays inside a bound.
 
         x_r = x + e_r,  K e_r inside the bound reduced by (K h + D) |v|
 
-    with measured pose x and velocity v, stiffness K and damping D of the six coordinates, and time step h. The spring
-    accelerates the mass m to at most F / (2 √(k m)), with force bound F and contact stiffness k (see `slow_down`).
-    A pose that needs no limiting is output unchanged up to rounding.
+    x_r is the output, x and v are the measured pose and velocity, K and D the stiffness and damping of the six
+    coordinates, and h is the time step. The spring accelerates the mass m to at most the speed F / (2 √(k m)), with the
+    force bound F and the contact stiffness k (see `slow_down`). If no limit is active, the desired pose is output
+    unchanged up to rounding.
 
     .. pydrake_system::
 
@@ -33,7 +34,7 @@ class ReferenceGovernor(LeafSystem):
     ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
     measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), the limits of [fx fy fz tx ty tz], of the norm
     of the force and of the norm of the torque [N, Nm]; it can lower the bound but not raise it. NaN and negative
-    numbers count as 0: the spring exerts no force, and the damper, which belongs to the plant, remains.
+    numbers count as 0: the spring then exerts no force, and only the damper of the plant acts.
 
     Args:
         stiffness: Stiffness (6,) of each coordinate of the pose [N/m, Nm/rad], positive.
@@ -61,8 +62,8 @@ class ReferenceGovernor(LeafSystem):
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_state_input_port = input_getter("state", "measured pose and its velocity, (12,)")
-    get_max_wrench_input_port = input_getter("max_wrench", "largest wrench per axis and its norms, (8,); optional")
-    get_reference_pose_output_port = output_getter("reference_pose", "governed pose, (6,)")
+    get_max_wrench_input_port = input_getter("max_wrench", "limits per axis and of the norms, (8,) [N, Nm]; optional")
+    get_reference_pose_output_port = output_getter("reference_pose", "reference of the spring, (6,)")
 
     def _reference_pose(self, context: Context) -> np.ndarray:
         state, bound = self._state_port.Eval(context), self._bound

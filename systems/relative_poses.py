@@ -13,7 +13,7 @@ from guiderail.systems.support.drake_multibody import check_bodies, transform_to
 
 
 class RelativePoses(LeafSystem):
-    """Poses of bodies B relative to a reference body R.
+    """Compute the poses of bodies B relative to a reference body R.
 
         X_RB = X_RW X_WB
 

@@ -23,8 +23,8 @@ class Residual(LeafSystem):
         output_ports:
         - desired_pose
 
-    All ports are (O,); ``action`` is in [−1, 1]. Drake's `Adder` computes the same sum, but its output counts as
-    time-dependent, so downstream outputs would be computed again at every plant step.
+    All ports are (O,); ``action`` is in [−1, 1]. Drake's `Adder` is not used, because its output counts as
+    time-dependent: downstream outputs would be computed again at every plant step.
 
     Args:
         gain: Diagonal of K, (O,), in units of the reference per unit of action.
@@ -37,7 +37,7 @@ class Residual(LeafSystem):
         super().__init__()
         self._gain = as_numbers(gain, "gain")
         if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():
-            raise InputError(f"a residual's gain is one finite number per output, not {gain}")
+            raise InputError(f"a residual's gain must be one finite number per output, not {gain}")
         self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
         self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
         sources = [self._reference_port, self._action_port]

@@ -20,7 +20,7 @@ class RewardTerm:
     Args:
         name: Name of the term and of its output port.
         inputs: Size of each signal that the term depends on, by name. Terms that name the same signal share its port.
-        value: Pure function with these signals as keyword arguments; returns the term of this control step.
+        value: Pure function with these signals as keyword arguments; returns the term's value in this control step.
     """
 
     name: str
@@ -29,7 +29,7 @@ class RewardTerm:
 
 
 class RewardSystem(LeafSystem):
-    """Sum of named reward terms, each of which is an output too.
+    """Sum of named reward terms, with an output port for each term.
 
         r = Σ_i r_i    (as in equation 4.22)
 
@@ -50,9 +50,9 @@ class RewardSystem(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If `terms` is no sequence of reward terms, there is no term, a name is not allowed, a signal's size
-            is below 1 or differs between terms, or the parameters of a function are not named like its signals. At
-            evaluation, if a term is not one finite number, or the sum of the terms is not finite.
+        InputError: If `terms` is not a sequence of reward terms, there is no term, a name is not allowed, a signal's
+            size is below 1 or differs between terms, or the parameters of a function are not named like its signals.
+            At an evaluation, if a term is not one finite number, or the sum of the terms is not finite.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
@@ -60,8 +60,8 @@ class RewardSystem(LeafSystem):
         self._of_task = f" of {task_name}" if task_name else ""
         check_terms(terms, RewardTerm, f"a reward{self._of_task}")
         self._terms, names = tuple(terms), [term.name for term in terms]
-        are_words = all(isinstance(name, str) and name not in ("", "reward") for name in names)
-        if not names or not are_words or len(set(names)) < len(names):
+        are_allowed = all(isinstance(name, str) and name not in ("", "reward") for name in names)
+        if not names or not are_allowed or len(set(names)) < len(names):
             raise InputError(
                 f"a reward{self._of_task} needs terms of different names, neither empty nor 'reward', "
                 f"not {brief(names)}"
@@ -106,13 +106,13 @@ class RewardSystem(LeafSystem):
         return total
 
     def _value(self, term: RewardTerm, signals: Mapping[str, np.ndarray]) -> float:
-        # Copies: a function that changes its arguments must not change those of the next term.
+        # The arguments are copied, so that a function that changes them does not affect the next term.
         value = term.value(**{name: signals[name].copy() for name in term.inputs})
         array = np.asarray(value)
         if array.size != 1 or array.dtype.kind not in "fiub":
             raise InputError(f"reward term {term.name!r}{self._of_task} must be one number, and it is {brief(value)}")
         number = float(array.item())
-        # Without this error a learner would diverge only episodes later, far from the cause.
+        # Without this error, a learner would diverge many episodes after the cause.
         if not math.isfinite(number):
             raise InputError(f"reward term {term.name!r}{self._of_task} is not finite, but {number}")
         return number

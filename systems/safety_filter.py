@@ -1,4 +1,4 @@
-"""Safety filter that projects commanded positions out of keep-out boxes."""
+"""Safety filter that projects commanded positions out of keep-out boxes and into linear constraints."""
 
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
@@ -13,8 +13,8 @@ class SafetyFilter(LeafSystem):
 
         safe_pose = project(pose, desired_pose)
 
-    `KeepOut.project` moves a command out of boxes and into linear constraints. The measured pose is sampled at
-    control steps, so the command is constant between them.
+    `KeepOut.project` moves a command out of boxes and into linear constraints. The measured pose is sampled at control
+    steps, so that the command is constant during a control step.
 
     .. pydrake_system::
 
@@ -27,7 +27,7 @@ class SafetyFilter(LeafSystem):
         - intervention
 
     ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1 if a box changed the
-    command, and 0 if only the constraints did.
+    command. It is 0 if only the linear constraints changed the command.
 
     Args:
         keep_out: Boxes and constraints.

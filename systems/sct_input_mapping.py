@@ -18,9 +18,9 @@ class SctInputMapping(LeafSystem):
 
         H^im = displace_q(H, map_q(u))    (equations 2.19 and 2.20)
 
-    where H is ``pose`` and u is held for one period. Inputs are clipped to [−1, 1]. A NaN or infinite input, or a
-    ``state`` that is not the number of a state, results in a NaN pose, for which `ActiveConstraintProjector` repeats
-    its last safe command.
+    H is ``pose``, u is ``action`` clipped to [−1, 1] and constant for one period, and q is ``state``. If ``action`` is
+    not finite, or ``state`` is not the number of a state, the requested pose is NaN, and an `ActiveConstraintProjector`
+    repeats its last safe command.
 
     .. pydrake_system::
 
@@ -37,14 +37,14 @@ class SctInputMapping(LeafSystem):
 
     Args:
         template: Shared control template.
-        frames: Poses of the template's objects by name, in the frame that the poses at the ports refer to.
-        period: Time for which an input is held [s], positive.
+        frames: Poses of the template's object frames by name, in the reference frame of the poses at the ports.
+        period: Control period [s], positive.
 
     Raises:
         InputError: If the period is not positive, or a frame is missing or not finite.
 
     Attributes:
-        frames: Parameters with the poses of the template's object frames, which a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):

@@ -17,9 +17,10 @@ class SctStateMachine(LeafSystem):
 
         q → q' if d_q < threshold of the transition to q',  q' → q if d_q > threshold + hysteresis
 
-    The conditions are evaluated at every control step with the pose just before it; at most one transition is taken
-    (see `SharedControlTemplate.next_state`). A transition is postponed until a command can satisfy the active
-    constraints of the next state within one period. An episode begins in the state of the initial pose.
+    q is the state and d_q its transition distance. At every control step, the conditions are evaluated with the pose
+    just before the step, and at most one transition is taken (see `SharedControlTemplate.next_state`). A transition is
+    postponed until a command can satisfy the active constraints of the next state within one period. An episode begins
+    in the state of the initial pose (`SharedControlTemplate.state_at`).
 
     .. pydrake_system::
 
@@ -32,16 +33,16 @@ class SctStateMachine(LeafSystem):
         - transition_distance
         - progress
 
-    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the
-    measured pose. It replaces ``pose`` at initialization, when a commanded ``pose`` may not be initialized yet.
-    ``state`` is (1,), the number of the state, and has no direct feedthrough. ``transition_distance`` is (1,), d_q of
-    the current state q in meters or radians. ``progress`` is (1,), the progress in the whole task, accumulated over the
-    states. Its increase in a step is the decrease d_{t−1} − d_t of the transition distance (equation 3.2) times the
-    weight of the state.
+    ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the measured
+    pose. It replaces ``pose`` at initialization, because a commanded ``pose`` may not be initialized yet. ``state`` is
+    (1,), the number of the state, without direct feedthrough. ``transition_distance`` is (1,), d_q of the current state
+    in meters or radians. ``progress`` is (1,), the progress in the whole task, accumulated over the states. Its
+    increase in a step is the decrease d_{t−1} − d_t of the transition distance (equation 3.2) times the weight of the
+    state.
 
     Args:
         template: Shared control template.
-        frames: Poses of the template's objects by name, in the frame that the poses at the ports refer to.
+        frames: Poses of the template's object frames by name, in the reference frame of the poses at the ports.
         period: Control period [s], positive.
 
     Raises:
@@ -49,7 +50,7 @@ class SctStateMachine(LeafSystem):
             ``initial_pose`` is not finite.
 
     Attributes:
-        frames: Parameters with the poses of the template's object frames, which a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set.
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):

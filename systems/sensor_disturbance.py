@@ -6,10 +6,10 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 DRIFT_TIME = 10.0
-"""Time after which a drift has the given standard deviation [s]."""
+"""Time after which a drift has its specified standard deviation [s]."""
 
 
 class SensorDisturbance(LeafSystem):
@@ -17,10 +17,10 @@ class SensorDisturbance(LeafSystem):
 
         y = s ∘ u(t − k h) + b + C (x − x₀) + d + σ ∘ n,  n ~ N(0, 1), sampled once per period h
 
-    and then rounded to whole multiples of the resolution. The measurement u has the scale s, the bias b and the delay
-    k. C is the gradient of the error over the configuration x, and x₀ is the configuration at the initialization. The
-    drift d is a random walk. s, b, C, k and the seed of noise and drift are parameters of the context, which a reset
-    sets. An initialization restarts noise and drift, and fills the delay line with zeros.
+    The result is rounded to whole multiples of the resolution. u is the measurement, s the scale, k the delay, b the
+    bias, and d the drift, a random walk. C is the gradient of the error over the configuration x, and x₀ is the
+    configuration at initialization. s, b, C, k and the seed of noise and drift are parameters of the context, which a
+    reset sets. An initialization restarts noise and drift and fills the delay line with zeros.
 
     .. pydrake_system::
 
@@ -36,7 +36,7 @@ class SensorDisturbance(LeafSystem):
     Args:
         period: Period h of noise, drift and delay [s], positive.
         noise: Standard deviations σ, (n,), not negative.
-        delay: Largest delay and default of k [periods], at least 0. `set_delay` changes k to a value from 1 to `delay`.
+        delay: Default and largest value of k [periods], at least 0. `set_delay` changes k to a value from 1 to `delay`.
         drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
         resolution: Resolution of the output, (n,), not negative; 0, the default, disables rounding.
         configuration_size: Size m of the configuration; 0 if the error does not depend on a configuration.
@@ -58,19 +58,15 @@ class SensorDisturbance(LeafSystem):
         super().__init__()
         self._noise = as_numbers(noise, "noise")
         if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
-            raise InputError(f"a sensor's noise is a standard deviation for each of its numbers, not {noise}")
-        if not (is_whole(delay, 0) and is_whole(configuration_size, 0)):
-            raise InputError(
-                "a sensor's delay is a whole number of periods, and the size of its configuration a whole number, at "
-                f"least 0 each, not {delay} and {configuration_size}"
-            )
-        delay, configuration_size = int(delay), int(configuration_size)
+            raise InputError(f"a sensor's noise must be a vector of finite numbers, none negative, not {noise}")
+        delay = as_count(delay, "the delay of a sensor", 0)
+        configuration_size = as_count(configuration_size, "configuration_size", 0)
         size, self._delay = len(self._noise), delay
         self._drift = np.zeros(size) if drift is None else as_numbers(drift, "drift")
         self._resolution = np.zeros(size) if resolution is None else as_numbers(resolution, "resolution")
         for name, values in (("drift", self._drift), ("resolution", self._resolution)):
             if not _are_magnitudes(values, (size,)):
-                raise InputError(f"a sensor's {name} is a number from 0 for each of its numbers, not {values}")
+                raise InputError(f"a sensor's {name} must be {size} finite numbers, none negative, not {values}")
         self._has_noise, self._has_drift = bool(self._noise.any()), bool(self._drift.any())
         self._is_rounded = self._resolution > 0.0
         self._rounds_any, self._unit = bool(self._is_rounded.any()), np.where(self._is_rounded, self._resolution, 1.0)
@@ -102,15 +98,15 @@ class SensorDisturbance(LeafSystem):
     get_disturbed_measurement_output_port = output_getter("disturbed_measurement", "disturbed measurement, (n,)")
 
     def set_error(self, context: Context, scale: np.ndarray, bias: np.ndarray, seed: int) -> None:
-        """Set scale s (n,), bias b (n,) in the units of the sensor, and the seed of noise and drift, not negative.
+        """Set scale s (n,), bias b (n,) in the units of the sensor, and the seed of noise and drift.
 
         `context` is this system's.
 
         Raises:
             InputError: If the seed is not a whole number of at least 0.
         """
-        given = ((self._scale, scale), (self._bias, bias), (self._seed, declare.seed_parameter(seed)))
-        for index, values in given:
+        parameters = ((self._scale, scale), (self._bias, bias), (self._seed, declare.seed_parameter(seed)))
+        for index, values in parameters:
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
     def set_delay(self, context: Context, delay: int) -> None:
@@ -120,7 +116,7 @@ class SensorDisturbance(LeafSystem):
             InputError: If `delay` is not a whole number from 1 to the largest delay.
         """
         if not (is_whole(delay, 1) and delay <= self._delay):
-            raise InputError(f"the delay of this sensor is from 1 to {self._delay} periods, not {delay}")
+            raise InputError(f"this sensor's delay must be from 1 to {self._delay} periods, not {delay}")
         context.get_mutable_numeric_parameter(self._used_delay).SetAtIndex(0, float(delay))
 
     def set_gradient(self, context: Context, gradient: np.ndarray) -> None:
@@ -152,19 +148,18 @@ class SensorDisturbance(LeafSystem):
         if self._delay_line is None:
             measured = self._measurement_port.Eval(context)
         else:
-            skipped = self._delay - int(context.get_numeric_parameter(self._used_delay).value().item())
+            offset = self._delay - int(context.get_numeric_parameter(self._used_delay).value().item())
             size = len(self._noise)
-            measured = context.get_discrete_state().value(self._delay_line)[skipped * size :][:size]
+            measured = context.get_discrete_state().value(self._delay_line)[offset * size :][:size]
         scale, bias = (context.get_numeric_parameter(index).value() for index in (self._scale, self._bias))
         noise = self._noise * context.get_discrete_state().value(self._noise_sample)
         disturbed = scale * measured + bias + noise
         if self._has_drift:
             disturbed = disturbed + context.get_discrete_state().value(self._walk)
         if self._configuration_port is not None:
-            moved = self._configuration_port.Eval(context)
-            moved = moved - context.get_discrete_state().value(self._first_configuration)
+            first = context.get_discrete_state().value(self._first_configuration)
             gradient = context.get_numeric_parameter(self._gradient).value().reshape(len(noise), -1)
-            disturbed = disturbed + gradient @ moved
+            disturbed = disturbed + gradient @ (self._configuration_port.Eval(context) - first)
         if self._rounds_any:
             disturbed = np.where(self._is_rounded, np.round(disturbed / self._unit) * self._unit, disturbed)
         return disturbed

@@ -16,11 +16,11 @@ from guiderail.systems.support.drake_multibody import JointDynamics, check_plant
 
 
 class StatusWatchdog(LeafSystem):
-    """Check each status of a robot, output the last accepted one, and report faults (`StateEstimator`).
+    """Check each status message of a robot, output the last accepted status, and report faults (`StateEstimator`).
 
     If the clock input is connected, delays of this program are not attributed to the robot, and a delay that is too
-    long is reported as a separate fault. An initialization does not change the state, because it does not change the
-    robot either: without the estimated velocity, an arm in motion could not be damped.
+    long is reported as a separate fault. An initialization does not reset the state, because an arm in motion could not
+    be damped without the estimated velocity.
 
     .. pydrake_system::
 
@@ -38,14 +38,14 @@ class StatusWatchdog(LeafSystem):
 
     ``status`` is abstract: the newest `JointStatus`, or None. ``torque`` is (n,), the torques that are sent after this
     check [Nm]. ``clock`` is (1,), the wall-clock time of this check [s]; if it is not connected, checks are one period
-    apart. ``estimated_state`` is (2n,), positions and velocities [rad, rad/s], and ``external_torque`` is (n,) [Nm];
-    both are those of the last accepted status, with its velocities limited as described in `StateEstimator`, and zero
-    before the first. ``velocity`` is (n,), the velocity for damping [rad/s]: estimated from several sources, predicted
+    apart. ``estimated_state`` is (2n,), positions and velocities [rad, rad/s], and ``external_torque`` is (n,) [Nm].
+    Both are values of the last accepted status, and zero before the first; velocities are limited as described in
+    `StateEstimator`. ``velocity`` is (n,), the velocity for damping [rad/s]: estimated from several sources, predicted
     while no status is accepted, and zero where it is unknown. ``fault`` is (1,), a code of `Fault`. ``age`` is (1,),
     the age of the last accepted status relative to the earliest arrival [s]; infinite before the first.
 
     Args:
-        plant: Model of the arm and its payload alone, finalized; its inertia is used.
+        plant: Finalized model of only the arm and its payload; provides the inertia.
         limits: Plausibility limits of a status.
         torque_tolerance: Largest error of each joint's torque (n,) [Nm], positive.
         period: Period of the check, and of the status messages [s], positive.
@@ -93,7 +93,10 @@ class StatusWatchdog(LeafSystem):
     get_age_output_port = output_getter("age", "age of the accepted status, (1,) [s]")
 
     def forget_torque(self, context: Context) -> None:
-        """Treat the torques since the last check as unknown, as a command was not sent; `context` is this system's."""
+        """Treat the torques since the last check as unknown, because a command was not sent.
+
+        `context` is this system's.
+        """
         context.SetDiscreteState(self._state, self._estimator.forget_torque(self._state_of(context)).vector())
 
     def _state_of(self, context: Context) -> EstimatorState:
@@ -108,8 +111,8 @@ class StatusWatchdog(LeafSystem):
 
     def _evaluate(self, context: Context) -> Estimate:
         value, state, clock = self._status_port.Eval(context), self._state_of(context), self._clock(context)
-        # An unchanged clock input belongs to the previous check.
-        is_new_clock = np.isfinite(clock) and clock not in context.get_discrete_state().value(self._last_clock)
+        # If the clock input has not changed, its value belongs to the previous check.
+        is_new_clock = np.isfinite(clock) and clock != context.get_discrete_state().value(self._last_clock).item()
         now = clock if is_new_clock else state.check_time
         status = value if isinstance(value, JointStatus) else None
         M, drag = self._dynamics.evaluate(self._plant_context.Eval(context))

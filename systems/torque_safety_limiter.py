@@ -13,15 +13,15 @@ from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant
 
-# Indices into the discrete state: [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
+# Indices into the discrete state [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
 # last change to DAMPING or OFF in s; blend factor from 0 to 1].
 _ARM_STATE, _BLEND_FACTOR = 0, 3
 
-ZERO_TORQUE_TIME = 0.05  # after a stop, zero torque is sent at least this long, even during a status fault [s]
+ZERO_TORQUE_TIME = 0.05  # shortest time for which zero torque is sent after damping, even with a status fault [s]
 
 
 class ArmState(IntEnum):
-    """Lifecycle state of an arm: waiting for its status, taking over, running, coming to rest, without torque."""
+    """Lifecycle state of an arm: waiting for its status, ramping up, running, coming to rest, without torque."""
 
     WAITING = 0
     RAMPING = 1
@@ -32,7 +32,7 @@ class ArmState(IntEnum):
 
 @dataclass(frozen=True)
 class SafetyLimits:
-    """Limits of an arm, and the durations of its stop and start.
+    """Limits of an arm, and durations of its stop and its start.
 
     Args:
         velocity: Velocity limit of each joint (n,) [rad/s], positive.
@@ -40,7 +40,7 @@ class SafetyLimits:
         external_torque: Limit of the external torque of each joint (n,) [Nm], positive.
         force: Limit of the force on the tool [N], positive.
         lower, upper: Corners of the workspace of the tool center in the target frame (3,) [m], finite.
-        damping_time: Duration of damping in a stop, after which zero torque is sent [s], positive.
+        damping_time: Duration of damping in a stop, before zero torque is sent [s], positive.
         decay_time: Decay time of the joint velocities during damping [s], at least two periods.
         ramp_time: Time in which the blend factor increases to 1 [s], positive.
 
@@ -79,17 +79,20 @@ class TorqueSafetyLimiter(LeafSystem):
         τ = clip(a f τ_commanded + (1 − a) τ_damping)
 
     The blend factor a increases from 0 to 1 in the ramp time. The freshness f falls from 1 at a status age of one
-    period to 0 at two periods, because torques computed from an old state could accelerate the arm. τ_damping
-    (`damping_torque`) lets the velocity decay with the decay time, given the inertia at the last accepted positions.
-    The velocity is estimated from several sources, and predicted while no status is accepted.
+    period to 0 at two periods, because torques computed from an old state could accelerate the arm. With τ_damping
+    (`damping_torque`), the velocity decays with the decay time; the inertia is that of the last accepted positions. The
+    velocity is estimated from several sources, and predicted while no status is accepted.
 
     A limit violation or a fault of the status stops the arm at once. The fault is stored until `resume` is called. At
-    the start the limiter waits until no fault is present and then takes over without `resume`. An initialization while
-    the arm is controlled stops it with `Fault.INITIALIZED`, because a driver may repeat the last torque forever; it
-    does not end a stop. An earlier context must not be restored while the arm is controlled. The output is always
-    finite and within the torque limits; at zero torque the robot only compensates its weight. After damping, zero
-    torque is sent for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the driver can hold the arm
-    by itself (brakes, position control), ``is_holding`` requests this after a fault of `STATUS_FAULTS`.
+    the start, the limiter waits until no fault is present and then ramps up without `resume`. If an initialization
+    occurs while the arm is controlled, the arm is stopped with `Fault.INITIALIZED`, because a driver may repeat the
+    last torque forever. An initialization does not end a stop. An earlier context must not be restored while the arm is
+    controlled.
+
+    The output is always finite and within the torque limits. At zero torque, the robot only compensates its weight.
+    After damping, zero torque is sent for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the
+    driver can hold the arm by itself (brakes, position control), ``is_holding`` requests this after a fault of
+    `STATUS_FAULTS`.
 
     .. pydrake_system::
 
@@ -114,19 +117,20 @@ class TorqueSafetyLimiter(LeafSystem):
         - is_holding
         - not_following
 
-    ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,), ``external_torque`` (n,)
-    [Nm], joints in the order of the plant's positions. ``wrench`` is (6,), force first. ``pose`` and ``desired_pose``
-    are (6,); their positions are checked. ``status_fault`` and ``status_age``, (1,), and ``velocity``, (n,) [rad/s],
-    are outputs of a `StatusWatchdog`; an unknown code counts as `Fault.MALFORMED`. ``command_timed_out`` is (1,), the
-    output of a `CommandWatchdog`.
+    ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,) [rad, rad/s], and
+    ``external_torque`` is (n,) [Nm], with joints in the order of the plant's positions. ``wrench`` is (6,), force
+    first. ``pose`` and ``desired_pose`` are (6,); their positions are checked. ``status_fault`` (1,), ``status_age``
+    (1,) [s] and ``velocity`` (n,) [rad/s] are outputs of a `StatusWatchdog`; an unknown fault code counts as
+    `Fault.MALFORMED`. ``command_timed_out`` is (1,), from a `CommandWatchdog`.
 
-    ``fault`` is (1,), the code of the `Fault` that stopped the arm, otherwise that of a present fault, or 0.
-    ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is 1 while commands are
-    sent. ``is_holding`` (1,) is 1 while the driver has to hold the arm instead. ``not_following`` (1,) is 1 while the
-    desired pose is not followed: the arm is waiting, taking over or stopped, or no valid command is available.
+    ``fault`` is (1,). While the arm is stopped, it is the code of the `Fault` that stopped the arm, otherwise the code
+    of the present fault. ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is
+    1 while commands are sent. ``is_holding`` (1,) is 1 while the driver has to hold the arm instead. ``not_following``
+    (1,) is 1 while the desired pose is not followed: the arm is not in the state RUNNING, or no valid command is
+    available.
 
     Args:
-        plant: Model of the arm and its payload alone, finalized; its inertia is used.
+        plant: Finalized model of only the arm and its payload; provides the inertia.
         limits: Limits of measured and sent values.
         period: Period of the torque commands [s], positive.
         can_hold: True if the driver can hold the arm.
@@ -198,16 +202,16 @@ class TorqueSafetyLimiter(LeafSystem):
     get_not_following_output_port = output_getter("not_following", "flag that the desired pose is not followed, (1,)")
 
     def stop(self, context: Context, fault: Fault = Fault.USER_STOP) -> None:
-        """Stop the arm with a fault, unless it is stopped already; `context` is this system's."""
+        """Stop the arm with a fault unless the arm is already stopped; `context` is this system's."""
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state == ArmState.WAITING:
-            # No velocity has been accepted yet and no torque has been sent, so there is nothing to damp.
+            # Nothing to damp: no velocity has been accepted and no torque has been sent.
             context.SetDiscreteState(self._state, [ArmState.OFF, fault, np.inf, 0.0])
         elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
             context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
 
     def damp_again(self, context: Context) -> None:
-        """Begin damping again in a stop, after commands could not be sent; `context` is this system's."""
+        """Restart the damping of a stopped arm, after commands could not be sent; `context` is this system's."""
         arm_state, fault, _, _ = self._state_of(context)
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
             context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
@@ -220,7 +224,7 @@ class TorqueSafetyLimiter(LeafSystem):
         """
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state != ArmState.OFF:
-            raise InputError(f"only a stopped arm can resume, and this one is {ArmState(int(arm_state)).name.lower()}")
+            raise InputError(f"only a stopped arm can resume, and this arm is {ArmState(int(arm_state)).name.lower()}")
         fault = self._present_fault.Eval(context)
         if fault:
             raise InputError(f"the arm can't resume yet: {fault.description}")
@@ -230,10 +234,11 @@ class TorqueSafetyLimiter(LeafSystem):
         return context.get_discrete_state().value(self._state)
 
     def _find_fault(self, context: Context) -> Fault:
-        """Return the first fault that is present now; checks have the form `not value <= limit`, so that NaN fails."""
+        """Return the first fault that is present, or `Fault.NONE`."""
+        # All checks have the form `not value <= limit`, which is also a fault for NaN.
         limits, n = self._limits, self._num_joints
         code = self._status_fault_port.Eval(context)[0]
-        # An unknown code, such as NaN, is a fault as well.
+        # An unknown code, such as NaN, is also a fault.
         status_fault = next((fault for fault in Fault if fault == code), Fault.MALFORMED)
         if status_fault:
             return status_fault
@@ -297,7 +302,7 @@ class TorqueSafetyLimiter(LeafSystem):
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
 
     def _damping_torque(self, context: Context) -> np.ndarray:
-        """Return the torque (n,) [Nm] that damps the velocity; zero if velocity or posture is not finite."""
+        """Return the torque (n,) [Nm] that damps the velocity; zero if velocity or joint state is not finite."""
         velocity = self._velocity_port.Eval(context)
         if not np.isfinite(velocity).all() or not np.isfinite(self._estimated_state_port.Eval(context)).all():
             return np.zeros(self._num_joints)

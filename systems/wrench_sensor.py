@@ -17,13 +17,13 @@ from guiderail.systems.support.drake_multibody import check_bodies, check_plant
 
 
 class WrenchSensor(LeafSystem):
-    """Measure the wrench of the environment on a tool at its center of compliance, low-pass filtered.
+    """Measure the wrench of the environment on a tool at the center of compliance, low-pass filtered.
 
         F = M A + bias(V) − M [0, g] − F_wrist,  τ y' = F − y
 
-    F is the `external_wrench` on a tool with spatial inertia M, velocity V and acceleration A, where F_wrist is the
-    reaction of the wrist, a joint. The tool is the child of the wrist and the bodies welded to it. F is transformed to
-    the center of compliance P and expressed in axes that are fixed in the world. y is the output.
+    F is the `external_wrench` on a tool with spatial inertia M, velocity V and acceleration A. F_wrist is the reaction
+    of the wrist, a joint. The tool consists of the child body of the wrist and all bodies welded to it. F is
+    transformed to the center of compliance P and expressed in axes that are fixed in the world. y is the output.
 
     .. pydrake_system::
 
@@ -37,12 +37,12 @@ class WrenchSensor(LeafSystem):
         - wrench
 
     The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is a
-    discrete state without direct feedthrough: one sample old, and zero after an initialization.
+    discrete state without direct feedthrough, delayed by one sample, and zero after an initialization.
 
     Args:
         plant: Finalized plant, connected to this system.
-        wrist: Joint at which the reaction is measured; its child is the first body of `tool`.
-        tool: Bodies on the child side of the wrist: its child first, and all bodies welded to it.
+        wrist: Joint whose reaction is measured; its child is the first body of `tool`.
+        tool: Bodies on the child side of the wrist: the child of the wrist first, then all bodies welded to it.
         center: Center of compliance P, fixed to a body of `tool`.
         R_WAxes: Orientation in the world of the axes in which the wrench is expressed.
         period: Sampling period [s], positive; ideally the plant's time step.
@@ -50,7 +50,7 @@ class WrenchSensor(LeafSystem):
 
     Raises:
         InputError: If an argument is out of range, of another type or plant, the first body of `tool` is not the child
-            of the wrist, `center` is not fixed to a body of it, or a body that is welded to it is missing.
+            of the wrist, `center` is not fixed to a body of `tool`, or a body welded to the tool is missing in `tool`.
     """
 
     def __init__(
@@ -78,10 +78,10 @@ class WrenchSensor(LeafSystem):
         indices = {int(body.index()) for body in tool}
         if int(center.body().index()) not in indices:
             raise InputError(f"the center {center.name()} must be fixed to a body of a wrench sensor's tool")
-        missing = _welded_beyond(plant, wrist) - indices
+        missing = _tool_indices(plant, wrist) - indices
         if missing:
             names = ", ".join(plant.get_body(BodyIndex(index)).name() for index in sorted(missing))
-            raise InputError(f"a wrench sensor's tool has all bodies that are welded to it: add {names}")
+            raise InputError(f"a wrench sensor's tool must contain all bodies that are welded to it: add {names}")
         nominal = plant.CreateDefaultContext()
         self._wrist = int(wrist.index())
         self._tool = int(tool[0].index())
@@ -146,8 +146,8 @@ class WrenchSensor(LeafSystem):
         return (at_center[::-1] @ (self._R_AxesW @ R_WTool).T).ravel()
 
 
-def _welded_beyond(plant: MultibodyPlant, wrist: Joint) -> set[int]:
-    """Return the indices of the child of the wrist and of all bodies that are welded to it on its side."""
+def _tool_indices(plant: MultibodyPlant, wrist: Joint) -> set[int]:
+    """Return the indices of the child of the wrist and of all bodies welded to it, apart from the wrist itself."""
     joints = [plant.get_joint(index) for index in plant.GetJointIndices() if index != wrist.index()]
     welds = [
         {int(joint.parent_body().index()), int(joint.child_body().index())}
@@ -155,8 +155,8 @@ def _welded_beyond(plant: MultibodyPlant, wrist: Joint) -> set[int]:
         if isinstance(joint, WeldJoint)
     ]
     found = {int(wrist.child_body().index())}
-    while grown := set().union(*(weld for weld in welds if weld & found)) - found:
-        found |= grown
+    while added := set().union(*(weld for weld in welds if weld & found)) - found:
+        found |= added
     return found
 
 

@@ -3,21 +3,20 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_finite, is_whole
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
 
 class WrenchTare(LeafSystem):
-    """Subtract the mean of the first measurements, which are taken in free motion, from all later ones.
+    """Subtract the mean of the first measurements, which are taken in free motion, from all later measurements.
 
         y_k = 0 for k < s + n,  y_k = u_k − (1/n) Σ u_j over j = s … s + n − 1 afterwards
 
     k counts samples since the initialization. The first s samples are skipped, because filters settle during this time.
-    The next n finite samples are averaged; others are not counted. A contact force during these n samples would be
-    subtracted too.
+    The next n finite samples are averaged; samples that are not finite are not counted. A contact force during these n
+    samples would be subtracted as well.
 
     .. pydrake_system::
 
@@ -40,11 +39,8 @@ class WrenchTare(LeafSystem):
 
     def __init__(self, period: float, skipped: int, averaged: int):
         super().__init__()
-        if not (is_whole(skipped, 0) and is_whole(averaged, 1)):
-            raise InputError(
-                f"a tare skips a whole number of samples and averages at least one, not {skipped} and {averaged}"
-            )
-        self._skipped, self._averaged = skipped, averaged
+        self._skipped = as_count(skipped, "the number of skipped samples", 0)
+        self._averaged = as_count(averaged, "the number of averaged samples")
         self._count = self.DeclareDiscreteState(1)  # number k of samples so far
         self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # mean of the averaged samples so far
         self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)

@@ -127,9 +127,9 @@ def test_reset_forgets_the_limit_of_last_episode():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"limits": np.ones(8)}, "rows of 8"),
-        ({"limits": np.ones((0, 8))}, "rows of 8"),
-        ({"limits": np.ones((2, 6))}, "rows of 8"),
+        ({"limits": np.ones(8)}, "must have the shape"),
+        ({"limits": np.ones((0, 8))}, "must have the shape"),
+        ({"limits": np.ones((2, 6))}, "must have the shape"),
         ({"limits": np.full((2, 8), np.inf)}, "finite and not negative"),
         ({"limits": np.full((2, 8), np.nan)}, "finite and not negative"),
         ({"limits": np.full((2, 8), -1e-9)}, "finite and not negative"),

@@ -70,7 +70,7 @@ def test_a_system_of_another_size_is_refused():
     system = builder.AddSystem(PassThrough(3))
     builder.ExportInput(system.get_input_port(), "observation")
     builder.ExportOutput(system.get_output_port(), "action")
-    with pytest.raises(InputError, match="takes 1 numbers and returns 2, this one 3 and 3"):
+    with pytest.raises(InputError, match="an observation of size 1 and an action of size 2, not 3 and 3"):
         make_skill("NarrowPassage", builder.Build(), guidance="kgrl")
 
 

@@ -81,7 +81,7 @@ def test_blank_name_is_refused():
         ),
         (
             lambda known: FunctionGuidance(known, lambda action, pose, wrench: pose, action_size=1.5),
-            "guidance needs whole sizes of at least 1, not 1.5, 2 and 2$",
+            "action_size must be a whole number of at least 1, not 1.5$",
         ),
     ],
 )
