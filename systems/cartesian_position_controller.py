@@ -165,9 +165,7 @@ class CartesianPositionController(LeafSystem):
     def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = self._positions_port.Eval(context)
         if not np.isfinite(measured).all():
-            raise InputError(
-                f"the first joint command is the measured one, so measured positions must be finite, not {measured}"
-            )
+            raise InputError(f"the first joint command is measured: measured positions must be finite, not {measured}")
         discrete_state.set_value(self._command, measured)
         for flag in (self._is_stuck, self._has_timed_out):
             discrete_state.set_value(flag, [0.0])

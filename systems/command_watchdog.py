@@ -8,7 +8,7 @@ from guiderail.systems.support.last_valid_pose import LastValidPose
 
 
 class CommandWatchdog(LeafSystem):
-    """Output the desired pose while it is valid, otherwise the last valid one.
+    """Output the desired pose while it is valid, otherwise the last valid desired pose.
 
     This system is for robot controllers without a command timeout. A command is valid while it is finite, not older
     than the timeout, and not more than one period in the future; see `LastValidPose`. While the blend factor is zero,

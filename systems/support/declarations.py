@@ -248,7 +248,7 @@ def start_time(system: LeafSystem) -> DiscreteStateIndex:
 
 
 def has_started(context: Context, start: DiscreteStateIndex) -> bool:
-    """Return True after the time of initialization, which the discrete state `start` contains (`start_time`).
+    """Return True after the time of the last initialization; `start` is the system's `start_time`.
 
     Drake also triggers periodic events at the time of initialization, when no step has ended yet. An event offset of
     one period cannot avoid this: period + k * period differs from (k + 1) * period in the last bit for about a quarter
@@ -275,8 +275,8 @@ def update_after_start(
     """Declare an `update` that is omitted at the time of initialization, when no step has ended.
 
     Returns:
-        Discrete state of the `start_time`. Because of this further group of discrete state, all groups of the system
-        are accessed by their indices.
+        Discrete state of the `start_time`. It is a further group of the discrete state, so that a system with another
+        group must access the groups by their indices.
 
     Raises:
         InputError: If the period is not positive and finite.

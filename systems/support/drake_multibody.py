@@ -45,12 +45,12 @@ def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Fra
     if not isinstance(plant, MultibodyPlant):
         raise InputError(f"a plant is a MultibodyPlant, not {brief(plant)}")
     if not plant.is_finalized():
-        raise InputError("a plant must be finalized before it is given to a system: call Finalize()")
+        raise InputError("the plant of a system must be finalized: call Finalize() first")
     for name, frame in frames.items():
         if not isinstance(frame, Frame):
             raise InputError(f"{name} is a frame of the plant, such as body.body_frame(), not {brief(frame)}")
         if frame.GetParentPlant() is not plant:
-            raise InputError(f"{name} is the frame {frame.name()} of another plant: give a frame of this one")
+            raise InputError(f"{name} is the frame {frame.name()} of another plant: give a frame of this plant")
     if fixed is not None and fixed.body() not in plant.GetBodiesWeldedTo(plant.world_body()):
         raise InputError(f"the target frame {fixed.name()} can move: give a frame that is fixed in the world")
 
@@ -68,7 +68,7 @@ def check_bodies(plant: MultibodyPlant, what: str, bodies: Sequence[RigidBody]) 
         if not isinstance(body, RigidBody):
             raise InputError(f"{what} has bodies of the plant, as plant.GetBodyByName returns, not {brief(body)}")
         if body.GetParentPlant() is not plant:
-            raise InputError(f"{what} has the body {body.name()} of another plant: give a body of this one")
+            raise InputError(f"{what} has the body {body.name()} of another plant: give a body of this plant")
 
 
 def effort_limits(plant: MultibodyPlant) -> np.ndarray:

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 
 _TIME_TOLERANCE = 1e-6  # tolerance of time stamps [s]: far above rounding errors after days, far below any period
-_MAX_COORDINATE = 1e6  # largest coordinate of a command [m, rad]; with larger ones a wrench could overflow
+_MAX_COORDINATE = 1e6  # largest coordinate of a command [m, rad], above which a wrench could overflow
 
 
 class CommandValidity:
@@ -53,7 +53,7 @@ class CommandValidity:
 
 
 class LastValidPose:
-    """Desired pose to follow: the present command while it is valid, otherwise the last valid one.
+    """Desired pose to follow: the present command while it is valid, otherwise the last valid command.
 
     The last valid pose and the time of the last check are discrete states, which a periodic event updates. The age of a
     command refers to the last check instead of the present time, so that outputs are computed again only when the

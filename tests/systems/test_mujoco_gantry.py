@@ -106,8 +106,8 @@ def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
 @pytest.mark.parametrize(
     ("factors", "words"),
     [
-        *(((wrong, 1.0), "friction is finite and not negative") for wrong in (-0.1, np.nan, np.inf)),
-        *(((1.0, wrong), "stiffness is finite and positive") for wrong in (0.0, -1.0, np.nan, np.inf)),
+        *(((wrong, 1.0), "friction must be finite and not negative") for wrong in (-0.1, np.nan, np.inf)),
+        *(((1.0, wrong), "stiffness must be finite and positive") for wrong in (0.0, -1.0, np.nan, np.inf)),
     ],
 )
 def test_factor_of_the_contact_is_refused_out_of_range(station, factors, words):

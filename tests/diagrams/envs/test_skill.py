@@ -77,7 +77,7 @@ def test_a_system_of_another_size_is_refused():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (PassThrough(3), "has an input 'observation' and an output 'action', unlike PassThrough"),
+        (PassThrough(3), "needs an input 'observation' and an output 'action', unlike PassThrough"),
         (3, "a policy is a function from an observation to an action, not 3"),
     ],
 )
