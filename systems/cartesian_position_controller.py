@@ -76,7 +76,7 @@ class CartesianPositionController(LeafSystem):
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
     (n,) [rad]. ``pose`` is (6,), the pose of the tool center at the joint command. ``stuck`` (1,) is 1 if the tool
     could not move in the desired direction at the last valid command. ``command_timed_out`` (1,) is 1 while no valid
-    command is available. All outputs are state without direct feedthrough.
+    command is available. All outputs depend only on state, without direct feedthrough.
 
     Args:
         plant: Finalized model of only the arm, with at least six joints; provides kinematics and joint limits.

@@ -32,7 +32,8 @@ class PoseMotionLimiter(LeafSystem):
 
     A desired pose that is not finite, or that is rotated by 0.9 π or more from the start, is ignored: the output comes
     to rest at the last valid desired pose. If the desired pose is too far away for the computation of a trajectory,
-    such as 10 km, the motion is braked to rest. If the measured pose is not finite, the last output is repeated.
+    such as 10 km, the motion is braked to rest. If the measured pose is not finite while the blend factor is zero, the
+    last output is repeated.
 
     .. pydrake_system::
 

@@ -16,8 +16,9 @@ class PoseRateLimiter(LeafSystem):
     While the blend factor is zero or NaN, the output is the measured pose. While the factor is positive, the output
     moves from there, or from the pose measured at initialization, towards the desired pose. In each period, the
     position moves along a straight line by at most speed times period, and each angle changes separately in the shorter
-    direction. If the desired pose can be reached within the speed limits, it is output unchanged. If the desired pose
-    or the measured pose is not finite, the last output is repeated.
+    direction. If the desired pose can be reached within the speed limits, it is output unchanged. If the measured pose
+    is not finite while the factor is zero, or the desired pose while the factor is positive, the last output is
+    repeated.
 
     .. pydrake_system::
 

@@ -235,7 +235,7 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def _find_fault(self, context: Context) -> Fault:
         """Return the first fault that is present, or `Fault.NONE`."""
-        # All checks have the form `not value <= limit`, which is also a fault for NaN.
+        # The limit checks have the form `not value <= limit`, so that NaN is also a fault.
         limits, n = self._limits, self._num_joints
         code = self._status_fault_port.Eval(context)[0]
         # An unknown code, such as NaN, is also a fault.
