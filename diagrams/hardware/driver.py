@@ -1,4 +1,4 @@
-"""Interface to the program that drives a robot: joint states in, joint torques out, without message types."""
+"""Interface of robot drivers: joint states as input and joint torques as output, independent of message types."""
 
 from __future__ import annotations
 
@@ -27,21 +27,12 @@ from guiderail.systems.torque_safety_limiter import SafetyLimits
 STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers [s], 5 ms; a control period is an exact multiple
 POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 
-# Limits of the commanded and the external torque as shares of the driver's reflex limits, and of the joint velocity as
-# a share of its maximum.
+# Limits of the commanded and the external torque as shares of the driver's reflex limits, and limit of the joint
+# velocity as a share of its maximum.
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 TORQUE_TOLERANCE_SHARE = 0.02  # largest error of a joint torque by friction, gravity and sensor, relative to its limit
 
 MAX_DIFFERENCE = 0.02  # largest difference of an entry of a flange's pose from that of the driver's robot [m, 1]
-
-# What a driver must give as each of its attributes, for messages.
-NEEDED = {
-    "name": "a text",
-    "torque_reflex_limits": "a positive number of each joint [Nm]",
-    "has_command_timeout": "True or False",
-    "period": "a positive time [s]",
-    "hold_off": "a time that is not negative [s]",
-}
 
 CommandCallback = Callable[[np.ndarray, float], None]
 
@@ -59,23 +50,23 @@ class Driver(ABC):
     """Connection to the program that drives a robot with joint torque control.
 
     A driver of another robot or transport implements `read` and `write` and is registered with `register_driver`. If
-    the robot's program repeats the last torque when commands stop, a `SafetyMonitor` is needed, and the driver
-    implements `add_listener`, `read_heartbeats` and `write_heartbeat` as well. A driver of a robot that brakes or holds
-    its position by itself sets `can_hold` and implements `hold`.
+    the robot's program repeats the last torque when commands stop, a `SafetyMonitor` is needed, and the driver also
+    implements `add_listener`, `read_heartbeats` and `write_heartbeat`. If the robot can brake or hold its position by
+    itself, the driver sets `can_hold` and implements `hold`.
 
     Attributes:
         url: Address that the connection was opened with; empty for the default.
-        num_statuses: Number of different statuses received. A repeated one counts once, but a malformed one without a
-            time counts each time, because the robot answers.
-        num_foreign_commands: Number of commands received by the robot from other programs, without those of a safety
+        num_statuses: Number of different statuses received. A repeated status counts once. A malformed status without a
+            time counts whenever it is received, because it shows that the robot answers.
+        num_foreign_commands: Number of commands of other programs to the robot, without the commands of a safety
             monitor that stops the arm.
     """
 
     name: ClassVar[str]  # prefix of the joint ports of a hardware station, as in Drake's own stations
-    # Name of the registered robot that the driver moves; the robot of a station needs its joints and kinematics. Empty
-    # for a driver of any robot with as many joints as `torque_reflex_limits`.
+    # Name of the registered robot that the driver moves; the robot of a station must have the same joints and
+    # kinematics. Empty for a driver of any robot with as many joints as `torque_reflex_limits`.
     robot: ClassVar[str] = ""
-    # External torques at which the driver stops by itself under torque control, (n,) [Nm].
+    # External torques at which the robot stops by itself under torque control, (n,) [Nm].
     torque_reflex_limits: ClassVar[tuple[float, ...]]
     has_command_timeout: ClassVar[bool]  # True if the driver brings the arm to rest when commands stop
     # True if `hold` is implemented: the driver then holds the arm without status or torques.
@@ -106,7 +97,7 @@ class Driver(ABC):
         """Brake the arm or hold its position, until torques are written again.
 
         Raises:
-            InputError: If the driver cannot; see `can_hold`.
+            InputError: If the driver cannot hold the arm; see `can_hold`.
         """
         raise InputError(f"the driver {self.name} can't hold the arm by itself")
 
@@ -213,7 +204,7 @@ DRIVERS: Registry[type[Driver]] = Registry(
     entry_points="guiderail.drivers",
     check=lambda name, driver: check_class(name, driver, Driver),
 )
-"""Driver classes by name: that of a robot for its default driver, otherwise that of an interface, such as "fci"."""
+"""Driver classes by name: name of a robot for its default driver, otherwise name of an interface, such as "fci"."""
 
 register_driver = DRIVERS.register
 
@@ -234,7 +225,7 @@ def find_driver(robot: Robot | str) -> type[Driver]:
 
 
 def open_driver(driver: Robot | str, url: str) -> Driver:
-    """Return a connection by the default driver of a robot, or by the driver with a name.
+    """Return a connection at `url` by the default driver of a robot, or by the driver with a name.
 
     Raises:
         InputError: If there is no such driver, it cannot be opened at `url`, or it is incomplete (`check_driver`).
@@ -245,8 +236,8 @@ def open_driver(driver: Robot | str, url: str) -> Driver:
     except InputError:
         raise
     except ERRORS as error:
-        words = " ".join(str(error).split())
-        raise InputError(f"the driver {name} can't be opened: {type(error).__name__}: {words}") from error
+        message = " ".join(str(error).split())
+        raise InputError(f"the driver {name} can't be opened: {type(error).__name__}: {message}") from error
     if not isinstance(opened, Driver):
         raise InputError(f"the driver {name} is no Driver: register a class that is derived from Driver")
     check_driver(opened)
@@ -260,16 +251,16 @@ def check_driver(driver: Driver) -> None:
         InputError: If an attribute is missing, has another type, or a limit or time is out of range.
     """
     limits = getattr(driver, "torque_reflex_limits", None)
-    needed = {
-        "name": isinstance(getattr(driver, "name", None), str) and bool(driver.name),
-        "torque_reflex_limits": isinstance(limits, Sequence) and bool(limits) and all(map(_is_positive, limits)),
-        "has_command_timeout": isinstance(getattr(driver, "has_command_timeout", None), bool),
-        "period": _is_positive(driver.period),
-        "hold_off": driver.hold_off == 0.0 or _is_positive(driver.hold_off),
-    }
-    for attribute, is_given in needed.items():
-        if not is_given:
-            raise InputError(f"the driver {type(driver).__name__} needs {NEEDED[attribute]} as its {attribute}")
+    has_limits = isinstance(limits, Sequence) and bool(limits) and all(map(_is_positive, limits))
+    for attribute, is_valid, description in (
+        ("name", isinstance(getattr(driver, "name", None), str) and bool(driver.name), "a text"),
+        ("torque_reflex_limits", has_limits, "a positive number of each joint [Nm]"),
+        ("has_command_timeout", isinstance(getattr(driver, "has_command_timeout", None), bool), "True or False"),
+        ("period", _is_positive(driver.period), "a positive time [s]"),
+        ("hold_off", driver.hold_off == 0.0 or _is_positive(driver.hold_off), "a time that is not negative [s]"),
+    ):
+        if not is_valid:
+            raise InputError(f"the driver {type(driver).__name__} needs {description} as its {attribute}")
     if not hasattr(driver, "num_statuses"):
         raise InputError(f"the driver {type(driver).__name__} must call super().__init__(url) in its constructor")
 
@@ -281,8 +272,8 @@ def _is_positive(value: object) -> bool:
 def check_robot(driver: Driver, robot: Robot) -> None:
     """Check that a robot has the joints and the kinematics of the robot that a driver moves.
 
-    Joints are compared by the motion of the flange in the base frame, with each joint turned alone. A `PoseDriver`
-    commands poses relative to flange and base, so for it the flange's pose in the world is compared as well.
+    Joints are compared by the motion of the flange in the base frame when a single joint is turned. A `PoseDriver`
+    commands poses relative to flange and base, so the flange's pose in the world is then compared as well.
 
     Raises:
         InputError: If they differ, or there is no registered robot `Driver.robot`.
@@ -307,7 +298,7 @@ def check_robot(driver: Driver, robot: Robot) -> None:
 
 
 def _calc_motions(robot: Robot) -> tuple[RigidTransform, list[RigidTransform]]:
-    """Return the flange's pose in the world at zero, and its motion in the base frame for each joint alone at 1 rad."""
+    """Return the flange's pose in the world at zero positions, and its motion in the base frame by 1 rad per joint."""
     plant = MultibodyPlant(0.0)
     mounted = add_robot(plant, robot)
     plant.Finalize()

@@ -18,12 +18,12 @@ ERRORS = (Exception, SystemExit)  # exceptions of a driver that must not end the
 
 
 class DriverGuard:
-    """Calls the methods of a driver while an arm is controlled, and raises no exception of theirs.
+    """Calls the methods of a driver while an arm is controlled, and catches their exceptions.
 
-    If the driver raises while a status is received, or returns no valid status object, the status counts as
-    malformed. If it raises while a command is sent, `take_failure` returns True once, and the command of the next step
-    is tried as usual; `take_recovery` returns True once after that has succeeded. All stations on a driver share one
-    guard, `Driver.guard`.
+    If the driver raises an exception while a status is received, or returns no valid status object, the status counts
+    as malformed. If it raises an exception while a command is sent, `take_failure` returns True once. The command of
+    the next step is sent as usual; once a command has succeeded, `take_recovery` returns True once. All stations on a
+    driver share one guard, `Driver.guard`.
 
     Attributes:
         read_error: Newest exception of receiving or reading, in words; empty if there was none.
@@ -40,7 +40,8 @@ class DriverGuard:
         """Clear the errors, before the driver is used again."""
         self.read_error = self.command_error = ""
         self._has_failed_to_receive = self._has_failed_command = False
-        self._is_failing = self._has_recovered = False  # the last command failed; the first one after it succeeded
+        self._is_failing = False  # the last command failed
+        self._has_recovered = False  # a command succeeded after a failed one
 
     @property
     def error(self) -> str:
@@ -78,7 +79,10 @@ class DriverGuard:
         return status
 
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
-        """Return the heartbeats; none, and the next status is malformed, after an exception or with other objects."""
+        """Return the heartbeats.
+
+        After an exception, or if the driver returns other objects, there are none, and the next status is malformed.
+        """
         try:
             heartbeats = tuple(self._driver.read_heartbeats())
             if not all(isinstance(heartbeat, Heartbeat) for heartbeat in heartbeats):
@@ -89,15 +93,15 @@ class DriverGuard:
         return heartbeats
 
     def configure(self, impedance: RobotImpedance) -> None:
-        """Call `PoseDriver.configure`, as a command."""
+        """Call `PoseDriver.configure`; an exception counts as a failed command."""
         self._command("configure", impedance)
 
     def write(self, torque: np.ndarray, time: float) -> bool:
-        """Send torques (n,) [Nm] of a time [s]; return False if the driver raises an exception."""
+        """Send torques (n,) [Nm] with their time [s]; return False if the driver raises an exception."""
         return self._command("write", torque, time)
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
-        """Send the desired pose of a time [s]."""
+        """Send a desired pose with its time [s]."""
         self._command("write_pose", X_BaseTool, time)
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
@@ -109,15 +113,15 @@ class DriverGuard:
         self._command("stop")
 
     def hold(self) -> bool:
-        """Return True if the driver holds the arm; False after an exception, so that torques are sent instead."""
+        """Hold the arm; return False if the driver raises an exception, so that torques are sent instead."""
         has_failed = self._has_failed_command, self._is_failing
         if self._command("hold"):
             return True
-        self._has_failed_command, self._is_failing = has_failed  # the torques decide
+        self._has_failed_command, self._is_failing = has_failed  # only failed torques count
         return False
 
     def recover(self) -> None:
-        """Clear an error of the robot; the arm is at rest.
+        """Clear an error of the robot while the arm is at rest.
 
         Raises:
             InputError: If the error persists, or the driver raises another exception.
@@ -149,7 +153,7 @@ class DriverGuard:
         return has_recovered
 
     def check_readable(self) -> None:
-        """Raise an `InputError` if receiving or reading raised an exception; for an arm that does not move yet."""
+        """Raise an `InputError` if receiving or reading raised an exception; call it before the arm moves."""
         if self.read_error:
             raise InputError(f"no status can be read from the driver {self._driver.name}: {self.read_error}")
 

@@ -1,8 +1,8 @@
 """Driver for the Franka Control Interface: sends desired poses to a compiled Cartesian impedance loop at 1 kHz.
 
-The client is franky 2 (MIT license). It runs libfranka's loop in a thread without the GIL, has a Cartesian impedance
-that follows references of any rate with bounded errors, forces and torque rates, and ends a torque motion by damping.
-With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
+The client is franky 2 (MIT license). It runs libfranka's loop in a thread without the GIL. Its Cartesian impedance
+controller accepts references at any rate, and bounds errors, forces and torque rates. It ends a torque motion by
+damping. With pylibfranka, Franka's own binding, the 1 kHz loop would run in Python.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class FciDriver(PoseDriver):
         """Return the newest status, malformed after a reflex or a lost connection; None before the robot answers."""
         franky = self._franky
         if self._is_lost:
-            return MALFORMED_STATUS  # each further call of the client would wait for a second
+            return MALFORMED_STATUS  # each further call of the client would block for a second
         if self._robot is None:
             try:
                 self._robot = franky.Robot(self.url, realtime_config=franky.RealtimeConfig.Ignore)
@@ -221,7 +221,7 @@ class FciDriver(PoseDriver):
             try:
                 self._robot.move(self._franky.TorqueStopMotion(max_duration=STOP_TIME), asynchronous=True)
             except (self._franky.Exception, RuntimeError) as error:
-                # The motion has ended by a reflex, or the connection is lost.
+                # A reflex has ended the motion, or the connection is lost.
                 logger.warning("the robot at %s brakes by itself: %s", self.url, error)
 
     def recover(self) -> None:
@@ -245,7 +245,7 @@ class FciDriver(PoseDriver):
             raise InputError(f"the robot at {self.url} cannot recover: {self.error or 'the connection is lost'}")
 
     def _check_connected(self) -> None:
-        """Raise an `InputError` before `read` has connected to the robot."""
+        """Raise an `InputError` if `read` has not connected to the robot yet."""
         if self._robot is None and not self._is_lost:
             raise InputError("the driver fci is used before it has read a status")
 

@@ -1,4 +1,4 @@
-"""Lockstep of a hardware station with a simulated Franka: each waits for the other, however slow the machine is.
+"""Lockstep of a hardware station and a simulated Franka: each process waits for the other, on a machine of any speed.
 
 libfranka's protocol has no message that makes a robot wait. The simulated robot therefore listens on `LOCKSTEP_PORT`
 for requests, one JSON object a line, and answers each with its time [s]. ``{"advance": h}`` is answered when the
@@ -67,7 +67,7 @@ class FciLockstepClock(Clock):
 
     def _request(self, message: dict[str, Any]) -> float | None:
         """Return the robot's time after a request [s], or None if it does not answer."""
-        # Wait for the full timeout only once if the robot is silent, not in every step.
+        # If the robot is silent, wait for the full timeout only once, not in every step.
         timeout = self._period if self._has_timed_out else self._timeout
         try:
             if self._socket is None:

@@ -50,7 +50,7 @@ class ReflexDetector:
         external_torque: np.ndarray,
         external_wrench: np.ndarray,
     ) -> Reflex | None:
-        """Return the reason of a reflex in this millisecond, or None; of several reasons, the one checked first counts.
+        """Return the reason of a reflex in this millisecond, or None; of several reasons, return the first one checked.
 
         Args:
             command: Commanded torque without gravity (7,) [Nm].

@@ -43,7 +43,7 @@ STEP = 0.001  # period of the protocol [s]
 # Steps of the engine in a period. With one step, a contact with a time constant of 2 ms lasts a single step: the tool
 # bounces from it every 5 ms, and joint velocities jump by 0.07 rad/s.
 SUBSTEPS = 4
-# Rate of the robot's clock relative to the wall clock, in lockstep without a motion, between the station's requests.
+# Rate of the robot's clock relative to the wall clock between the station's requests, in lockstep without a motion.
 IDLE_RATE = 0.1
 REPEAT_INTERVAL = 0.2  # wall clock time after which the state of a waiting robot is sent again [s]
 RESIDUAL_FRICTION = 0.1  # friction of a joint [Nm]; libfranka's torques are "without gravity and friction"
@@ -79,7 +79,7 @@ class SimulatedFranka(FrankaMujocoRobot):
         super()._post_step()
 
     def detect_reflex(self, detector: ReflexDetector, command: np.ndarray) -> Reflex | None:
-        """Return the reason of a reflex for a commanded torque (7,) [Nm], or None."""
+        """Return the reason why a commanded torque (7,) [Nm] causes a reflex, or None."""
         model, data = self._model, self._data
         assert model is not None
         assert data is not None
@@ -96,7 +96,7 @@ class SimulatedFranka(FrankaMujocoRobot):
     def state(self) -> Any:
         """State message, with the external torque of the arm on its surroundings."""
         state = super().state
-        # The tool replaces the hand, whose mass the simulator reports.
+        # The tool replaces the hand, but the simulator reports the hand's mass.
         return state.replace(tau_ext_hat_filtered=tuple(-self._external), m_ee=0.0)
 
 
@@ -150,7 +150,7 @@ class WorkcellSimulator(MujocoSimulator):
         body = ET.SubElement(last, "body", name="payload", pos=f"0 0 {FLANGE_HEIGHT}")
         attributes = {"pos": payload.get_com(), "mass": [payload.get_mass()], "fullinertia": values}
         ET.SubElement(body, "inertial", {name: " ".join(map(str, value)) for name, value in attributes.items()})
-        # The tool replaces the hand, which stays in the model for the simulator's gripper but does not collide.
+        # The tool replaces the hand. The hand stays in the model for the simulator's gripper, but does not collide.
         for body in last.iter("body"):
             if body.get("name", "").startswith((ROBOT + "hand", ROBOT + "left", ROBOT + "right")):
                 for geometry in body.findall("geom"):
@@ -168,7 +168,7 @@ class WorkcellSimulator(MujocoSimulator):
             self._arm.add_contact()
 
     def move_parts(self, X_TTactual: RigidTransform, X_PWorkpiece: RigidTransform) -> None:
-        """Place the actual target frame in the nominal one, and the workpiece relative to the tool center."""
+        """Place the actual target frame in the nominal target frame, and the workpiece relative to the tool center."""
         workcell = self._workcell
         X_WFixture = workcell.X_WT @ X_TTactual @ workcell.X_FT.inverse()
         for name, X in ((FIXTURE, X_WFixture), (WORKPIECE, self._X_LinkTool @ X_PWorkpiece)):
@@ -208,7 +208,7 @@ class _RobotServer(FrankaRobotServer):
 
     @property
     def is_waiting(self) -> bool:
-        """True if the client has not answered the last state yet."""
+        """True if the client has not answered the last state of its motion yet."""
         return self.is_controlled and self._answered < self._FrankaServer__message_id - 1
 
     @property
@@ -233,7 +233,7 @@ class _RobotServer(FrankaRobotServer):
         super().start_motion(controller_mode, motion_generator_mode, motion_id)
 
     def check_reflexes(self) -> Reflex | None:
-        """Abort the motion if there is a reason for a reflex; return the reason, or None."""
+        """Abort the motion by a reflex if there is a reason; return the reason, or None."""
         if not self.is_controlled:
             return None
         reflex, motion = self.robot.detect_reflex(self.detector, self._command), self.current_motion_id
@@ -249,9 +249,9 @@ class _RobotServer(FrankaRobotServer):
         self._FrankaServer__message_id -= 1
         self.send_state()
 
-    def wait(self, other: socket.socket, timeout: float) -> None:
-        """Wait until the client or the socket `other` has sent something, for at most `timeout` [s]."""
-        sockets = (self._tcp_socket or self._FrankaServer__server_socket, self._FrankaServer__udp_socket, other)
+    def wait(self, lockstep: socket.socket, timeout: float) -> None:
+        """Wait for a message of the client or on the socket `lockstep`, at most `timeout` [s]."""
+        sockets = (self._tcp_socket or self._FrankaServer__server_socket, self._FrankaServer__udp_socket, lockstep)
         select.select([one for one in sockets if one is not None], [], [], timeout)
 
     def _handle_udp_command(self, command_data: bytes) -> None:

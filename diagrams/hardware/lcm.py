@@ -28,15 +28,15 @@ MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
 HEARTBEAT_FORMAT = struct.Struct(">q?q")
-# A safety monitor has ended if more than this number of heartbeats of others arrived after its last one. `MAX_SENDERS`
-# monitors send this number of heartbeats in `FORGET_TIME`.
+# A safety monitor counts as ended if more than this number of other monitors' heartbeats arrived after its own last
+# heartbeat. `MAX_SENDERS` monitors send this number of heartbeats in `FORGET_TIME`.
 MAX_HEARTBEATS_MISSED = MAX_SENDERS * round(FORGET_TIME / STATUS_PERIOD)
 
 
 def open_bus(url: str) -> DrakeLcm:
     """Open the LCM bus at `url`, LCM's default if empty.
 
-    `DrakeLcm` accepts any URL; messages to an unusable one are lost without an error.
+    `DrakeLcm` accepts any URL; messages to an unusable URL are lost without an error.
 
     Raises:
         InputError: If the URL is unusable.
@@ -87,7 +87,7 @@ class MessageCounter:
 
     Attributes:
         count: Number of messages that differ from their predecessor in type or time.
-        repeats: Number of the other messages.
+        repeats: Number of messages that equal their predecessor in type and time.
         head: Type and time of the newest message, which identify it.
     """
 
@@ -147,8 +147,8 @@ class LcmDriver(Driver):
     def heartbeat_channel(cls, number: int = 0) -> str:
         """Return a channel of a safety monitor's heartbeats; `number` is less than `MAX_SENDERS`.
 
-        On UDP, `DrakeLcm` keeps one unread message of a channel and drops later ones. Each monitor has a channel of its
-        own, so that the heartbeats of one do not displace those of another.
+        On UDP, `DrakeLcm` keeps one unread message of a channel and drops later messages. Each monitor therefore has
+        its own channel, so that its heartbeats do not displace another monitor's heartbeats.
         """
         return cls.command_channel + ("_MONITOR" if number == 0 else f"_MONITOR_{number}")
 
@@ -209,16 +209,16 @@ class LcmDriver(Driver):
     def read_heartbeats(self) -> tuple[Heartbeat, ...]:
         """Return the newest heartbeat of each safety monitor, at most `MAX_SENDERS`.
 
-        A monitor is left out after others have sent more than `MAX_HEARTBEATS_MISSED` heartbeats since its last one.
+        A monitor is left out if more than `MAX_HEARTBEATS_MISSED` heartbeats of other monitors followed its last one.
         """
         return tuple(heartbeat for heartbeat, *_ in self._heartbeats.values())
 
     def write_heartbeat(self, heartbeat: Heartbeat) -> None:
         """Send a heartbeat of the safety monitor, if possible on a channel that no other monitor uses."""
-        taken = {number for other, number, _ in self._heartbeats.values() if other.sender != heartbeat.sender}
-        if self._number in taken:
-            # Two monitors that see each other choose at random, because the same choice would collide again.
-            self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - taken) or [self._number])
+        used = {number for newest, number, _ in self._heartbeats.values() if newest.sender != heartbeat.sender}
+        if self._number in used:
+            # Two monitors on one channel both change it: with a fixed rule they would choose the same channel again.
+            self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - used) or [self._number])
         message = HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping, heartbeat.sender)
         self.lcm.Publish(self.heartbeat_channel(self._number), message)
 
@@ -236,7 +236,7 @@ class LcmDriver(Driver):
     def _on_command(self, message: bytes) -> None:
         if message in self._written:
             return
-        # The commands of a safety monitor are not foreign. It sends its heartbeat before them.
+        # The commands of a safety monitor are not foreign. The monitor sends its heartbeat before them.
         if not any(heartbeat.is_stopping for heartbeat in self.read_heartbeats()):
             self.num_foreign_commands += 1
             self._num_contested += bool(self._written)
@@ -259,7 +259,7 @@ class LcmDriver(Driver):
                 self._heartbeats.pop(next(iter(self._heartbeats)))
 
     def _num_missed(self) -> int:
-        """Return the number of heartbeats that arrived after the last one of the longest silent monitor."""
+        """Return the number of heartbeats that followed the last heartbeat of the longest silent monitor."""
         return self._num_heartbeats - next(iter(self._heartbeats.values()))[2]
 
 
@@ -290,7 +290,7 @@ class IiwaDriver(LcmDriver):
 class PandaDriver(LcmDriver):
     """Drake's driver of a Franka Emika Panda, in torque mode.
 
-    Franka's external torque is that of the arm on the surroundings. Reflex limits are those of libfranka's examples.
+    Franka's external torque is the torque of the arm on the surroundings. Reflex limits are from libfranka's examples.
     """
 
     name = robot = "panda"

@@ -1,4 +1,4 @@
-"""Simulated driver: an iiwa with Drake's driver, which another process commands over LCM."""
+"""Simulated driver: an iiwa and its driver in Drake, commanded by another process over LCM."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ CHECK_INTERVAL = 1.0  # wall clock time after which a silent robot's program is 
 
 
 class SimulatedIiwa(Diagram):
-    """An iiwa and its driver in simulation: receives torques on LCM and sends joint states.
+    """Simulation of an iiwa and its driver: receives joint torques on LCM and sends joint states.
 
     Attributes:
         controller_plant: The arm as its controller models it.
@@ -134,7 +134,7 @@ class LockstepClock(Clock):
         self._used = self._driver.statuses.head
 
     def _wait_for_step(self) -> None:
-        # Wait for the full timeout only once if the robot is silent, not in every step.
+        # If the robot is silent, wait for the full timeout only once, not in every step.
         timeout = self._period if self._has_timed_out else self._timeout
         statuses, end = self._driver.statuses, time.monotonic() + timeout
         self._acknowledge()
@@ -216,7 +216,7 @@ def serve_in_lockstep(
     send()
     while steps * period < seconds:
         for _ in range(repeats if steps else 10 * repeats):
-            # A command arrives before the acknowledgement that belongs to it.
+            # A command arrives before the acknowledgement of the same step.
             while lcm.HandleSubscriptions(round(1000 * REPEAT_INTERVAL)) and not is_acknowledged():
                 pass
             if is_acknowledged():
@@ -245,8 +245,8 @@ def serve_in_real_time(
 ) -> None:
     """Simulate an arm in real time; like a real robot, it does not wait for commands.
 
-    Contact makes the simulation slower. If the simulation falls so far behind that its statuses count as old, this is
-    reported once, so that the cause is not sought in the commanding program.
+    Contact makes the simulation slower. If the simulation falls so far behind that its statuses count as old, the delay
+    is reported once, so that the cause is not sought in the commanding program.
 
     Args:
         simulator: Simulator of the arm, initialized.

@@ -39,7 +39,7 @@ class SafetyMonitor:
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
     lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
-    `StateEstimator` as the station, by a clock of its own. It sends a heartbeat with every check, so that a commanding
+    `StateEstimator` as the station, but with its own clock. It sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
     (`CommandSequence`): the arm is damped, and then has zero torque until only one program sends commands. During a
     stop the monitor sends torques even if no status arrives, so that the driver never repeats an old torque. If the
@@ -64,7 +64,7 @@ class SafetyMonitor:
         Args:
             driver: The monitor's own connection to the robot.
             plant: Controller plant of the arm and its tool, finalized; its dynamics and velocity limits are used.
-            limits: Limits of the arm, of which torque limits, damping time and decay time are used.
+            limits: Limits of the arm; only torque limits, damping time and decay time are used.
             clock: Function that returns the local time [s].
 
         Raises:
@@ -95,7 +95,7 @@ class SafetyMonitor:
     def check(self) -> None:
         """Check the newest status and the commands, stop the arm if needed, and send a heartbeat.
 
-        If there is no new status, the check is skipped until one period has passed since the last check.
+        Without a new status, the check is skipped until one period has passed since the last check.
         """
         status, now = self._guard.read(), self._clock()
         is_due = now - self._checked_at >= 0.99 * self._driver.period
@@ -103,7 +103,7 @@ class SafetyMonitor:
             return
         self._checked_at, self._num_repeats = now, 0
         if status is not None:
-            # The driver counts every other program's commands as foreign; here only contradictory ones count.
+            # The driver counts every other program's commands as foreign; here only contradictory commands count.
             status = replace(status, foreign_commands=self._commands.num_conflicts)
         self._plant.SetPositions(self._context, self._estimated.accepted_values[: self._plant.num_positions()])
         self._plant.SetVelocities(self._context, self._estimated.velocity)
@@ -138,12 +138,12 @@ class SafetyMonitor:
             return
         self._commanded_at = self._clock()
         heartbeats = self._guard.read_heartbeats()
-        # While another monitor stops the arm, the command may be that monitor's.
+        # While another monitor stops the arm, the command may be a command of that monitor.
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
             self._commands.add(torque, command_time, self._commanded_at)
         if self._is_stopping and self._command is not None and not self._is_holding:
-            # The robot executes the last command, so the torque is sent again, up to a limit: two monitors could
-            # answer each other endlessly.
+            # The robot executes the last command, so the torque is sent again. The number of repetitions is limited,
+            # because two monitors could answer each other endlessly.
             if self._num_repeats < MAX_REPEATS:
                 self._num_repeats += 1
                 self._guard.write(self._command, self._commanded_at)

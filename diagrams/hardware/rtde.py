@@ -1,8 +1,8 @@
 """Driver on Universal Robots' RTDE: sends the wrenches of an impedance to the controller's force mode (500 Hz).
 
-The client is ur-rtde (MIT license). Of its commands, `servoL` bounds no force, and `directTorque` would leave the loop
-of 500 Hz to Python and needs PolyScope 5.26. Force mode bounds the force by the commanded wrench, in the controller's
-own loop, and runs on every e-Series. This driver has not been tested on a real robot.
+The client is ur-rtde (MIT license). Its command `servoL` does not bound the force. With `directTorque`, the 500 Hz loop
+would run in Python, and PolyScope 5.26 is required. Force mode bounds the force by the commanded wrench in the
+controller's own loop, and runs on every e-Series. This driver has not been tested on a real robot.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ from guiderail.systems.support.drake_multibody import transform_to_vector
 
 logger = logging.getLogger(__name__)
 
-EXTERNAL_TORQUE_LIMITS = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # largest external joint torques [Nm]
 # Defaults of URScript's movel: 0.25 m/s, 1.2 m/s², 1.05 rad/s, 1.4 rad/s²; each acceleration is reached in 0.1 s.
 # Universal Robots publishes no limits of a commanded jerk.
 UR_MOTION_LIMITS = MotionLimits((0.25, 1.2, 12.0), (1.05, 1.4, 14.0))
 WATCHDOG_FREQUENCY = 10.0  # the controller ends its program when commands arrive less often [Hz]
-MAX_ZEROED_FORCE = 15.0  # largest force that a drifted sensor may show before it is zeroed [N]
+MAX_ZEROED_FORCE = 15.0  # largest force that is attributed to drift when the sensor is zeroed [N]
 MAX_POSE_DIFFERENCE = 0.02  # largest distance of the robot's calibrated tool center from the model's [m]
 NO_TRANSFORM = 2  # argument `type` of forceMode: the force frame is not transformed
 RECOVERY_TIME = 2.0  # longest wait until the robot reports no stop after a recovery [s]
@@ -50,9 +49,10 @@ VARIABLES = ["timestamp", "actual_q", "actual_qd", "actual_TCP_force", "actual_T
 class RtdeDriver(PoseDriver):
     """Universal Robots UR5e with PolyScope 5.10 or later, in remote control.
 
-    The commanded wrench is K e, clipped to the largest wrench of the impedance, with the error e of the tool center's
+    The commanded wrench is K e, clipped to the largest wrench of the impedance; e is the error of the tool center's
     pose in the axes of the base. In force mode the controller moves the tool with a bounded speed until its sensor
-    measures that wrench: at rest the arm acts as a spring with a bounded force. The controller's own loop damps it.
+    measures the commanded wrench. At rest the arm therefore acts as a spring with a bounded force. The controller's own
+    loop damps the motion.
 
     The measured wrench is that of the surroundings on the tool. It is reported as joint torques Jᵀ F. A protective or
     emergency stop, and an ended program, make the status malformed until `recover`. If no command arrives for
@@ -60,7 +60,7 @@ class RtdeDriver(PoseDriver):
     """
 
     name = robot = "ur5e"
-    torque_reflex_limits = EXTERNAL_TORQUE_LIMITS
+    torque_reflex_limits = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # largest external joint torques [Nm]
     has_command_timeout = True
     hold_off = 0.25  # statuses are checked for this time before the first command [s]
     motion_limits = UR_MOTION_LIMITS
@@ -102,8 +102,8 @@ class RtdeDriver(PoseDriver):
         """Set tool center and payload, zero the force sensor and start the controller's program; nothing moves.
 
         Call it after `read` has returned a status. While poses are commanded, only the impedance is replaced. The force
-        sensor is zeroed once per connection, by the first call: later the tool may press on something, and a zeroed
-        sensor would hide that force from the controller, which would then add the bounded force to it.
+        sensor is zeroed once per connection, by the first call. Later the tool may be in contact: zeroing would hide
+        the contact force from the controller, which would then add the bounded force to it.
 
         Raises:
             InputError: If the robot cannot be connected, has not been read or refuses a setting, or if at the first
@@ -180,7 +180,7 @@ class RtdeDriver(PoseDriver):
         return ""
 
     def check_setup(self) -> list[Check]:
-        """Check state, program and kinematics of the robot; only the state if it has sent no status that is readable.
+        """Check state, program and kinematics of the robot; without a readable status, check only the state.
 
         Raises:
             InputError: If the robot has not been read.
@@ -224,7 +224,7 @@ class RtdeDriver(PoseDriver):
             self._check_kinematics()
             self._check(self._control.setWatchdog(WATCHDOG_FREQUENCY), "watchdog")
             self._is_active, self._has_failed_to_stop = True, False
-        # Computed by the station's model, so that driver and station agree; the robot's pose may differ by 1 mm.
+        # Computed with the station's model, so that driver and station agree; the robot's own pose may differ by 1 mm.
         X_BaseActual = self._calc_pose(status.positions)
         error = pose_error(X_BaseTool, X_BaseActual)[[3, 4, 5, 0, 1, 2]]
         limits = impedance.max_wrench
@@ -244,7 +244,7 @@ class RtdeDriver(PoseDriver):
             self._stopping.start()
 
     def _stop_force_mode(self) -> None:
-        """Leave force mode; if the robot refuses, its watchdog is not reset any more, and ends its program."""
+        """Leave force mode; if the robot refuses, its watchdog is no longer reset and ends the robot's program."""
         try:
             has_stopped = bool(self._control.forceModeStop())
         except Exception:  # the client raises RuntimeError and its own types
@@ -298,7 +298,7 @@ class RtdeDriver(PoseDriver):
             self._stopping = None
 
     def _check_connected(self) -> None:
-        """Raise an `InputError` before `read` has connected to the robot."""
+        """Raise an `InputError` if `read` has not connected to the robot yet."""
         if self._receiver is None:
             raise InputError("the driver rtde is used before it has read a status")
 

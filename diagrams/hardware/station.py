@@ -56,7 +56,7 @@ from guiderail.systems.torque_publisher import TorquePublisher
 from guiderail.systems.torque_safety_limiter import SafetyLimits, TorqueSafetyLimiter
 from guiderail.systems.wrench_tare import WrenchTare
 
-PROCESS_CHECK_PERIOD = 0.5  # period of checks of the robot's program while its first status is awaited [s]
+PROCESS_CHECK_PERIOD = 0.5  # time between checks of the robot's program during the wait for its first status [s]
 
 
 @register_station("hardware", workcell_kind="insertion", options=HardwareOptions, is_simulated=False)
@@ -263,7 +263,7 @@ class HardwareStation(Station):
     def start(self, simulator: Simulator, check_process: Callable[[], object] | None = None) -> None:
         """Wait for the robot's first status, and initialize a simulator that contains this station.
 
-        `check_process` is called while it waits; it raises an error if the robot's program has ended. While another
+        During the wait `check_process` is called, which raises an error if the robot's program has ended. While another
         station controls the arm, use `take_over`, which does not wait.
 
         Raises:
@@ -350,12 +350,12 @@ class HardwareStation(Station):
         stations, not root contexts; `context` is initialized.
         """
         context.SetStateAndParametersFrom(other_context)
-        for mine, theirs, port in (
+        for system, source, port in (
             (self._status, other._status, "status"),
             (self._heartbeat, other._heartbeat, "heartbeats"),
         ):
-            value = theirs.GetInputPort(port).Eval(other.GetSubsystemContext(theirs, other_context))
-            mine.GetInputPort(port).FixValue(self.GetMutableSubsystemContext(mine, context), Value[object](value))
+            value = source.GetInputPort(port).Eval(other.GetSubsystemContext(source, other_context))
+            system.GetInputPort(port).FixValue(self.GetMutableSubsystemContext(system, context), Value[object](value))
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Raise `InputError`, because a reset cannot set the pose of a real arm."""
@@ -390,8 +390,8 @@ class HardwareStation(Station):
         """Return the largest joint torques of the impedance's wrench, as shares of their limits, (n,).
 
         The joint positions are (n,) [rad]. The wrench is limited along and about each axis of the target separately;
-        the worst corner of this box of wrenches counts. The torque limiter clips at a share of 1. The driver's reflex
-        stops the arm at a share of at least 1 / `TORQUE_SHARE`, which clipped torques do not reach.
+        the result is for the worst corner of this box of wrenches. The torque limiter clips at a share of 1. The
+        robot's reflex stops the arm at a share of at least 1 / `TORQUE_SHARE`, which clipped torques do not reach.
         """
         J = tool_jacobian(self.controller_plant, positions, self.controller_plant.target)
         limits = to_wrench_order(self.impedance.limits)
@@ -408,9 +408,9 @@ def tool_jacobian(model: ControllerPlant, positions: np.ndarray, frame: Frame) -
 
 
 def make_rate_limiter(driver: Driver, period: float) -> PoseRateLimiter:
-    """Return the limiter of desired poses: it limits the speed, for a `PoseDriver` also acceleration and jerk."""
+    """Return the limiter of the desired poses' speed, and for a `PoseDriver` also of their acceleration and jerk."""
     if isinstance(driver, PoseDriver):
-        from guiderail.systems.pose_motion_limiter import PoseMotionLimiter  # its library is in the extra fci
+        from guiderail.systems.pose_motion_limiter import PoseMotionLimiter  # needs ruckig, an optional dependency
 
         return PoseMotionLimiter(driver.motion_limits, period=period)
     return PoseRateLimiter(period=period)
@@ -426,8 +426,8 @@ def make_robot_impedance(model: ArmControllerPlant, impedance: Impedance) -> Rob
     """Return the impedance for a robot's own controller, with the damping matrix of the nominal posture.
 
     Raises:
-        InputError: If the axes of target and base differ, because the wrench is limited along the target's axes, but
-            the robot uses those of its base.
+        InputError: If the axes of target and base differ: the station limits the wrench along the target's axes, but
+            the robot along the axes of its base.
     """
     plant, arm = model.plant, model.arm
     context = plant.CreateDefaultContext()

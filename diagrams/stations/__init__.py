@@ -1,1 +1,1 @@
-"""Stations: a robot, its controller and the objects of a task, with the same ports."""
+"""Stations: diagrams of a robot, its controller and the objects of a task, all with the same ports."""

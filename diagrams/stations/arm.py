@@ -86,10 +86,10 @@ def controller_model(
     robot: Robot | str = DEFAULT_ROBOT,
     end_effector: EndEffector | str = DEFAULT_END_EFFECTOR,
 ) -> tuple[MultibodyPlant, ArmModel]:
-    """Return the controller's plant, with arm, tool and workpiece but no fixture, offsets or tool joints, and its arm.
+    """Return the controller's plant and its arm; the plant has no fixture, no offsets and no joints of the tool.
 
     Raises:
-        InputError: If the robot's model has other joints than those in `Robot.joints`.
+        InputError: If the joints of the robot's model are not `Robot.joints`, in this order.
     """
     robot = find_robot(robot)
     plant = MultibodyPlant(0.0)
@@ -135,10 +135,10 @@ def add_gripper_control(
     upper = np.concatenate([joint.position_upper_limits() for joint in joints])
     opening = np.array([end_effector.opening[joint.name()] for joint in joints])
     command = builder.AddNamedSystem("gripper_command", GripperCommand(lower, upper, opening, period=period))
-    # The model's state includes joints that mimic others.
+    # The model's state includes joints that mimic other joints.
     num_positions = plant.num_positions(arm.tool_model)
-    every = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
-    first = min(joint.position_start() for joint in every if joint.num_positions() > 0)
+    all_joints = [plant.get_joint(index) for index in plant.GetJointIndices(arm.tool_model)]
+    first = min(joint.position_start() for joint in all_joints if joint.num_positions() > 0)
     actuated = np.zeros((2 * len(joints), plant.num_multibody_states(arm.tool_model)))
     for row, joint in enumerate(joints):
         column = joint.position_start() - first
@@ -159,7 +159,7 @@ class ArmStation(Station):
     port                size       meaning
     ==================  =========  ====================================================================================
     `gripper_position`  n          input, optional: desired positions of the gripper's actuated joints; open by default
-    `gripper_state`     2n         output: their positions and velocities
+    `gripper_state`     2n         output: positions and velocities of these joints
     ==================  =========  ====================================================================================
 
     A gripper's force is limited by its actuators. Controller and wrench sensor model it as a rigid, open tool.
@@ -274,25 +274,25 @@ class ArmStation(Station):
         return estimate.get_wrench_output_port()
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
-        """Sample the errors of joint torques, if the wrench is estimated from them; return some of them by name."""
+        """If the wrench is estimated from joint torques, sample their errors; return some of the errors by name."""
         if self._joint_torque is None:
             return {}
-        a, sensor, plant = self._joint_torque, self._torque_sensor, self._controller_plant.plant
+        accuracy, sensor, plant = self._joint_torque, self._torque_sensor, self._controller_plant.plant
         largest, bodies = plant.GetEffortUpperLimits(), len(sensor.bodies)
         tool = {int(body.index()) for body in self._controller_plant.arm.tool}
         masses = np.array([body.default_mass() for body in sensor.bodies])
         is_tool = np.array([int(body.index()) in tool for body in sensor.bodies])
         errors = JointTorqueErrors(
-            gain=a.gain * rng.uniform(-1.0, 1.0, len(largest)),
-            offset=a.offset * largest * rng.uniform(-1.0, 1.0, len(largest)),
-            friction=a.friction * largest * rng.uniform(0.0, 1.0, len(largest)),
-            mass=np.where(is_tool, 0.0, a.mass * masses) * rng.uniform(-1.0, 1.0, bodies),
-            center=a.center * rng.uniform(-1.0, 1.0, (bodies, 3)),
+            gain=accuracy.gain * rng.uniform(-1.0, 1.0, len(largest)),
+            offset=accuracy.offset * largest * rng.uniform(-1.0, 1.0, len(largest)),
+            friction=accuracy.friction * largest * rng.uniform(0.0, 1.0, len(largest)),
+            mass=np.where(is_tool, 0.0, accuracy.mass * masses) * rng.uniform(-1.0, 1.0, bodies),
+            center=accuracy.center * rng.uniform(-1.0, 1.0, (bodies, 3)),
         )
-        payload = a.payload * rng.uniform(-1.0, 1.0)
-        own = sensor.GetMyMutableContextFromRoot(context)
-        sensor.set_errors(own, errors, int(rng.integers(2**31)))
-        sensor.add_payload(own, payload)
+        payload = accuracy.payload * rng.uniform(-1.0, 1.0)
+        sensor_context = sensor.GetMyMutableContextFromRoot(context)
+        sensor.set_errors(sensor_context, errors, int(rng.integers(2**31)))
+        sensor.add_payload(sensor_context, payload)
         return {
             "torque_offset": errors.offset,
             "torque_gain": errors.gain,
@@ -301,8 +301,8 @@ class ArmStation(Station):
         }
 
     def set_payload(self, context: Context, mass: float) -> None:
-        """Add a mass [kg], unknown to controller and sensor, to the tool; `context` is the root context."""
-        own, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
-        tool.SetMass(own, tool.default_mass() + mass)
+        """Add a mass [kg] to the tool, which controller and sensor do not model; `context` is the root context."""
+        plant_context, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
+        tool.SetMass(plant_context, tool.default_mass() + mass)
         if self._joint_torque is not None:
             self._torque_sensor.add_payload(self._torque_sensor.GetMyMutableContextFromRoot(context), mass)

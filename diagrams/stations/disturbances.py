@@ -41,7 +41,7 @@ class DisturbedStation(Station):
     """
 
     def __init__(self, station: Station, disturbances: Disturbances):
-        """Construct the station; the inner one becomes part of it.
+        """Construct the station; the given `station` becomes its subsystem.
 
         Raises:
             InputError: If the station does not support one of the disturbances.
@@ -86,7 +86,7 @@ class DisturbedStation(Station):
         builder.BuildInto(self)
 
     def _add_constant(self, builder: DiagramBuilder, name: str, port: OutputPort) -> OutputPort:
-        """Add to `port` a constant pose, which a reset sets; return the port of the sum."""
+        """Add a constant pose, which a reset sets, to the value of `port`; return the port of the sum."""
         source = builder.AddNamedSystem(name, ConstantVectorSource(np.zeros(POSE_SIZE)))
         total = add_system(builder, f"{name}_added", Adder(2, POSE_SIZE), port, source.get_output_port())
         self._calibration.append(source)
@@ -147,7 +147,7 @@ class DisturbedStation(Station):
         )
         self._wrench.set_error(wrench, np.full(6, scale), bias, seed)
         self._pose.set_error(pose, np.ones(POSE_SIZE), pose_offset, 0)
-        # A seed of its own: with the same seed both systems would use the same random numbers.
+        # A separate seed: with the same seed, both systems would use the same random numbers.
         self._commands.set_seed(commands, int(np.random.SeedSequence(seed).generate_state(1)[0]))
         sampled = {"friction_factor": friction, "modulus_factor": modulus, "wrench_scale": scale, "wrench_bias": bias}
         further = (*e.calibration_error, *e.wrench_gradient, e.wrench_delay[1] - e.wrench_delay[0])
@@ -178,7 +178,7 @@ class DisturbedStation(Station):
 
 
 def _without_replaced_errors(disturbances: Disturbances, station: Station) -> SensorErrors:
-    """Return the errors to add at a station's ports, without those that its joint torque errors already cause."""
+    """Return the errors to add at a station's ports, without the errors that its joint torque errors already cause."""
     errors = disturbances.errors
     if errors.joint_torque is None:
         return errors
@@ -202,15 +202,16 @@ def disturbed(
 
     Args:
         build: Builder of the station; it needs the parameter `impedance` for an `impedance` or a stiffness factor.
-        disturbances: Disturbances of the station; for a robot only `sensing` and `tare`, and only a tare is applied.
-        is_simulated: False for a robot.
+        disturbances: Disturbances of the station; on a real robot only `sensing` and `tare`, and only the tare is
+            applied.
+        is_simulated: False for a real robot.
         name: Name of the station, for messages.
         impedance: Impedance of the task; the builder's own by default, or `Impedance()` if it declares none and there
             is a stiffness factor.
 
     Raises:
-        InputError: If the station does not support a disturbance, has no impedance to set, or is a robot and there are
-            other disturbances than `sensing` and `tare`.
+        InputError: If the station does not support a disturbance, has no impedance to set, or is a real robot and there
+            are other disturbances than `sensing` and `tare`.
     """
     own_impedance = inspect.signature(build).parameters.get("impedance")
     if impedance is not None and own_impedance is None:

@@ -156,7 +156,7 @@ class GantryStation(Station):
 
 
 def moving_mass(plant: MultibodyPlant) -> float:
-    """Return the mass of the tool with the bodies that are fixed to it [kg]; the links are negligible."""
+    """Return the mass of the tool and the bodies that are fixed to it [kg]; the links' mass is negligible."""
     tool = plant.GetBodiesWeldedTo(plant.GetBodyByName("tool_center"))
     return float(sum(body.default_mass() for body in tool))
 
@@ -192,7 +192,7 @@ def _controller_plant(workcell: Workcell, impedance: Impedance) -> ControllerPla
 def _add_gantry(
     plant: MultibodyPlant, workcell: Workcell, impedance: Impedance, *, with_gains: bool
 ) -> ModelInstanceIndex:
-    """Add joints, tool and workpiece, all without gravity, and with springs and dampers if `with_gains` is True."""
+    """Add joints, tool and workpiece without gravity; add springs and dampers to the joints if `with_gains` is True."""
     model = plant.AddModelInstance("gantry")
     parent: Frame = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     for (name, joint_type, axis), stiffness, damping, limit in zip(
@@ -216,14 +216,14 @@ def _add_gantry(
 def _add_wrench(
     builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
 ) -> OutputPort:
-    """Add the low-pass filtered contact wrench, delayed by one plant step like that of a sensor.
+    """Add the low-pass filtered contact wrench, delayed by one plant step like a sensor's; return its port.
 
     Only C++ systems of Drake run at every plant step; the Python system `PoseWrench` runs when its output is read.
     """
     period = plant.time_step()
     decay = float(np.exp(-period / time_constant)) if time_constant > 0.0 else 0.0
-    one, zero = np.eye(POSE_SIZE), np.zeros((POSE_SIZE, POSE_SIZE))
-    low_pass = LinearSystem(decay * one, (1.0 - decay) * one, one, zero, period)
+    identity = np.eye(POSE_SIZE)
+    low_pass = LinearSystem(decay * identity, (1.0 - decay) * identity, identity, 0 * identity, period)
     add_system(builder, "low_pass", low_pass, plant.get_generalized_contact_forces_output_port(gantry))
     wrench = add_system(builder, "wrench", PoseWrench(), pose=pose, generalized_force=low_pass.get_output_port())
     return wrench.get_wrench_output_port()

@@ -29,11 +29,11 @@ if TYPE_CHECKING:
 
 TANK_CAPACITY = 5.0  # capacity of the energy tank [J], a multiple of the work of an insertion
 # Smallest mass [kg] and moment of inertia [kg m²] of the moving parts. A joint's damping increases with its inertia, so
-# these give a lower bound of the dissipation that refills a tank.
+# these values give a lower bound of the dissipation that refills a tank.
 MIN_MASS, MIN_INERTIA = 1.5, 2e-3
 WRENCH_RATE = np.array([100.0] * 3 + [10.0] * 3 + [100.0, 10.0])
-"""Largest rates at which a wrench limit changes from state to state of a template: of three forces, three torques, the
-norm of the force and the norm of the torque, (8,) [N/s, Nm/s]."""
+"""Largest rates of a wrench limit between the states of a template, (8,) [N/s, Nm/s]: of three forces, three torques,
+the norm of the force and the norm of the torque."""
 
 
 def add_controller(
@@ -47,7 +47,7 @@ def add_controller(
     """Add a robot's controller, the monitor of its impedance wrench, and its energy tank.
 
     The controller checks its commands every `period` [s], which is also the period of the tank. There is a tank only if
-    the impedance is bounded. The tank, not the controller, then receives the desired pose.
+    the impedance is bounded; the desired pose is then an input of the tank instead of the controller.
     """
     limits = to_wrench_order(impedance.limits)
     gains = ImpedanceGains(
@@ -91,7 +91,7 @@ def add_energy_tank(
 def make_phase_wrench_limit(
     template: SharedControlTemplate, impedance: Impedance | None, period: float
 ) -> PhaseWrenchLimit | None:
-    """Return the system that limits the wrench to the limits of the template's current state; None without any limit.
+    """Return the system that limits the wrench by the template's current state; None if no state has a limit.
 
     Args:
         template: Shared control template.
@@ -112,8 +112,9 @@ def make_phase_wrench_limit(
     # A state without limits has the station's bound, so that the ramp to another state's limits starts there.
     bounds = [impedance.bound.numbers] * len(template.states)
     for number, state in enumerate(template.states):
-        given = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]
-        bounds[number] = np.minimum(bounds[number], max_wrench(*given)) if state.limits_wrench else bounds[number]
+        if state.limits_wrench:
+            limits = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]
+            bounds[number] = np.minimum(bounds[number], max_wrench(*limits))
     return PhaseWrenchLimit(np.array(bounds), WRENCH_RATE, period=period)
 
 

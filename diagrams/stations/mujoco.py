@@ -52,8 +52,8 @@ class MujocoContact:
     impedance: float = 0.95  # constraint impedance of a contact, between 0 and 1
     # Stiffness of friction relative to the normal direction; reduces creep of sticking contacts.
     friction_ratio: float = 10.0
-    # Natural frequency of a spring times time step. It determines the mass of the spring's body, which must be heavy
-    # enough for explicit integration.
+    # Product of a spring's natural frequency and the time step. It determines the mass of the spring's body, which must
+    # be heavy enough for explicit integration.
     spring_step: float = 1.0
 
 
@@ -67,7 +67,7 @@ def mujoco_model(
 ) -> mujoco.MjModel:
     """Return the compiled model. Its world frame is the target frame T, so the first six joint positions are the pose.
 
-    Surfaces of a body, and the workpiece's inertia, are in the frame of the body. Products of inertia about the center
+    The surfaces of a body, and the workpiece's inertia, are in the body's frame. Products of inertia about the center
     of mass are neglected. The engine's time step divides the station's `period` [s].
 
     Raises:
@@ -224,7 +224,7 @@ class MujocoStation(Station):
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(
                 f"station='mujoco' needs convex solids, which {type(workcell).__name__} does not provide: "
-                "give it the methods of ConvexWorkcell"
+                "implement the methods of ConvexWorkcell"
             )
         builder = DiagramBuilder()
         self.scene_graph = builder.AddSystem(SceneGraph())
@@ -258,7 +258,7 @@ class MujocoStation(Station):
 
     @property
     def time_step(self) -> float:
-        """Period of inputs and outputs, of which the control period is a multiple [s]."""
+        """Period of inputs and outputs [s]; the control period is a multiple of it."""
         return self._time_step
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:

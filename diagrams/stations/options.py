@@ -10,9 +10,9 @@ of their numbers, with references to docs/bibliography.md:
 - A wrist sensor [28]: resolution of 0.0125 N and 0.00075 Nm, uncertainty of about 1 % of the range.
 - An identified dynamic model of the first arm, with friction [29].
 
-Noise of 0.01 % of a joint's largest torque gives the tool noise in the first arm's data sheet; friction of 0.02 % stays
-within the arm's repeatability. Before the tare, offsets and model errors are much larger: newtons at the tool.
-Strain gauges drift with temperature, but hardly within one episode. docs/concepts/sensors.md has the resulting
+Noise of 0.01 % of a joint's largest torque corresponds to the tool noise in the first arm's data sheet; friction of
+0.02 % stays within the arm's repeatability. Before the tare, offsets and model errors are much larger: newtons at the
+tool. Strain gauges drift with temperature, but hardly within one episode. docs/concepts/sensors.md has the resulting
 errors of each arm.
 """
 
@@ -238,7 +238,7 @@ class Disturbances(Options):
 
     @property
     def errors(self) -> SensorErrors:
-        """Errors of the sensors: the setting `sensing`, in which options of single errors replace the setting's errors.
+        """Errors of the sensors: errors of the setting `sensing`, replaced by the given options of single errors.
 
         Joint torques have errors of their own. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
         and the errors of the arm's model, `wrench_drift` their drift and friction, `wrench_noise` their noise.

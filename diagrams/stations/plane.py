@@ -58,7 +58,7 @@ class PlaneConfig:
 
     @property
     def damping(self) -> float:
-        """Damping [N s/m] with which the largest force leads to the largest speed."""
+        """Damping of each joint [N s/m], with which `max_force` moves it at `max_speed`."""
         return self.max_force / self.max_speed
 
     @property
@@ -83,11 +83,11 @@ class PlaneStation(Station):
 
     ``desired_pose`` and ``pose`` are the position (x, y) of the robot's center [m]. ``wrench`` (2,) is the force of the
     walls on the robot, averaged over the control step [N], and ``contact_force`` (1,) its norm. ``saturation`` (2,) is
-    the force of each joint beyond its limit [N]. ``query`` is the scene graph's, for cameras.
+    the force of each joint beyond its limit [N]. ``query`` is the query port of the scene graph, for cameras.
 
     `walls` and `robot_radius` of the workcell are simulated; `goal`, `goal_radius`, `zone_x`, `obstacle`,
-    `obstacle_radius`, `obstacles` and `obstacles_move` are only drawn; they act through the constraints,
-    terminations and rewards of a task.
+    `obstacle_radius`, `obstacles` and `obstacles_move` are only visual geometry here; a task uses them in its
+    constraints, terminations and rewards.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class PlaneStation(Station):
     ):
         """Construct the station from the geometry of walls, goal and obstacles.
 
-        A `control_period` [s], a whole multiple of the plant's period, replaces that of the `config`.
+        A `control_period` [s], a whole multiple of the plant's period, replaces the control period of the `config`.
 
         Raises:
             InputError: If `control_period` is no whole multiple of the plant's period.
@@ -116,15 +116,15 @@ class PlaneStation(Station):
         self.plant.Finalize()
 
         # F = clip(k (x_d - x), ±F_max), against the joints' viscous friction.
-        one = np.eye(2)
+        identity = np.eye(2)
         state = self.plant.get_state_output_port(self._robot)
         pose = add_system(builder, "pose", MatrixGain(D=np.eye(2, 4)), state).get_output_port()
         watchdog = CommandWatchdog(config.control_period, command_timeout(config.control_period), 2)
         add_system(builder, "watchdog", watchdog, pose=pose)
-        both = Multiplexer([2, 2])
-        add_system(builder, "desired_and_measured_pose", both, watchdog.get_safe_pose_output_port(), pose)
-        gain = MatrixGain(D=config.position_gain * np.hstack([one, -one]))
-        force = add_system(builder, "position_gain", gain, both.get_output_port()).get_output_port()
+        poses = Multiplexer([2, 2])
+        add_system(builder, "desired_and_measured_pose", poses, watchdog.get_safe_pose_output_port(), pose)
+        gain = MatrixGain(D=config.position_gain * np.hstack([identity, -identity]))
+        force = add_system(builder, "position_gain", gain, poses.get_output_port()).get_output_port()
         limit = np.full(2, config.max_force)
         applied = add_system(builder, "force_limit", Saturation(-limit, limit), force).get_output_port()
         builder.Connect(applied, self.plant.get_actuation_input_port(self._robot))
@@ -132,7 +132,7 @@ class PlaneStation(Station):
         excess = add_system(builder, "excess_force", Adder(2, 2), force, negative)
 
         contact_force = self.plant.get_generalized_contact_forces_output_port(self._robot)
-        force_sum = LinearSystem(one, one, one, 0 * one, config.plant_period)
+        force_sum = LinearSystem(identity, identity, identity, 0 * identity, config.plant_period)
         add_system(builder, "force_sum", force_sum, contact_force)
         mean_force = MeanForce(2, config.substeps, config.control_period)
         add_system(builder, "mean_force", mean_force, force_sum=force_sum.get_output_port())
@@ -151,7 +151,7 @@ class PlaneStation(Station):
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the robot's center at (x, y), at rest; `context` is the root context."""
+        """Put the robot's center at `pose`, (2,) [m], at rest; `context` is the root context."""
         set_at_rest(self.plant, self._robot, context, check_pose(pose, 2))
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:

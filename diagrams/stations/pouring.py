@@ -29,7 +29,7 @@ from guiderail.systems.wrench_sensor import WrenchSensor
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])
 
-# Above the speed of any guidance, so that the controller does not slow a guidance down.
+# Above the speed of every guidance, so that the controller does not slow down a guided motion.
 SPEED_LIMITS = SpeedLimits(translational=0.5, rotational=2.0)
 
 WRENCH_TIME_CONSTANT = 0.02  # time constant of the wrench sensor's low-pass filter [s]
@@ -50,7 +50,7 @@ class PouringConfig:
     ball: Ball = field(default_factory=Ball)  # parameters of a ball
     num_balls: int = 2  # number of balls
     p_WStand: tuple[float, float, float] = (0.76, 0.18, 0.0)  # point of the table's surface under the nominal mug [m]
-    # Height of a stand under the mug, which leaves room for the wrist under a low thermos [m].
+    # Height of a stand under the mug [m]; the stand leaves room for the wrist when the thermos is low.
     stand_height: float = 0.06
     # Distance of the thermos's axis from the flange [m]; the axes of thermos and flange are perpendicular.
     grip: float = 0.08
@@ -97,9 +97,9 @@ class PouringConfig:
     @cached_property
     def X_FlangeP(self) -> RigidTransform:
         """Pose of the thermos's tip P at the flange, with its axis perpendicular to the flange's."""
-        turned = RigidTransform(RotationMatrix.MakeZRotation(self.arm.tool_turn), [0.0, 0.0, 0.0])
+        X_FlangeTurned = RigidTransform(RotationMatrix.MakeZRotation(self.arm.tool_turn), [0.0, 0.0, 0.0])
         R = RotationMatrix(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
-        return turned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
+        return X_FlangeTurned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])
 
 
 @register_station(
@@ -137,8 +137,8 @@ class PouringStation(Station):
 
     ``tip_in_mug`` is the tip's pose in the actual mug's frame, (6,), position and rotation vector; ``balls_in_mug`` and
     ``balls_in_thermos`` are the poses of all n balls in the vessels' tip frames, (6 n,), in the same form.
-    ``collision`` is 1 while the arm or the thermos touches table or mug, ``touched`` from the first such plant step on;
-    both (1,).
+    ``collision`` (1,) is 1 while the arm or the thermos touches table or mug; ``touched`` (1,) is 1 from the first
+    plant step with such a contact on.
     """
 
     wraps_angles = True
@@ -244,12 +244,12 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
     arm = add_robot(plant, config.arm)
     thermos = add_vessel(plant, "thermos", config.thermos, BLUE)
     wrist = plant.WeldFrames(arm.flange, thermos.body_frame(), config.X_FlangeP)
-    # The hand is a cylinder from the flange to the thermos's wall; its contact counts as the thermos's.
+    # The hand is a cylinder from the flange to the thermos's wall; it is part of the thermos's body.
     length = config.grip - config.thermos.outer_radius
     X_PHand = config.X_FlangeP.inverse() @ RigidTransform([0.0, 0.0, length / 2])
     add_shape(plant, thermos, "hand", X_PHand, Cylinder(0.03, length), METAL)
     for model in (arm.model, thermos.model_instance()):
-        # On a real arm under position control, integral action compensates gravity.
+        # Without gravity, as on a real arm under position control, where integral action compensates gravity.
         plant.set_gravity_enabled(model, False)
     if config.arm.drives is not None:
         add_drives(arm.actuators, config.arm.drives)
@@ -257,7 +257,7 @@ def add_arm_with_thermos(plant: MultibodyPlant, config: PouringConfig) -> tuple[
 
 
 def _add_stand(plant: MultibodyPlant, mug: RigidBody, config: PouringConfig) -> None:
-    """Add the stand under the mug; the stand moves with the mug, and its contact counts as the mug's."""
+    """Add the stand under the mug; it is part of the mug's body and moves with it."""
     if config.stand_height > 0:
         X_MG = RigidTransform([0.0, 0.0, -config.mug.height - config.stand_height / 2])
         add_shape(plant, mug, "stand", X_MG, Cylinder(config.mug.outer_radius, config.stand_height), WOOD)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StationKind:
-    """Entry of the registry: how a station is built, and what it needs."""
+    """Entry of the registry: builder and requirements of a station."""
 
     name: str  # name for `station=`
     build: Callable[..., Station]  # builder; its arguments are a workcell, and the options by name

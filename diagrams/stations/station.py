@@ -66,9 +66,9 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 # Accuracy and cost of other time steps: `python -m research.benchmarks time_step`.
 PLANT_PERIOD = CONTROL_PERIOD / 2  # default time step of a plant [s]
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
-COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; two control periods if that is longer
+COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; at least two control periods
 
-# Force limits along x, y and z as fractions of the limit of the norm. The norm of the three fractions is below 1.
+# Limits of the force along x, y and z as fractions of the limit of its norm. The norm of these fractions is below 1.
 FORCE_SHARES = (0.45, 0.45, 0.75)
 # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m].
 CONTACT_STIFFNESS = 2.5e4
@@ -111,9 +111,9 @@ class Impedance:
 
 
 def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
-    """Return a station's `max_wrench` (8,) that limits the impedance's force [N] and torque [Nm], as norms.
+    """Return the value (8,) of a station's input `max_wrench` that limits the norms of force [N] and torque [Nm].
 
-    A torque is limited to 1/√3 of `torque` about each axis, so that the norm never exceeds `torque`.
+    The torque about each axis is limited to `torque` / √3, so that its norm never exceeds `torque`.
 
     Raises:
         InputError: If the force or the torque is not positive.
@@ -169,7 +169,7 @@ class Station(Diagram):
 
     @property
     def time_step(self) -> float:
-        """Time step of the simulation, of which the control period is a multiple [s]."""
+        """Time step of the simulation [s]; the control period is a multiple of it."""
         return float(self.plant.time_step())
 
     @property
@@ -223,18 +223,18 @@ class Station(Diagram):
         `context` is the root context. The modulus is Drake's hydroelastic modulus, or the contact stiffness of another
         engine.
         """
-        own = self.scene_graph.GetMyMutableContextFromRoot(context)
-        inspector = self.scene_graph.model_inspector()
+        scene_graph_context = self.scene_graph.GetMyMutableContextFromRoot(context)
+        inspector, source = self.scene_graph.model_inspector(), self.plant.get_source_id()
         for geometry in inspector.GetAllGeometryIds(Role.kProximity):
             properties = ProximityProperties(inspector.GetProximityProperties(geometry))
             if properties.HasProperty("material", "coulomb_friction"):
                 nominal = properties.GetProperty("material", "coulomb_friction")
-                factored = CoulombFriction(friction * nominal.static_friction(), friction * nominal.dynamic_friction())
-                properties.UpdateProperty("material", "coulomb_friction", factored)
+                scaled = CoulombFriction(friction * nominal.static_friction(), friction * nominal.dynamic_friction())
+                properties.UpdateProperty("material", "coulomb_friction", scaled)
             if properties.HasProperty("hydroelastic", "hydroelastic_modulus"):
                 nominal = properties.GetProperty("hydroelastic", "hydroelastic_modulus")
                 properties.UpdateProperty("hydroelastic", "hydroelastic_modulus", modulus * nominal)
-            self.scene_graph.AssignRole(own, self.plant.get_source_id(), geometry, properties, RoleAssign.kReplace)
+            self.scene_graph.AssignRole(scene_graph_context, source, geometry, properties, RoleAssign.kReplace)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the station's own disturbances at a reset, and return them by name; `context` is the root context."""
@@ -289,7 +289,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
 
 
 def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple[MultibodyPlant, SceneGraph]:
-    """Add a plant with the settings that all stations share; `config` holds others of `MultibodyPlantConfig`."""
+    """Add a plant with the settings that all stations share; `config` has further fields of `MultibodyPlantConfig`."""
     shared = {"discrete_contact_approximation": "lagged", "use_sampled_output_ports": False}  # see `TaskDiagram`
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared, **config), builder)
 
@@ -297,9 +297,9 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
 def add_workcell_plant(
     builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
 ) -> tuple[MultibodyPlant, SceneGraph, Robot]:
-    """Add a finalized plant with the workcell's fixture, and the robot and workpiece that `add_robot` adds.
+    """Add a finalized plant with the workcell's fixture, and with the robot and workpiece that `add_robot` adds.
 
-    Contact is hydroelastic and falls back to point contact.
+    Contact is hydroelastic, with point contact as the fallback.
 
     Raises:
         InputError: If the time step is not positive.

@@ -53,12 +53,12 @@ class ConvexWorkcell(Protocol):
 
 
 class MovableWorkcell(ABC):
-    """Workcell with a fixture and a workpiece on frames, which a reset moves in the context."""
+    """Workcell with a fixture and a workpiece on frames; a reset moves the frames in the context."""
 
     fixture: ClassVar[str]  # name of the fixture's body
     workpiece: ClassVar[str]  # name of the workpiece's body
-    # Surfaces without contact: names of the fixture's, then of the workpiece's. (`drake:collision_filter_group` in an
-    # SDF file filters whole bodies only.)
+    # Pairs without contact: names of surfaces of the fixture, then of the workpiece. (`drake:collision_filter_group` in
+    # an SDF file filters whole bodies only.)
     filtered_pairs: ClassVar[Sequence[tuple[Iterable[str], Iterable[str]]]] = ()
 
     @property

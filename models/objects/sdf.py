@@ -33,7 +33,7 @@ def strip(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def area_vectors(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Return the normals (T, 3) of triangles, each with twice the area of its triangle as length [m²]."""
+    """Return the normals (T, 3) of triangles; the length of a normal is twice the area of its triangle [m²]."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     return np.cross(b - a, c - a)
 
@@ -57,7 +57,7 @@ class TriangleMesh:
 
     @staticmethod
     def from_obj(path: Path) -> "TriangleMesh":
-        """Read the vertices and triangles of an OBJ file with triangular faces, such as one with the text of `to_obj`.
+        """Read the vertices and triangles of an OBJ file with triangular faces, such as a file written with `to_obj`.
 
         Raises:
             InputError: If a vertex is not three numbers, there is no face, a face is not three whole numbers, or a
@@ -74,7 +74,7 @@ class TriangleMesh:
         if points.shape[1:] != (3,) or triangles.shape[1:] != (3,):
             raise InputError(f"{path} must hold vertices of three numbers, and triangles only: export it as triangles")
         if ((triangles < 1) | (triangles > len(vertices))).any():
-            raise InputError(f"a face of {path} has a vertex outside 1 … {len(vertices)}: number them from the first")
+            raise InputError(f"a face of {path} has a vertex outside 1 … {len(vertices)}: number the vertices from 1")
         return TriangleMesh(points, triangles - 1)
 
     def normals(self) -> np.ndarray:
@@ -122,18 +122,15 @@ def generate_assets(files: Callable[..., dict[str, str]], *dimensions: Hashable)
     return Path(folder.name)
 
 
-DRAKE_NAMESPACE = 'xmlns:drake="drake.mit.edu"'
-
-
 @dataclass(frozen=True)
 class ContactMaterial:
     """Parameters of the hydroelastic contact model of a surface; they are not properties of a real material."""
 
     friction: float  # coefficient of static and dynamic friction
-    modulus: float | None = None  # pressure at full depth [Pa]; None for a rigid surface
-    resolution: float | None = None  # edge length of a curved primitive's mesh [m]
+    modulus: float | None = None  # hydroelastic modulus [Pa]; None for a rigid surface
+    resolution: float | None = None  # resolution hint: edge length of a curved primitive's mesh [m]
     dissipation: float = 1.0  # Hunt-Crossley dissipation [s/m]
-    # Distance at which a compliant surface enters the contact computation [m], so that no step penetrates deeply.
+    # Distance from a compliant surface at which contact begins [m]; it limits the penetration within a time step.
     margin: float | None = None
 
 
@@ -181,7 +178,7 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0, pitch: float = 0.0) -> st
 
 
 def collision(name: str, pose: str, geometry: str, material: ContactMaterial) -> str:
-    """Return a collision element."""
+    """Return the SDF element of a collision geometry."""
     return f"""
       <collision name="{name}">
         <pose>{pose}</pose>
@@ -191,7 +188,7 @@ def collision(name: str, pose: str, geometry: str, material: ContactMaterial) ->
 
 
 def visual(name: str, pose: str, geometry: str, color: str) -> str:
-    """Return a visual element; `color` is "r g b a"."""
+    """Return the SDF element of a visual geometry; `color` is "r g b a"."""
     return f"""
       <visual name="{name}">
         <pose>{pose}</pose>
@@ -215,13 +212,13 @@ def model(
         mass: Mass [kg].
         center: Center of mass (3,) [m].
         radius_of_gyration: Radius of gyration [m].
-        contents: Collision and visual elements.
+        contents: SDF elements of the collision and visual geometry.
         source: Module or file that the dimensions come from, named in a comment.
     """
     inertia = mass * radius_of_gyration**2
     return f"""<?xml version="1.0"?>
 <!-- Written by {source}; change the dimensions there. -->
-<sdf version="1.9" {DRAKE_NAMESPACE}>
+<sdf version="1.9" xmlns:drake="drake.mit.edu">
   <model name="{name}">
     <link name="{name}">
       <inertial>

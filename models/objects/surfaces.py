@@ -1,4 +1,4 @@
-"""Collision geometry as convex solids, for physics engines that support only these."""
+"""Collision geometry as convex solids, for physics engines that do not support other shapes."""
 
 from dataclasses import dataclass, field
 
@@ -38,10 +38,10 @@ class Hull:
 
 @dataclass(frozen=True)
 class Spring:
-    """Spring-loaded slide of a surface, for a physics engine whose contact model is too stiff."""
+    """Spring-loaded prismatic joint of a surface: adds compliance where a physics engine's contact is too stiff."""
 
-    axis: tuple[float, float, float]  # direction of the slide (3,) in the body's frame
-    stiffness: float  # stiffness [N/m]
+    axis: tuple[float, float, float]  # direction of the joint (3,) in the body's frame
+    stiffness: float  # [N/m]
 
 
 @dataclass(frozen=True)
@@ -49,12 +49,12 @@ class Surface:
     """Convex solid of a body's collision geometry."""
 
     name: str  # unique name
-    pair: str  # name of the pair; the surface collides with those surfaces of the other body that have the same pair
+    pair: str  # name of the pair; surfaces of two bodies collide if their pairs have the same name
     shape: Cylinder | Box | Hull  # shape in the surface's frame
     friction: float  # friction coefficient of the pair
     position: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0))  # position (3,) [m] of the frame in the body
     pitch: float = 0.0  # rotation of the frame about the body's y axis [rad]
-    spring: Spring | None = None  # slide that carries the surface; None: it is fixed to the body
+    spring: Spring | None = None  # joint that carries the surface; None if the surface is fixed to the body
 
 
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:

@@ -1,4 +1,4 @@
-"""Geometry of a plug and its socket: overlap and its remedy, clearance of walls, path to the target, symmetries."""
+"""Geometry of a plug and its socket: overlap and shrinking, clearance of walls, path to the target, symmetries."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ from guiderail.models.parts.mesh_file import Part
 from guiderail.models.parts.solids import SurfaceLocator, join_surfaces, sample_surface, to_arrays, to_manifold
 
 MAX_WALL_SLOPE = 0.5  # largest component of a wall's normal along the axis
-MAX_FLANK_SLOPE = 0.98  # the same for the flank of a thread
+MAX_FLANK_SLOPE = 0.98  # largest component of a thread flank's normal along the axis
 MAX_RESTING_OVERLAP = 2e-6  # largest overlap that counts as rounding of faces in contact [m]
 _ROUNDING = 1e-6  # rounding of lengths in mesh files [m]
 _SAMPLES = 12000  # number of points sampled on the walls of a part
+_PATH_STEPS = 24  # number of poses on the straight part of a path
 _SLIVER = 1e-13  # twice the area of a triangle below which its normal is a rounding error [m²]
 
 
@@ -38,13 +39,13 @@ class InsertionMotion:
         """Height lost per full turn [m]; only for a motion with a turn."""
         return self.advance * 2.0 * np.pi / abs(self.turn)
 
-    def path(self, steps: int = 24) -> list[tuple[float, float]]:
-        """Return heights [m] and angles [rad] from the rim to the target: `steps` down, and `steps` - 1 in a turn."""
-        down = [(float(z), -self.turn) for z in np.linspace(self.rim, self.advance, steps)]
+    def path(self) -> list[tuple[float, float]]:
+        """Return heights [m] and angles [rad] from the rim to the target: straight down, then in the turn, if any."""
+        down = [(float(z), -self.turn) for z in np.linspace(self.rim, self.advance, _PATH_STEPS)]
         if not self.turn:
             return down
-        turning = zip(np.linspace(self.advance, 0.0, steps)[1:], np.linspace(-self.turn, 0.0, steps)[1:], strict=True)
-        return down + [(float(z), float(angle)) for z, angle in turning]
+        heights, angles = (np.linspace(start, 0.0, _PATH_STEPS)[1:] for start in (self.advance, -self.turn))
+        return down + list(zip(heights.tolist(), angles.tolist(), strict=True))
 
 
 def make_solids(part: Part) -> list[Any]:
@@ -70,7 +71,7 @@ def move_solid(solid: Any, height: float, angle: float) -> Any:
 def measure_overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float, np.ndarray]:
     """Return the approximate thickness [m] and the position (3,) [m] of the thickest overlap of two parts.
 
-    The thickness is that of a sheet: twice the volume divided by the surface.
+    An overlap is treated as a thin sheet: its thickness is twice its volume divided by its surface area.
     """
     thickest, where = 0.0, np.zeros(3)
     for one in first:
@@ -102,7 +103,7 @@ def compute_radius_of_gyration(part: Part) -> float:
 
 
 def _meshes(part: Part) -> tuple[list[Any], np.ndarray]:
-    """Return each body as a mesh of trimesh, and its volume [m³]."""
+    """Return each body as a mesh of trimesh, and the volumes of the bodies [m³]."""
     trimesh = import_extra("trimesh")
     meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
     return meshes, np.array([mesh.volume for mesh in meshes])
@@ -152,7 +153,7 @@ def measure_side_clearance(plug: Part, socket: Part, max_slope: float = MAX_WALL
 
 
 def _walls(part: Part, max_slope: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices (V, 3) [m] and triangles (T, 3) of the walls of a part, its faces along the axis."""
+    """Return vertices (V, 3) [m] and triangles (T, 3) of a part's walls: its faces along the axis."""
     vertices, triangles = join_surfaces(part.bodies)
     is_large = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > _SLIVER
     is_wall = np.abs(_normals(vertices, triangles)[:, 2]) < max_slope
@@ -166,7 +167,7 @@ def _normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list[tuple[float, float]]:
-    """Return each plug body's largest overlap with the socket on its path [m], and the height there [m]."""
+    """Return, for each body of the plug, the largest overlap with the socket on the path [m], and its height [m]."""
     fixed, obstructions = make_solids(socket), []
     for body in make_solids(plug):
         overlaps = [(measure_overlap([move_solid(body, z, a)], fixed)[0], z) for z, a in motion.path()]
@@ -174,8 +175,8 @@ def find_obstructions(plug: Part, socket: Part, motion: InsertionMotion) -> list
     return obstructions
 
 
-MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance; above it, the parts are not drawn assembled [m]
-_SPARE = 0.01 * MM  # clearance left by the suggested distance [m]
+MAX_SHRINK = 0.5 * MM  # largest suggested `shrink` distance [m]; if more is needed, the parts are not drawn assembled
+_SPARE = 0.01 * MM  # clearance left after shrinking by the suggested distance [m]
 _VOLUME_SAMPLES = 1000  # number of points sampled on the surface of a common volume
 _REGULARIZATION = 1e-3  # relative weight of the motion of a vertex in the least-squares problem
 
@@ -227,7 +228,7 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
         for other in second:
             common = one ^ other
             if not common.is_empty():
-                # Vertices where the surfaces cross lie on both of them, so points between vertices are sampled, too.
+                # Vertices on the intersection lie on both surfaces, so points between vertices are sampled, too.
                 points, _ = sample_surface(*to_arrays(common), _VOLUME_SAMPLES)
                 deepest = max(deepest, float(SurfaceLocator(*to_arrays(other)).find_nearest(points)[1].max()))
     return deepest
@@ -236,8 +237,8 @@ def measure_depth(first: Sequence[Any], second: Sequence[Any]) -> float:
 def shrink(part: Part, distance: float) -> Part:
     """Return a part whose faces are moved inwards by a distance [m].
 
-    The motion of each vertex is the least-squares solution for which the planes of its faces move by the distance. It
-    is at most twice the distance.
+    Each vertex moves so that the planes of its faces move by the distance, in the least-squares sense. The motion of a
+    vertex is at most twice the distance.
 
     Raises:
         InputError: If a body would have no volume left.
@@ -261,7 +262,7 @@ def _vertex_motion(vertices: np.ndarray, triangles: np.ndarray, distance: float)
         one, two = corners[:, (i + 1) % 3] - corners[:, i], corners[:, (i + 2) % 3] - corners[:, i]
         lengths = np.linalg.norm(one, axis=1) * np.linalg.norm(two, axis=1)
         cosine = np.einsum("ij,ij->i", one, two) / np.maximum(lengths, 1e-30)
-        angle = np.arccos(np.clip(cosine, -1.0, 1.0))  # the weight of a face must not depend on its triangulation
+        angle = np.arccos(np.clip(cosine, -1.0, 1.0))  # faces weighted by angle: independent of triangulation
         np.add.at(matrices, triangles[:, i], angle[:, None, None] * normals[:, :, None] * normals[:, None, :])
         np.add.at(sides, triangles[:, i], angle[:, None] * normals)
     weight = _REGULARIZATION * np.trace(matrices, axis1=1, axis2=2)[:, None, None] + 1e-12
@@ -283,20 +284,20 @@ SYMMETRIES = {
     "mirrored across the other diagonal": np.array([[0, -1], [-1, 0]]),
 }
 SAME, NEARLY = 0.99, 0.8  # smallest intersection over union of two outlines that count as (nearly) the same
-BELOW = 0.8e-3  # distance of the sections at the rim from the plug's tip or the socket's mouth, past the lead-ins [m]
+BELOW = 0.8e-3  # distance of the compared sections from the plug's tip and the socket's mouth, past the lead-ins [m]
 _SECTIONS = 12  # heights at which outlines are compared
-_AROUND = 1.15  # radius around the axis in which a socket is compared, in radii of the plug
+_AROUND = 1.15  # radius around the axis in which a socket is compared, relative to the radius of the plug
 
 
 def find_symmetries(
     plug: Part, socket: Part, motion: InsertionMotion, deviation: float = 0.0
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names of the symmetries of both parts, and of further ones that nearly hold on the rim.
+    """Return the names of the symmetries of both parts, and of further symmetries that nearly hold on the rim.
 
-    A symmetry also maps the plug at its target to one that fits the socket: it overlaps it no more than the plug does,
-    apart from rounding and `deviation`, the largest overlap caused by the decimation of both parts [m]. The parts are
-    in the target frame, the plug at its target. On the rim, the plug is turned by minus `motion.turn`. With a turn, the
-    first tuple is empty.
+    A symmetry maps the outlines of both parts to themselves. It also maps the plug at its target to a plug that fits:
+    the overlap of the mapped plug with the socket exceeds the overlap of the plug at most by rounding and `deviation`,
+    the largest overlap caused by the decimation of both parts [m]. The parts are in the target frame, the plug at its
+    target. On the rim, the plug is turned by minus `motion.turn`. With a turn, the first tuple is empty.
     """
     low, rim = float(plug.bounds[0, 2]), motion.rim + float(plug.bounds[0, 2])
     socket_solids, plug_solids = make_solids(socket), [move_solid(one, 0.0, -motion.turn) for one in make_solids(plug)]
@@ -329,7 +330,7 @@ def _hole(bodies: Sequence[Any], height: float, radius: float) -> Any:
 
 
 def _similarity(outline: Any, move: np.ndarray) -> float:
-    """Return the intersection over union of an outline and its image under a symmetry; 1 without an outline."""
+    """Return the intersection over union of an outline and its image under a symmetry; 1 if both are empty."""
     other = outline.transform(np.column_stack([move, [0, 0]]).astype(float))
     joint = (outline + other).area()
     return (outline ^ other).area() / joint if joint > 1e-6 else 1.0

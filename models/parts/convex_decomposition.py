@@ -1,6 +1,6 @@
 """Decomposition of a solid into convex pieces.
 
-Contact of a compliant mesh needs tetrahedra, and a convex piece has few. An approximate decomposition would lose
+Contact of a compliant mesh needs tetrahedra; few are enough for a convex piece. An approximate decomposition would lose
 clearances of a tenth of a millimeter. The solid is therefore cut along its own faces at concave edges, which moves no
 surface. Only the fine decomposition and the sectors of a screw fill concavities.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.parts.solids import SCALE, SurfaceLocator, hull_of, measure_distance, to_arrays
 
-MAX_PIECES = 300  # largest number of pieces; a base with two gears, between which a third is inserted, has 282
+MAX_PIECES = 300  # largest number of pieces; a base with two gears, the socket of a third gear, has 282
 MAX_FINE_PIECES = 800  # largest number of pieces of a fine decomposition; few of them are in contact at a time
 _FINE_SLIVER = 1e-8  # fraction of the whole volume below which a piece of a fine decomposition is a rounding error
 _SLIVER = 1e-6  # fraction of the whole volume below which a piece is a rounding error
@@ -36,9 +36,9 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
     Args:
         solid: Solid of `manifold3d`.
         max_pieces: Largest number of pieces.
-        depth: Depth below which a concavity is filled [mm]; None: volumes decide instead. With a depth, smaller parts
-            are kept, and a part that no plane of a face cuts is cut by planes that halve the angles between faces. A
-            part that no plane cuts is replaced by its hull.
+        depth: Depth below which a concavity is filled [mm]; None: concavities of negligible volume are filled instead.
+            With a depth, only much smaller parts are left out, and a part that no plane of a face cuts is cut by
+            planes that halve the angles between faces. A part that no plane cuts is replaced by its hull.
 
     Returns:
         The pieces; None if more than `max_pieces` are necessary, or, without a depth, if hulls fill a concavity that no
@@ -48,7 +48,7 @@ def cut_into_convex_pieces(solid: Any, max_pieces: int = MAX_PIECES, depth: floa
     sliver = (_SLIVER if depth is None else _FINE_SLIVER) * total
     while uncut:
         for part in uncut.pop().decompose():
-            # The hull of a thin part would not be thin if the part is bent.
+            # A thin part is left out: if it is bent, its hull would not be thin.
             if part.volume() < sliver or (depth and 2.0 * part.volume() < THINNEST * part.surface_area()):
                 continue
             hollow = _hollow(part)
@@ -69,7 +69,8 @@ def cut_into_sectors(solid: Any, number: int, max_pieces: int = MAX_PIECES) -> l
     """Cut a solid by planes through the z axis into `number` sectors, at least 3, and each sector in two.
 
     The second cut is across the sector, at the radius with the smallest concave volume, which is the root of a thread.
-    Cuts along the curved faces of a thread would be too many. The pieces are convex hulls, which fill concavities.
+    Cuts along the curved faces of a thread would make too many pieces. The pieces are convex hulls, which fill
+    concavities.
 
     Returns:
         The pieces; None if more than `max_pieces` are necessary.

@@ -1,25 +1,25 @@
 """Scripted demonstrator of an insertion: a straight motion for tests, and a search for demonstrations.
 
-Poses [x y z Rz Ry Rx] are those of the plug in the target frame [m, rad]. A command lies below the surface that stops
+Poses [x y z Rz Ry Rx] are poses of the plug in the target frame [m, rad]. A command lies below the surface that stops
 the plug; under impedance control, the distance of the command from the surface determines the push.
 """
 
 import numpy as np
 
-from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
-from guiderail.models.objects.bnc_connector.demonstrations import random_curves
+from guiderail.models.common.transforms import DEGREE, MM
+from guiderail.models.objects.bnc_connector.demonstrations import poses, random_curves
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM  # [m/s]
-TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # height above and below the rim [m], and the speed there [m/s]
+TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # distance from the rim within which the plug moves slowly [m], its speed [m/s]
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
 SEARCH = 1.8  # time on the rim [s]
 PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 10  # with only five, the variance along the search would vary by a factor of four
-SPREAD = 1.7 * MM  # radius of the circle around the nominal position on which the demonstrations' sockets lie [m]
+SPREAD = 1.7 * MM  # radius of the circle of the demonstrations' sockets around the nominal position [m]
 _ANGLES = np.arange(NUM_DEMONSTRATIONS) * 2.0 * np.pi / NUM_DEMONSTRATIONS  # angles of the sockets on the circle [rad]
 
-# Standard deviations of the hand [m, rad]: wide on the rim, narrow where the parts guide the motion.
+# Standard deviations of the hand's pose [m, rad]: wide on the rim, narrow where the parts guide the motion.
 _WIDE = np.array([1.2 * MM, 1.2 * MM, 0.7 * MM, 1.0 * DEGREE, 0.8 * DEGREE, 0.8 * DEGREE])
 _NARROW = np.array([0.12 * MM, 0.12 * MM, 0.4 * MM, 0.5 * DEGREE, 0.15 * DEGREE, 0.15 * DEGREE])
 _CORRELATION = (0.22, 0.22, 0.35, 0.5, 0.3, 0.3)  # correlation times of the deviations [s]
@@ -29,7 +29,7 @@ _CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted
 def plan_straight_insertion(
     travel: float, rim: float, turn: float, push: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and poses (N, 6) [m, rad] of an insertion.
+    """Return times (N,) [s] and poses (N, 6) [m, rad] of a straight insertion.
 
     The plug moves down, slowly past the rim, is pushed, turns, and moves to the target.
 
@@ -51,7 +51,7 @@ def plan_straight_insertion(
     if turn:
         points += [(abs(turn) / TURN_SPEED + PAUSE, -push, 0.0)]
     points += [(PAUSE, -push, 0.0), (PAUSE, 0.0, 0.0), (PAUSE, 0.0, 0.0)]
-    return _poses([(0.0, travel, -turn), *points])
+    return _timed_poses([(0.0, travel, -turn), *points])
 
 
 def plan_search(
@@ -82,7 +82,7 @@ def plan_search(
     if turn:
         points += [(abs(turn) / TURN_SPEED + PAUSE, -push, 0.0)]
     points += [(PAUSE, -push, 0.0), (0.4, -0.5 * push, 0.0), (PAUSE, -0.5 * push, 0.0)]
-    return _poses(points)
+    return _timed_poses(points)
 
 
 def demonstrator_motions(
@@ -97,15 +97,14 @@ def demonstrator_motions(
     start.
     """
     rng = np.random.default_rng(seed)
-    script_times, poses = script
-    heights = np.interp(times, script_times, poses[:, 2])
-    # From wide to narrow over the first 3 mm below the search.
+    script_times, script_poses = script
+    heights = np.interp(times, script_times, script_poses[:, 2])
     wide = np.clip((heights - press_from) / (3.0 * MM) + 1.0, 0.0, 1.0)[:, None]
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTERING * curves.mean(axis=0)
     wander /= wander.std(axis=0)  # otherwise an action would have little effect where the curves are close by chance
-    nominal = np.stack([np.interp(times, script_times, column) for column in poses.T], axis=1)
+    nominal = np.stack([np.interp(times, script_times, column) for column in script_poses.T], axis=1)
     motions = nominal + scale * wander
     motions[:, :, :2] += (1.0 - wide) * socket_offsets()[:, None, :]
     motions[:, :, 3] += socket_turns(search_turn)[:, None]
@@ -125,9 +124,7 @@ def socket_turns(largest: float) -> np.ndarray:
     return largest * np.cos(3.0 * _ANGLES)
 
 
-def _poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:
+def _timed_poses(points: list[tuple[float, float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and poses (N, 6) from the duration [s], the height [m] and the turn [rad] of each point."""
     durations, heights, turns = np.array(points).T
-    poses = np.zeros((len(points), POSE_SIZE))
-    poses[:, 2], poses[:, 3] = heights, turns
-    return np.cumsum(durations), poses
+    return np.cumsum(durations), poses(heights, turns)

@@ -38,7 +38,7 @@ def accepted_pieces(pieces: Sequence[Piece]) -> list[Piece] | None:
     """Return pieces that Drake accepts; a refused piece is rounded to a grid, or left out if it is negligible.
 
     Returns:
-        The pieces; None if a refused piece can be neither rounded nor left out; one of tetrahedra never can.
+        The pieces; None if a refused piece can be neither rounded nor left out, or has tetrahedra.
     """
     refused = _refused(pieces)
     if not refused:

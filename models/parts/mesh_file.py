@@ -35,7 +35,7 @@ MAX_FILE_SIZE = 200_000_000  # [bytes]
 MAX_TRIANGLES = 2_000_000  # largest number of triangles of a file
 _CPU_SECONDS, _MAX_MEMORY = 120, 2 * 2**30  # limits of a parser: CPU time [s] and memory [bytes]
 NOTHING_REPAIRED = Repair()
-_KNOWN = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
+_FORMAT_UNITS = {".glb": "m", ".step": "m", ".stp": "m"}  # units of formats that define one
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,12 +68,12 @@ class Part:
 
 
 def find_unit(path: Path, unit: str | None) -> str | None:
-    """Return the unit of a file, which its format or else `unit` determines; None if neither does."""
-    return _KNOWN.get(path.suffix.lower()) or unit
+    """Return the unit that the format of a file defines, or else `unit`."""
+    return _FORMAT_UNITS.get(path.suffix.lower()) or unit
 
 
 def find_units(paths: Sequence[Path], unit: str | None) -> list[str | None]:
-    """Return the unit of each file, as `find_unit`.
+    """Return the unit of each file; see `find_unit`.
 
     Raises:
         InputError: If `unit` is unknown, or contradicts the formats of all files.
@@ -147,7 +147,7 @@ def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
 
     try:
         mesh: Any = trimesh.load(io.BytesIO(data), file_type=ending, force="mesh", process=False, skip_materials=True)
-    except ImportError:  # trimesh tries to detect the encoding of a text
+    except ImportError:  # trimesh has no library to detect the encoding of a text
         raise ValueError(f"it is damaged or no {ending.upper()} file") from None
     number = 0 if mesh is None else max(len(mesh.faces), len(mesh.vertices) // 3)
     if not 0 < number <= MAX_TRIANGLES:
@@ -158,7 +158,8 @@ def _parse(data: bytes, ending: str) -> tuple[np.ndarray, np.ndarray, int]:
 class Surface(Protocol):
     """Mesh with the contact parameters of one surface.
 
-    A surface with a `modulus` [Pa] is compliant, one with None rigid. `dissipation` is that of Hunt and Crossley [s/m].
+    `modulus` is the hydroelastic modulus [Pa], None for a rigid surface; `dissipation` is the Hunt-Crossley dissipation
+    [s/m].
     """
 
     file: str
@@ -170,7 +171,7 @@ class Surface(Protocol):
 def obj_text(vertices: np.ndarray, triangles: np.ndarray) -> str:
     """Return the text of an OBJ file of vertices (V, 3) [m] and triangles (T, 3).
 
-    Triangles of almost no area are left out, because their normals are rounding errors.
+    Triangles of negligible area are left out, because their normals are rounding errors.
     """
     has_area = np.linalg.norm(area_vectors(vertices, triangles), axis=1) > 1e-10
     return TriangleMesh(vertices, triangles[has_area]).to_obj()

@@ -53,14 +53,14 @@ Arrays = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class ContactSurface:
-    """Surface of a part as it is simulated."""
+    """Surface of a part in the simulation."""
 
-    bodies: tuple[Arrays, ...]  # vertices (V, 3) [m] and triangles (T, 3) of each body, the snapping ones last
+    bodies: tuple[Arrays, ...]  # vertices (V, 3) [m] and triangles (T, 3) of each body, snapping bodies last
     snapping: int  # number of the snapping bodies
     visual: Arrays  # vertices and triangles of the whole part, decimated but not cropped
     deviation: float  # largest measured distance from the drawing in the regions that can touch [m]
     volume: float  # volume of the part [m³]
-    sectors: int = 0  # number of sectors about z in which the curves of a screw are straight; 0 for other parts
+    sectors: int = 0  # number of sectors about z in which chords replace the arcs of a screw; 0 for other parts
 
     @property
     def num_triangles(self) -> int:
@@ -98,7 +98,7 @@ def prepare_surfaces(
         socket: Socket in the target frame, decimated by `decimate`.
         motion: Motion of the plug.
         tolerance: Largest deviation of the result from the drawing [m].
-        moved: Deviation of the given parts from the drawing [m].
+        moved: Deviation of the decimated parts from the drawing [m].
         snapping: Indices of bodies of the plug that deflect; they are not united with the others. If there are any,
             neither part is cropped.
         yaw: Largest rotation of the plug in the socket about its axis in a search [rad].
@@ -186,15 +186,15 @@ def make_compliant(
         make, seconds = _mesh_bodies, TETRAHEDRA_SECONDS
     for name in order:
         try:
-            made = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
+            result = run_isolated(make, surfaces[name], tolerance, cpu_seconds=seconds)
         except IsolatedError as error:
             log(f"{name}: {failure} ({error})")
             continue
-        accepted = None if made is None else accepted_pieces(made[0])
-        if made is None or accepted is None:
-            log(f"{name}: {failure if made is None else 'Drake refuses a piece'}")
+        accepted = None if result is None else accepted_pieces(result[0])
+        if result is None or accepted is None:
+            log(f"{name}: {failure if result is None else 'Drake refuses a piece'}")
             continue
-        yield name, accepted, made[1]
+        yield name, accepted, result[1]
 
 
 def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") -> tuple[list[Piece], float] | None:
@@ -218,12 +218,12 @@ def cut_bodies(surface: ContactSurface, tolerance: float, kind: str = "convex") 
         added = _added(cut, solid)
         if added and float(SurfaceLocator(*arrays).find_nearest(added[0])[1].max()) > 2.0 * tolerance:
             return None
-        kept = [one for one in cut if 2.0 * one.volume() > THINNEST * one.surface_area()]
-        if len(kept) < len(cut):
-            added = _added(kept, solid)
+        thick = [piece for piece in cut if 2.0 * piece.volume() > THINNEST * piece.surface_area()]
+        if len(thick) < len(cut):
+            added = _added(thick, solid)
         if added:
             deviation = max(deviation, measure_distance(added, arrays))
-        pieces += [Piece(number, ".obj", *to_arrays(one)) for one in kept]
+        pieces += [Piece(number, ".obj", *to_arrays(piece)) for piece in thick]
     return pieces, deviation
 
 
@@ -259,12 +259,12 @@ def simplify(solid: Any, tolerance: float, start: float = 1.0) -> tuple[Any, flo
     tolerance [mm], a smaller bound is tried. The first bound is the fraction `start` of the tolerance. If all bounds
     fail, the solid is returned unchanged.
     """
-    drawn = to_arrays(solid)
+    original = to_arrays(solid)
     for fraction in (start, 0.3 * start, 0.1 * start):
         simpler = solid.as_original().simplify(fraction * tolerance)
         if simpler.is_empty():
             continue
-        deviation = 1e3 * measure_deviation(drawn, to_arrays(simpler))
+        deviation = 1e3 * measure_deviation(original, to_arrays(simpler))
         if deviation <= tolerance:
             return simpler, deviation
     return solid, 0.0
@@ -287,8 +287,9 @@ def as_hull_if_near(solid: Any, tolerance: float) -> tuple[Any, float]:
 def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plug: bool) -> Any:
     """Return the region of a part that can come within `margin` of the other part while the plug moves down along z.
 
-    A slab of the plug above z0 meets only the region of the socket above z0. A slab of the socket below z1 meets only
-    the region of the plug below z1. Each slab keeps the projection of that region along z, widened by the margin.
+    A slab of the plug above z0 can touch only the region of the socket above z0, and a slab of the socket below z1 only
+    the region of the plug below z1. Each slab is cropped to the projection of that region along z, widened by the
+    margin.
 
     Args:
         part: Solid to crop.
@@ -299,7 +300,7 @@ def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plu
     """
     manifold3d = import_extra("manifold3d")
     low, high = part.bounding_box()[2], part.bounding_box()[5]
-    cuts, kept = np.linspace(low, high, _SLABS + 1), []
+    cuts, regions = np.linspace(low, high, _SLABS + 1), []
     turns = np.rad2deg(np.linspace(0.0, turn, 9)) if turn else (0.0,)
     for start, end in itertools.pairwise(cuts):
         plane = ((0, 0, 1), start - margin) if is_plug else ((0, 0, -1), -(end + margin))
@@ -313,9 +314,9 @@ def crop_to_contact(part: Any, other: Any, margin: float, turn: float, *, is_plu
             [outline.rotate(sign * float(angle)) for angle in turns], manifold3d.OpType.Add
         )
         shadow = shadow.offset(margin, manifold3d.JoinType.Round, circular_segments=16).simplify(0.3)
-        kept.append(manifold3d.Manifold.extrude(shadow, end - start + 2e-3).translate((0, 0, start - 1e-3)))
-    if not kept:
+        regions.append(manifold3d.Manifold.extrude(shadow, end - start + 2e-3).translate((0, 0, start - 1e-3)))
+    if not regions:
         return part
-    cropped = part ^ manifold3d.Manifold.batch_boolean(kept, manifold3d.OpType.Add)
-    solid = [one for one in cropped.decompose() if one.volume() > _SLIVER]
-    return manifold3d.Manifold.compose(solid) if solid else part
+    cropped = part ^ manifold3d.Manifold.batch_boolean(regions, manifold3d.OpType.Add)
+    pieces = [piece for piece in cropped.decompose() if piece.volume() > _SLIVER]
+    return manifold3d.Manifold.compose(pieces) if pieces else part

@@ -1,7 +1,7 @@
 """Repair of meshes exported from CAD programs to closed solids: slivers, open seams, doubled faces, cavities.
 
 Open edges are first closed without moving a vertex: loose triangles are removed, and flat faces are triangulated again.
-If that fails, fTetWild gives a new surface, which differs from the old one by at most `MAX_MOVED`.
+If that fails, fTetWild computes a new surface, which differs from the old surface by at most `MAX_MOVED`.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def _without_doubled_faces(vertices: np.ndarray, triangles: np.ndarray) -> Any:
 def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
     """Return the solid of triangles that may cross or leave gaps: the boundary of their tetrahedral mesh.
 
-    `gaps` is the beginning of the error messages, a description of the gaps.
+    `gaps` describes the gaps, and is the beginning of the error messages.
 
     Raises:
         InputError: If the software for the repair is not installed, or no attempt gives a solid.
@@ -180,21 +180,21 @@ def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     provided that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
     """
     triangles = _without_loose_triangles(triangles)
-    left = find_open_edges(triangles)
-    for normal, distance in _planes(vertices, triangles, left):
-        if not len(left):
+    open_edges = find_open_edges(triangles)
+    for normal, distance in _planes(vertices, triangles, open_edges):
+        if not len(open_edges):
             break
         inside = (np.abs(vertices @ normal - distance) < _FLAT)[triangles].all(axis=1)
         along = area_vectors(vertices, triangles) @ normal > 0.0
-        # Triangles of the plane with the opposite normal belong to another face, or to this one in wrong orientation.
+        # Triangles of the plane with the opposite normal belong to another face, or to this face but are inverted.
         for chosen in (inside, inside & along):
             face = _fill(vertices, triangles[~chosen], normal, distance)
             if face is None:
                 continue
             changed = np.concatenate([triangles[~chosen], face])
-            now = find_open_edges(changed)
-            if len(now) < len(left):
-                triangles, left = changed, now
+            still_open = find_open_edges(changed)
+            if len(still_open) < len(open_edges):
+                triangles, open_edges = changed, still_open
                 break
     return triangles
 

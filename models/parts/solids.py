@@ -16,7 +16,7 @@ import numpy as np
 from guiderail.models.common.errors import import_extra
 from guiderail.models.objects.sdf import area_vectors
 
-SCALE = 1e3  # from meters to millimeters, for which the tolerances of manifold3d and fTetWild are meant
+SCALE = 1e3  # from meters to millimeters, the unit that suits the tolerances of manifold3d and fTetWild
 
 
 def to_manifold(vertices: np.ndarray, triangles: np.ndarray) -> Any:
@@ -71,7 +71,8 @@ class SurfaceLocator:
 def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return points (P, 3) of a surface and the indices of their triangles (P,): uniform samples, and corners.
 
-    There are `count` samples, the same in every call, and fewer than `2 * count` corners, every n-th one of the mesh.
+    The `count` samples are the same in every call. The corners are every n-th corner of the mesh, fewer than
+    `2 * count`.
     """
     corners = vertices[triangles]
     cumulative = np.cumsum(0.5 * np.linalg.norm(area_vectors(vertices, triangles), axis=1))
@@ -88,7 +89,7 @@ def sample_surface(vertices: np.ndarray, triangles: np.ndarray, count: int) -> t
 def measure_distance(
     points_of: tuple[np.ndarray, np.ndarray], surface: tuple[np.ndarray, np.ndarray], count: int = NUM_SAMPLES
 ) -> float:
-    """Return the largest distance of sampled points of one surface from another one [m].
+    """Return the largest distance of sampled points of one surface from another surface [m].
 
     The arguments are those of `measure_deviation`.
     """

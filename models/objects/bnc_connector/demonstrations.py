@@ -1,8 +1,8 @@
 """Demonstrations of inserting and locking a BNC plug, five in each of three sets, and the scripted demonstrator.
 
 The scripted demonstrator replaces the human hand of the thesis (section 4.4.2). It moves the *desired* pose of a
-station with impedance control. The files hold the commanded and the measured poses. A primitive learns the commanded
-ones, because the push is the difference between commanded and measured poses.
+station with impedance control. The files contain the commanded and the measured poses. A primitive is fitted to the
+commanded poses, because the push is the difference between commanded and measured poses.
 
 - Insertion, for a jack at a known position: the motions differ randomly. The demonstrator approaches the jack
   imprecisely, wanders over the rim with a light push until the plug drops in, is precise where the connector guides the
@@ -13,7 +13,7 @@ ones, because the push is the difference between commanded and measured poses.
   covariance is the same in every direction. An action of a policy therefore has the same effect in every direction
   during the whole search.
 - Firm search, recorded on an arm: the push is four times as large. The torque from the rim shows on which side of the
-  rim the plug stands. With the firm push this torque is as large as the errors of an arm's joint torques, with the
+  rim the plug stands. With the firm push this torque is as large as the errors of an arm's joint torques. With the
   light push it is a quarter of these errors.
 
 `python -m research.generate` with `connector-demonstrations`, `connector-search-demonstrations` or
@@ -38,7 +38,8 @@ QUARTER_TURN = np.pi / 2
 # Heights of the plug in the locked frame [m].
 CLEAR = 15.5 * MM  # above the jack
 RIM = 10.5 * MM  # on the barrel's rim
-# A command lies below the surface that stops the plug: under impedance control the difference is the push.
+# A command lies below the surface that stops the plug: under impedance control, the distance between command and
+# surface determines the push.
 SEARCH_PUSH = 2.5 * MM
 SEAT_COMMAND = -6.0 * MM
 LOCK_COMMAND = -8.0 * MM
@@ -57,8 +58,8 @@ WAYPOINTS = np.array(
     ]
 )
 
-# Standard deviations of the hand at times of the motion: above the jack, at the rim, searching on it (twice), dropping
-# in, seated, turned and locked.
+# Standard deviations of the hand's pose at eight times of the motion: above the jack, at the rim, at begin and end of
+# the search on the rim, dropping in, seated, turned and locked.
 _TIMES = [0.0, 1.2, 1.6, 3.4, 4.1, 4.8, 7.0, 8.0]  # [s]
 _DEVIATIONS = {
     "x": np.array([1.0, 1.2, 1.2, 1.2, 0.35, 0.15, 0.15, 0.10]) * MM,
@@ -69,8 +70,8 @@ _DEVIATIONS = {
     "Rx": np.array([1.2, 1.2, 1.2, 1.2, 0.5, 0.2, 0.2, 0.15]) * DEGREE,
 }
 _CORRELATION = {"x": 0.22, "y": 0.22, "z": 0.35, "Rz": 0.5, "Ry": 0.3, "Rx": 0.3}  # correlation times [s]
-_CENTERING = 0.9  # part of the mean of the five random curves that is removed
-_TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and correlation time of the lead in time [s]
+_CENTERING = 0.9  # fraction of the mean of the five random curves that is subtracted from each curve
+_TEMPO_DEVIATION, _TEMPO_CORRELATION = 0.05, 1.5  # standard deviation and correlation time of the time shift [s]
 
 
 def poses(z: np.ndarray | float, yaw: np.ndarray | float) -> np.ndarray:
@@ -92,8 +93,8 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
     script_times, script = insert_and_lock()
     scripted, curves = [], []
     for _ in range(NUM_DEMONSTRATIONS):
-        lead = _TEMPO_DEVIATION * correlated(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
-        script_time = np.clip(times + lead, 0.0, script_times[-1])
+        time_shift = _TEMPO_DEVIATION * correlated(rng, times, _TEMPO_CORRELATION) * np.sin(np.pi * times / times[-1])
+        script_time = np.clip(times + time_shift, 0.0, script_times[-1])
         scripted.append(np.stack([np.interp(script_time, script_times, column) for column in script.T], axis=1))
         curves.append(np.stack([correlated(rng, times, _CORRELATION[name]) for name in _DEVIATIONS], axis=1))
     wander = np.stack(curves) - _CENTERING * np.mean(curves, axis=0)
@@ -111,13 +112,13 @@ def random_curves(rng: np.random.Generator, times: np.ndarray, correlations: Seq
 
 
 def correlated(rng: np.random.Generator, times: np.ndarray, correlation: float) -> np.ndarray:
-    """Return a random curve (N,) of unit variance with a Gaussian autocorrelation of `correlation` seconds."""
+    """Return a random curve (N,) of unit variance, with a Gaussian autocorrelation of width `correlation` [s]."""
     covariance = np.exp(-0.5 * ((times[:, None] - times) / correlation) ** 2) + 1e-6 * np.eye(len(times))
     return np.linalg.cholesky(covariance) @ rng.standard_normal(len(times))
 
 
 RADIUS = 2.5 * MM  # radius of the circle
-TURN = 0.3  # period of the circle [s], much shorter than the search
+TURN = 0.3  # duration of one circle [s], much shorter than the search
 LIGHT_PUSH = 1.5 * MM  # distance of the command below the rim, which causes a force of about two newtons
 FIRM_PUSH = 6.0 * MM  # distance of the command below the rim, which causes a force of about nine newtons
 SEARCH = (1.2, 3.0)  # begin and end of the search [s]
@@ -134,8 +135,8 @@ SEARCH_WAYPOINTS = np.array(
         *_LOCKING,
     ]
 )
-# Standard deviations of the hand in addition to the circle: at the start, where the circle begins to shrink, inserted,
-# turned and locked.
+# Standard deviations of the hand's pose in addition to the circle, at five times of the motion: at the start, when the
+# circle begins to shrink, inserted, turned and locked.
 _SEARCH_TIMES = [0.0, HOLD_UNTIL, IN_BY, 7.0, 8.0]  # [s]
 _SEARCH_DEVIATIONS = {
     "x": np.array([0.05, 0.05, 0.15, 0.15, 0.10]) * MM,

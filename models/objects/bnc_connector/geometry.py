@@ -36,7 +36,7 @@ class BncDimensions:
     barrel_height: float = 10.0 * MM
     lug_radius: float = 0.975 * MM
     lug_tip_radius: float = 5.5 * MM  # from the center line to the end of a lug
-    lug_root_radius: float = 4.025 * MM  # a lug starts inside the barrel
+    lug_root_radius: float = 4.025 * MM  # from the center line to the start of a lug, inside the barrel
     lug_depth: float = 5.5 * MM  # depth of a lug's center below the barrel's open end
 
     bore_radius: float = 4.925 * MM
@@ -46,7 +46,7 @@ class BncDimensions:
     slot_clearance: float = 0.125 * MM  # clearance between lug and slot on each side
     slot_depth: float = 0.9 * MM  # radial depth of the slots' walls
 
-    entry_height: float = 3.4 * MM  # height at which the straight entry ends
+    entry_height: float = 3.4 * MM  # upper end of the straight entry
     entry_angle: float = np.deg2rad(6.0)  # angle at which the ramp starts
     apex_height: float = 5.4 * MM
     apex_angle: float = np.deg2rad(78.0)
@@ -60,7 +60,7 @@ class BncDimensions:
     seat_height: float = 10.7 * MM  # height of the plug's face that meets the pad, from the mouth
     seat_width: float = 8.0 * MM
     seat_thickness: float = 2.0 * MM
-    shell_radius: float = 5.0 * MM  # shell by which the plug is held
+    shell_radius: float = 5.0 * MM  # radius of the shell, where the tool holds the plug
     shell_length: float = 16.0 * MM
 
     @property
@@ -69,7 +69,7 @@ class BncDimensions:
         return round(self.bore_radius - self.barrel_radius, 9)
 
     def with_bore_clearance(self, clearance: float) -> "BncDimensions":
-        """Return the dimensions with a bore of another clearance on each side [m]."""
+        """Return the dimensions with the bore's radius changed to another clearance on each side [m]."""
         return self if clearance == self.bore_clearance else replace(self, bore_radius=self.barrel_radius + clearance)
 
     @property

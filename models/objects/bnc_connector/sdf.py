@@ -50,7 +50,7 @@ PLUG_MASS = 0.03  # [kg]
 
 
 def barrel_sides(dimensions: BncDimensions) -> int:
-    """Return the number of sides of Drake's polygon of the barrel: each is at most as long as the resolution hint."""
+    """Return the number of sides of Drake's polygon of the barrel; no side is longer than the resolution hint."""
     assert BARREL.resolution is not None
     return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
 
@@ -111,7 +111,7 @@ def files(
 def folder_of(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> Path:
-    """Return the folder with a connector's files: that of this module for the default arguments, else a temporary one.
+    """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments.
 
     The arguments are those of `jack_sdf`; default dimensions are `BncDimensions()`.
     """
@@ -121,7 +121,8 @@ def folder_of(
 
 
 MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism between the slots; its face is then 7 µm inside the circle
-# A rigid disc on a spring models the gasket, with the force of Drake's pad within 20 % up to 0.6 mm.
+# The gasket is a rigid disc on a spring. Up to a compression of 0.6 mm, its force differs from the force of Drake's pad
+# by at most 20 %.
 PAD_STIFFNESS = 1.5e5  # [N/m]
 
 
@@ -211,7 +212,7 @@ def _under_the_ramp(d: BncDimensions) -> list[Outline]:
 
 
 def _between_the_slots(d: BncDimensions) -> list[Outline]:
-    """Return prisms from the end of a slot to the chamfered entry of the other one."""
+    """Return prisms from the end of one slot to the chamfered entry of the other slot."""
     angles, top = slot_columns(d).angles, d.ring_length
     wide, chamfer = SHOULDER / d.slot_radius, d.mouth_chamfer / d.slot_radius
     begin, end = angles[-1], np.pi + angles[0]
@@ -230,7 +231,7 @@ def _between_the_slots(d: BncDimensions) -> list[Outline]:
 
 
 def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing: float, left: bool = True) -> Outline:
-    """Return the shoulders of the edge from column i to i + 1 of a wall that faces up (1) or down (−1)."""
+    """Return the shoulders of the edge from column i to i + 1 of a wall; `facing` is 1 for up and −1 for down."""
     wide, h = SHOULDER / d.slot_radius, facing * wall
     slope = (h[i + 1] - h[i]) / (a[i + 1] - a[i])
     # To the right the wall may be below the line of the edge; to the left the solid always reaches that line.

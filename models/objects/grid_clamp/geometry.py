@@ -49,7 +49,7 @@ class GridClampDimensions:
     lip_flank: float = 0.4 * MM  # size of the flanks, at 45 degrees
     bead_radius: float = 4.35 * MM
     bead_depth: float = 1.5 * MM  # depth of the bead's crest with the shoulder on the table
-    bead_entry: float = 1.2 * MM  # length of the flank that meets the lip first
+    bead_entry: float = 1.2 * MM  # length of the flank that touches the lip first
     bead_exit: float = 0.6 * MM
 
     shoulder_width: float = 56.0 * MM
@@ -74,7 +74,7 @@ class GridClampDimensions:
 
 
 def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
-    """Return the mesh of a profile of (radius, height) [m], with polygons around the circles."""
+    """Return the mesh of a profile of (radius, height) [m], with circumscribed polygons for circles."""
     return lathe([(radius / np.cos(np.pi / NUM_SIDES), height) for radius, height in profile], NUM_SIDES)
 
 

@@ -44,7 +44,7 @@ LIP = ContactMaterial(friction=0.1)
 SLAB = ContactMaterial(friction=FRICTION)
 
 CLAMP_MASS = 0.15  # [kg]
-STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem by which the clamp is held
+STEM_RADIUS, STEM_LENGTH = 6.0 * MM, 6.0 * MM  # stem, where the tool holds the clamp [m]
 
 
 def clamp_sdf(dimensions: GridClampDimensions, friction: float = FRICTION) -> str:
@@ -94,7 +94,7 @@ def files(dimensions: GridClampDimensions, friction: float = FRICTION) -> dict[s
 
 
 def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Path:
-    """Return the folder with the files of clamp and table: the package's for default arguments, or a temporary one."""
+    """Return the folder with the files of clamp and table: a temporary one, or this module's for default arguments."""
     if (dimensions, friction) == (GridClampDimensions(), FRICTION):
         return FOLDER
     return generate_assets(files, dimensions, friction)
@@ -103,8 +103,8 @@ def folder_of(dimensions: GridClampDimensions, friction: float = FRICTION) -> Pa
 # Each side of the bead has its own spring, as stiff as one side of Drake's compliant bead in the lip.
 BEAD_STIFFNESS = 7e3  # [N/m]
 BEAD_CORE = 2.0 * MM  # inner radius of the bead's sides
-BEAD_GAP = 0.4 * MM  # gap between a side and the corner, so that a side touches only the lip side that it faces
-# Extra radius in the middle of a side's crest. Along a straight crest, contact is an edge and its normal is arbitrary.
+BEAD_GAP = 0.4 * MM  # gap between a side and its corners: a side must touch only the side of the lip that it faces
+# Extra radius in the middle of a side's crest. A straight crest would touch along a line, with an arbitrary normal.
 BEAD_CROWN = 0.01 * MM
 LIP_BACK = 2.0 * MM  # radial thickness of the lip
 

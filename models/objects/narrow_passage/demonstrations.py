@@ -1,9 +1,9 @@
 """Nine synthetic demonstrations through the narrow passage.
 
-They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like those,
-they are smooth, have the same duration, vary where the plane is free, and agree in the passage. Their starts and goals
-differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean crosses the
-obstacle, and two of them enter the zone.
+They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), which are not published. Like the
+originals, they are smooth, have the same duration, vary where the plane is free, and agree in the passage. Their starts
+and goals differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean
+crosses the obstacle, and two of them enter the zone.
 """
 
 from pathlib import Path
@@ -20,7 +20,8 @@ NUM_DEMONSTRATIONS = 9
 NUM_STEPS = 400
 PERIOD = 0.02  # time between points [s]
 
-# Mean of x, and standard deviations of x and y [m], over the progress along the path from 0 to 1.
+# Knots (progress, value) of the mean of x, and of the standard deviations of x and y [m]. The progress along the path
+# is from 0 to 1.
 _MEAN_X = [(0, 0.30), (0.25, 0.55), (0.42, 0.35), (0.66, 0.35), (0.80, 0.47), (0.95, 0.40), (1, 0.40)]
 _DEVIATION_X = [
     (0, 0.012),
@@ -47,15 +48,15 @@ _DEVIATION_Y = [
     (1, 0.01),
 ]
 _Y = (0.05, 0.95)  # y of start and goal [m]
-_ARRIVAL = 0.95  # part of the duration after which the goal is reached
-_CORRELATION = 0.22  # correlation time of the deviations, as part of the duration
-_CENTERING = 0.7  # part of the mean of the nine random curves that is removed
+_ARRIVAL = 0.95  # fraction of the duration after which the goal is reached
+_CORRELATION = 0.22  # correlation time of the deviations, as a fraction of the duration
+_CENTERING = 0.7  # fraction of the mean of the nine random curves that is subtracted from each curve
 _SMOOTHING = 4.0  # standard deviation of the smoothing [steps]
 
 
-def generate(seed: int = 0) -> Demonstrations:
+def generate() -> Demonstrations:
     """Return nine demonstrations: a mean path plus smooth random curves, scaled by the standard deviations."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     phase = np.linspace(0, 1, NUM_STEPS)
     progress = np.clip(phase / _ARRIVAL, 0, 1)
     progress = 0.5 * progress + 0.5 * (3 * progress**2 - 2 * progress**3)

@@ -11,10 +11,10 @@ from guiderail.models.primitives import LinearConstraints
 
 @dataclass(frozen=True)
 class PassageGeometry:
-    """Positions and sizes in meters; the walls bound the position of the robot's center.
+    """Positions and sizes [m] of walls, restricted zone, obstacles and goal.
 
-    The obstacles are discs on the path of the demonstrations, which ignore them. The robot can pass through an
-    obstacle, at a cost.
+    The walls bound the position of the robot's center. The obstacles are discs on the path of the demonstrations. The
+    robot can pass through an obstacle, at a cost.
     """
 
     start: tuple[float, float] = (0.30, 0.05)  # start (x, y) of the robot
@@ -50,7 +50,7 @@ class PassageGeometry:
         return LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-self.zone_x]))
 
     def keep_out(self, margin: float = 0.02) -> KeepOut:
-        """Return the keep-out region of safe residual RL, `margin` [m] before walls and zone (section 4.4.1).
+        """Return the keep-out region of safe residual RL: walls and zone, enlarged by `margin` [m] (section 4.4.1).
 
         Raises:
             InputError: If the margin is negative or not finite.
@@ -63,7 +63,7 @@ class PassageGeometry:
         return bool(np.hypot(pose[0] - self.goal[0], pose[1] - self.goal[1]) < self.goal_radius)
 
     def in_passage(self, pose: np.ndarray) -> bool:
-        """Return True close to the walls along y, where they may block the robot, at any x.
+        """Return True if the robot is so close to the walls along y that they may block it, at any x.
 
         The robot's center `pose` (2,) [m] is then less than 5 cm before the walls, between them, or less than 2 cm
         behind them.
@@ -73,7 +73,7 @@ class PassageGeometry:
     def obstacle_distance(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the distance d_t [m] of the robot's center from an obstacle's edge, negative inside (equation 4.24).
 
-        `pose` (2,) [m] is the robot's center, and `obstacle` (2,) [m] that of the obstacle; default: `self.obstacle`.
+        `pose` (2,) is the robot's center [m]. `obstacle` (2,) is the obstacle's center [m], by default `self.obstacle`.
         """
         x, y = self.obstacle if obstacle is None else obstacle
         return float(np.hypot(pose[0] - x, pose[1] - y)) - self.obstacle_radius
