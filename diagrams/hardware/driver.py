@@ -32,7 +32,7 @@ POLL_PERIOD = 2e-4  # pause between two reads of a driver that cannot wait [s]
 TORQUE_SHARE, EXTERNAL_TORQUE_SHARE, VELOCITY_SHARE = 0.9, 0.8, 0.8
 TORQUE_TOLERANCE_SHARE = 0.02  # largest error of a joint torque by friction, gravity and sensor, relative to its limit
 
-MAX_DIFFERENCE = 0.02  # largest difference of an entry of a flange's pose from that of the driver's robot [m, 1]
+MAX_DIFFERENCE = 0.02  # largest difference between entries of the flange's pose of two equal robots [m, 1]
 
 CommandCallback = Callable[[np.ndarray, float], None]
 
@@ -69,7 +69,7 @@ class Driver(ABC):
     # External torques at which the robot stops by itself under torque control, (n,) [Nm].
     torque_reflex_limits: ClassVar[tuple[float, ...]]
     has_command_timeout: ClassVar[bool]  # True if the driver brings the arm to rest when commands stop
-    # True if `hold` is implemented: the driver then holds the arm without status or torques.
+    # True if `hold` is implemented: the robot then brakes or holds its position without a status or torques.
     can_hold: ClassVar[bool] = False
     # Time after its first status during which the driver must not receive commands [s].
     hold_off: ClassVar[float] = 0.25

@@ -32,8 +32,9 @@ POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/r
 STOP_TIME = 0.5  # longest duration of a stop by damping [s]
 RECONNECTION_TIME = 10.0  # longest wait for a robot whose connection was lost [s]
 # Collision thresholds of the robot, relative to the impedance's largest wrench along an axis. The force threshold is at
-# least that of libfranka's examples [N], because the robot's estimate is off by some newtons. In simulation a plug that
-# drops from a rim into its hole ends with an impact of 1.9 times that wrench (28 N instead of 15 N; eight episodes).
+# least the threshold in libfranka's examples [N], because the robot's estimate has an error of some newtons. In
+# simulation a plug that drops from a rim into its hole ends with an impact of 1.9 times the impedance's largest force
+# (28 N instead of 15 N; eight episodes).
 FORCE_THRESHOLD_SHARE, MIN_FORCE_THRESHOLD = 2.5, 20.0
 MAX_TOOL_ERROR = 1e-4  # largest error of an entry of the tool frame's matrix that the robot reports [m, 1]
 MAX_MASS_ERROR = 0.05  # largest error of the mass that the robot reports [kg]
@@ -45,9 +46,9 @@ TORQUE_THRESHOLD = (20.0, 20.0, 18.0, 18.0, 16.0, 14.0, 12.0)  # collision thres
 class FciDriver(PoseDriver):
     """Franka Emika Panda or FR3 on the Franka Control Interface.
 
-    The external torque of the interface is that of the arm on its surroundings. After a reflex the status is malformed
-    until `recover` has cleared the error, so the station stops. If this program ends, libfranka's loop ends as well and
-    the robot brakes; if it hangs, the robot keeps the last desired pose with the bounded wrench.
+    The external torque of the interface is the torque of the arm on its surroundings. After a reflex the status is
+    malformed until `recover` has cleared the error, so the station stops. If this program ends, libfranka's loop also
+    ends and the robot brakes. If this program hangs, the robot holds the last desired pose with the bounded wrench.
     """
 
     name = robot = "panda"

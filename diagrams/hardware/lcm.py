@@ -115,11 +115,11 @@ class LcmDriver(Driver):
     command_channel: ClassVar[str]  # channel of the commands
     status_type: ClassVar[Any]  # message class of the statuses
     status_fields: ClassVar[tuple[str, str, str]]  # fields of `status_type`: position, velocity and external torque
-    external_torque_sign: ClassVar[float]  # sign that converts external torques to those of the surroundings on the arm
+    external_torque_sign: ClassVar[float]  # 1 for torques of the surroundings on the arm, −1 for the reactions
     command_type: ClassVar[Any]  # message class of the commands, with the field `joint_torque`
 
     def __init__(self, lcm: DrakeLcmInterface | str = ""):
-        """Open the connection on a bus, which is given as an object or by its URL.
+        """Open the connection on a bus; `lcm` is an object or a URL.
 
         Raises:
             InputError: If the URL is unusable.

@@ -162,9 +162,9 @@ def serve_in_lockstep(
 ) -> float:
     """Simulate an arm for another process, and wait after each step until its status is acknowledged.
 
-    Neither process runs ahead of the other, however slow the machine is. A `LockstepClock` acknowledges each status;
-    before its first acknowledgement, a command counts as an acknowledgement. The arm has a bus of its own, so that no
-    message arrives within a step: commands apply from the next step on, independently of timing.
+    Neither process runs ahead of the other, on a machine of any speed. A `LockstepClock` acknowledges each status;
+    before its first acknowledgement, a command counts as an acknowledgement. The arm has a separate bus, so that no
+    message arrives within a step. Commands therefore apply from the next step on, independently of timing.
 
     Args:
         simulator: Simulator of the arm, initialized.

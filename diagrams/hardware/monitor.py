@@ -38,7 +38,7 @@ class SafetyMonitor:
     """Monitor of a robot's statuses and commands that damps the arm to rest when commands stop or a status is wrong.
 
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
-    lost. The monitor therefore runs on the driver's machine, in a process of its own. It checks statuses with the same
+    lost. The monitor therefore runs on the driver's machine, in a separate process. It checks statuses with the same
     `StateEstimator` as the station, but with its own clock. It sends a heartbeat with every check, so that a commanding
     program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
     (`CommandSequence`): the arm is damped, and then has zero torque until only one program sends commands. During a

@@ -54,9 +54,9 @@ class RtdeDriver(PoseDriver):
     measures the commanded wrench. At rest the arm therefore acts as a spring with a bounded force. The controller's own
     loop damps the motion.
 
-    The measured wrench is that of the surroundings on the tool. It is reported as joint torques Jᵀ F. A protective or
-    emergency stop, and an ended program, make the status malformed until `recover`. If no command arrives for
-    1 / `WATCHDOG_FREQUENCY`, the controller ends its program and the arm stops.
+    The robot measures the wrench F of the surroundings on the tool, which is reported as joint torques Jᵀ F. After a
+    protective or emergency stop, or if the robot's program has ended, the status is malformed until `recover`. If no
+    command arrives for 1 / `WATCHDOG_FREQUENCY`, the controller ends its program and the arm stops.
     """
 
     name = robot = "ur5e"
@@ -70,8 +70,8 @@ class RtdeDriver(PoseDriver):
 
         Args:
             url: Host name or address of the robot.
-            client: Namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`; those of
-                ur-rtde by default.
+            client: Namespace with `RTDEControlInterface`, `RTDEReceiveInterface` and `DashboardClient`; by default the
+                classes of ur-rtde.
 
         Raises:
             InputError: If ur-rtde is not installed, or no host is named.
@@ -221,7 +221,12 @@ class RtdeDriver(PoseDriver):
             raise InputError("the driver rtde is used before it is configured")
         if not self._is_active:
             self._finish_stop()
-            self._check_kinematics()
+            distance = self._kinematic_distance()
+            if not distance <= MAX_POSE_DIFFERENCE:  # refuses NaN
+                raise InputError(
+                    f"the tool center of the robot at {self.url} is {1e3 * distance:.0f} mm from that of the "
+                    f"{self.name}'s model: it is another robot, or another tool is active"
+                )
             self._check(self._control.setWatchdog(WATCHDOG_FREQUENCY), "watchdog")
             self._is_active, self._has_failed_to_stop = True, False
         # Computed with the station's model, so that driver and station agree; the robot's own pose may differ by 1 mm.
@@ -305,19 +310,6 @@ class RtdeDriver(PoseDriver):
     def _check(self, accepted: bool, what: str) -> None:
         if not accepted:
             raise InputError(f"the robot at {self.url} refuses its configuration: {what}")
-
-    def _check_kinematics(self) -> None:
-        """Compare the tool center of the robot with that of the model.
-
-        Raises:
-            InputError: If they differ by more than `MAX_POSE_DIFFERENCE`.
-        """
-        distance = self._kinematic_distance()
-        if not distance <= MAX_POSE_DIFFERENCE:  # refuses NaN
-            raise InputError(
-                f"the tool center of the robot at {self.url} is {1e3 * distance:.0f} mm from that of the {self.name}'s "
-                "model: it is another robot, or another tool is active"
-            )
 
     def _kinematic_distance(self) -> float:
         """Return the distance of the robot's tool center from the model's [m]."""

@@ -90,9 +90,9 @@ class HardwareStation(Station):
     =====================  =====  =====================================================================================
 
     Attributes:
-        driver, robot, period, control_period, limits, status_limits, impedance: As given to the constructor, or by
-            default.
-        controller_plant: The arm as the controller models it.
+        driver, robot, period, control_period, limits, status_limits, impedance: Arguments of the constructor, or their
+            defaults.
+        controller_plant: Model of the arm for the controller.
     """
 
     wraps_angles = True
@@ -289,8 +289,8 @@ class HardwareStation(Station):
     def take_over(self, simulator: Simulator, other: HardwareStation, other_context: Context) -> None:
         """Initialize a simulator that contains this station, and take control from another station without a gap.
 
-        It neither waits nor raises if the driver fails, because the arm may be moving. The other station and its
-        context are those of `copy_state_from`.
+        If the driver fails, this method neither waits nor raises an exception, because the arm may be moving. See
+        `copy_state_from` for `other` and `other_context`.
         """
         self.driver.guard.receive()
         if isinstance(self.driver, PoseDriver):
@@ -327,7 +327,7 @@ class HardwareStation(Station):
     def resume(self, context: Context) -> None:
         """End a stop, and continue from where the arm is; `context` is the root context.
 
-        Without a valid command the arm stays there, also if it was moved by hand during the stop.
+        Without a valid command the arm stays at its pose, even if it was moved by hand during the stop.
 
         Raises:
             InputError: If the arm is not stopped, not yet at rest, or a fault persists.
@@ -346,8 +346,8 @@ class HardwareStation(Station):
     def copy_state_from(self, context: Context, other: HardwareStation, other_context: Context) -> None:
         """Copy the state of another station on the same driver, so that this station takes control without a gap.
 
-        The other station is a `clone` of this station, or the original of this clone. Both contexts are those of the
-        stations, not root contexts; `context` is initialized.
+        The other station is a `clone` of this station, or the original of this clone. Both contexts are contexts of
+        the stations, not root contexts; `context` is initialized.
         """
         context.SetStateAndParametersFrom(other_context)
         for system, source, port in (
@@ -359,7 +359,7 @@ class HardwareStation(Station):
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Raise `InputError`, because a reset cannot set the pose of a real arm."""
-        raise InputError("a real arm can't be put to a pose by a reset: move it there by desired poses")
+        raise InputError("a reset cannot set the pose of a real arm: move it there by desired poses")
 
     def clone(self, workcell: Workcell) -> HardwareStation:
         """Return another station of the same arm on the same driver, with the same limits."""

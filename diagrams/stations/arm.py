@@ -66,7 +66,7 @@ def add_arm(
 ) -> ArmModel:
     """Add the arm at the world's origin, the tool, and the workpiece to a plant that is not finalized.
 
-    `robot` and `end_effector` are objects or names; `as_rigid` makes an open gripper one rigid body.
+    `robot` and `end_effector` are objects or names. With `as_rigid`, a gripper is one rigid body in its open state.
     """
     robot, end_effector = find_robot(robot), find_end_effector(end_effector)
     arm = add_robot(plant, robot)
@@ -252,7 +252,7 @@ class ArmStation(Station):
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
     def joint_range(self, margin: float, min_singular_value: float) -> JointRange:
-        """Return constraints on the joint positions that belong to a commanded pose; see `JointRange`."""
+        """Return constraints on the joint positions at a commanded pose; see `JointRange`."""
         model = self._controller_plant
         return JointRange(model.plant, model.target, model.tool_center, model.posture, margin, min_singular_value)
 

@@ -34,7 +34,7 @@ EXACT_WRENCH = "exact_wrench"
 
 
 class DisturbedStation(Station):
-    """A station with disturbances between its ports and those of the inner station.
+    """A station with disturbances between its ports and the ports of an inner station.
 
     Measured pose and wrench are disturbed; success and the contact force, by which collisions are detected, are not.
     A further output, `exact_wrench`, is the wrench without errors.
@@ -134,7 +134,7 @@ class DisturbedStation(Station):
         return self._inner.joint_range(margin, min_singular_value)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
-        """Sample the disturbances of an episode, and return them by name."""
+        """Sample the disturbances of an episode; return them by name."""
         d, e = self._disturbances, self._errors
         friction, modulus = (_sample_factor(rng, factors) for factors in (d.friction_factor, d.modulus_factor))
         scale, seed = _sample_factor(rng, e.wrench_scale), int(rng.integers(2**31))
@@ -184,10 +184,10 @@ def _without_replaced_errors(disturbances: Disturbances, station: Station) -> Se
         return errors
     if not getattr(station, "estimates_wrench", False):
         return replace(errors, joint_torque=None)
-    given = disturbances.model_dump(exclude_none=True)
+    options = disturbances.model_dump(exclude_none=True)
     exact = SENSING["exact"]
     replaced = ("wrench_scale", "wrench_bias", "wrench_drift", "wrench_noise")
-    without_error = {name: getattr(exact, name) for name in replaced if name not in given}
+    without_error = {name: getattr(exact, name) for name in replaced if name not in options}
     return replace(errors, **without_error, wrench_gradient=exact.wrench_gradient)
 
 

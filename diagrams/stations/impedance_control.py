@@ -130,8 +130,8 @@ def add_impedance_control(
 ) -> OutputPort:
     """Add the controller of a robot, which checks its commands every `period` [s], and export a station's ports.
 
-    `state` is the port of the joint positions and velocities, (2n,), and `wrench` that of the measured wrench, (6,).
-    Returns the port of the joint torques, (n,).
+    `state` is the port of the joint positions and velocities, (2n,), and `wrench` the port of the measured wrench,
+    (6,). The result is the port of the joint torques, (n,).
     """
     controller, monitor, tank = add_controller(
         builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity

@@ -271,7 +271,7 @@ class MujocoStation(Station):
 
 
 def constraint_torques(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """Return the generalized force of contacts and joint limits on the model (nv,), without that of joint friction.
+    """Return the generalized force of contacts and joint limits on the model (nv,), without joint friction.
 
     MuJoCo's own sum, `qfrc_constraint`, includes joint friction.
     """

@@ -165,7 +165,7 @@ SENSING: dict[Sensing, SensorErrors] = {
         **_KINEMATICS,
     ),
 }
-"""Errors of each setting. On a station without an arm, "robot" has wrench errors like those of joint torque sensors."""
+"""Errors of each setting. Without an arm, "robot" means wrench errors of the size that joint torque sensors cause."""
 
 
 Factors = Annotated[
@@ -240,7 +240,7 @@ class Disturbances(Options):
     def errors(self) -> SensorErrors:
         """Errors of the sensors: errors of the setting `sensing`, replaced by the given options of single errors.
 
-        Joint torques have errors of their own. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
+        Joint torques have separate errors. A given `wrench_scale` replaces their gain, `wrench_bias` their offset
         and the errors of the arm's model, `wrench_drift` their drift and friction, `wrench_noise` their noise.
         """
         errors = SENSING[self.sensing]

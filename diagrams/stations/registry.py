@@ -66,7 +66,7 @@ def register_station(
         workcell_kind: Kind of workcell that the station needs.
         options: Class of the station's environment options; None if it has none.
         is_simulated: True for a simulation: a reset can set its state.
-        time_unit: Time step of the plant, of which control periods are whole multiples [s]; default: 5 ms.
+        time_unit: Control periods are whole multiples of this time [s]; default: 5 ms.
         control_period: Control period without the option `control_period` [s]; default: 20 ms.
 
     Raises:

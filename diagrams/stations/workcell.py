@@ -77,7 +77,7 @@ class MovableWorkcell(ABC):
 
     @property
     def X_WT(self) -> RigidTransform:
-        """Pose of the target in the world: that of the workpiece assembled in the nominal fixture."""
+        """Pose of the target in the world: pose of the workpiece assembled in the nominal fixture."""
         return self.X_WF @ self.X_FT
 
     def add_fixture(self, plant: MultibodyPlant) -> None:

@@ -60,8 +60,8 @@ class Surface:
 def ring_hulls(profile: np.ndarray, num_sides: int) -> list[np.ndarray]:
     """Return the vertices (4 K, 3) [m] of convex pieces of a polygonal ring about z, including shoulders.
 
-    The middle of a side lies on the x axis, as in `sdf.lathe`. `profile` (K, 2) holds the corners of the convex
-    section: [radius of the circle inside the polygon, height] [m].
+    The middle of a side lies on the x axis, as in `sdf.lathe`. `profile` (K, 2) has the corners of the convex
+    section as [radius of the circle inside the polygon, height] [m].
     """
     radius, height = np.asarray(profile, dtype=float).T
     radius = radius / np.cos(np.pi / num_sides)

@@ -87,8 +87,7 @@ def measure_overlap(first: Sequence[Any], second: Sequence[Any]) -> tuple[float,
 
 def compute_center_of_mass(part: Part) -> np.ndarray:
     """Return the center of mass (3,) [m] of a part with uniform density."""
-    meshes, volumes = _meshes(part)
-    return volumes @ np.array([mesh.center_mass for mesh in meshes]) / volumes.sum()
+    return np.asarray(_join_bodies(part).center_mass)
 
 
 def compute_radius_of_gyration(part: Part) -> float:
@@ -96,17 +95,13 @@ def compute_radius_of_gyration(part: Part) -> float:
 
     An inertia of m k² about every axis then has the trace of the part's inertia.
     """
-    meshes, volumes = _meshes(part)
-    offsets = np.array([mesh.center_mass for mesh in meshes]) - compute_center_of_mass(part)
-    traces = [np.trace(mesh.moment_inertia) for mesh in meshes] + 2.0 * volumes * (offsets**2).sum(axis=1)
-    return float(np.sqrt(traces.sum() / (3.0 * volumes.sum())))
+    mesh = _join_bodies(part)
+    return float(np.sqrt(np.trace(mesh.moment_inertia) / (3.0 * mesh.volume)))
 
 
-def _meshes(part: Part) -> tuple[list[Any], np.ndarray]:
-    """Return each body as a mesh of trimesh, and the volumes of the bodies [m³]."""
-    trimesh = import_extra("trimesh")
-    meshes = [trimesh.Trimesh(vertices, triangles, process=False) for vertices, triangles in part.bodies]
-    return meshes, np.array([mesh.volume for mesh in meshes])
+def _join_bodies(part: Part) -> Any:
+    """Return all bodies of a part as one mesh of trimesh [m]."""
+    return import_extra("trimesh").Trimesh(*join_surfaces(part.bodies), process=False)
 
 
 def plan_motion(plug: Part, socket: Part, turn: float, clear: float = 3e-3, *, advance: float = 0.0) -> InsertionMotion:

@@ -119,7 +119,7 @@ def _with_large_faces(convex: Any) -> Any:
 def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
     """Cut faces into fans of triangles, as Drake does; return the smallest triangle's area [mm²] and flattest corner.
 
-    `faces` holds the number of corners and the corners of each polygon.
+    `faces` lists, for each polygon, the number of its corners and the corners.
     """
     smallest, corner, start = np.inf, 0, 0
     while start < len(faces):
@@ -130,7 +130,7 @@ def _smallest_face(points: np.ndarray, faces: list[int]) -> tuple[float, int]:
             a, b, c = points[triangle] * SCALE
             area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a)))
             if area < smallest:
-                # The corner opposite the longest side is nearest to the line of the other two.
+                # The corner opposite the longest side is nearest to the line through the other two corners.
                 opposite = np.argmax([np.linalg.norm(c - b), np.linalg.norm(c - a), np.linalg.norm(b - a)])
                 smallest, corner = area, int(triangle[opposite])
     return smallest, corner

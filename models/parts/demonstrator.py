@@ -90,10 +90,10 @@ def demonstrator_motions(
 ) -> np.ndarray:
     """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
-    The random deviations are wide while the command is above the height `press_from` [m]. They become narrow over the
-    3 mm below it, and each search ends at a socket of its own (`socket_offsets`). The variance of the demonstrations is
-    then that of the socket's position, so that actions can follow a displaced socket down to the target. With a
-    `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its socket's turn from the
+    The random deviations are wide while the command is above the height `press_from` [m], and become narrow over the
+    3 mm below. Each search ends at a different socket position (`socket_offsets`). The variance of the demonstrations
+    is then the variance of the socket positions, so that actions can follow a displaced socket down to the target. With
+    a `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its socket's turn from the
     start.
     """
     rng = np.random.default_rng(seed)

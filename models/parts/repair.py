@@ -117,7 +117,7 @@ def _wrap(gaps: str, vertices: np.ndarray, triangles: np.ndarray) -> Any:
     `gaps` describes the gaps, and is the beginning of the error messages.
 
     Raises:
-        InputError: If the software for the repair is not installed, or no attempt gives a solid.
+        InputError: If the software for the repair is not installed, or no attempt results in a solid.
     """
     if find_spec("pytetwild") is None or find_spec("pyvista") is None:
         raise InputError(
@@ -176,8 +176,8 @@ def find_open_edges(triangles: np.ndarray) -> np.ndarray:
 def close_edges(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Return the triangles of a mesh (V, 3), (T, 3) after the repair of its open edges; some edges may remain open.
 
-    If the triangles in one plane are removed, the open edges of the other triangles enclose the face in that plane,
-    provided that no triangle is missing elsewhere. The face is replaced only if fewer edges are open afterwards.
+    The triangles in one plane are removed. If no triangle is missing elsewhere, the open edges of the remaining
+    triangles enclose the face in this plane. The face is replaced only if fewer edges are open afterwards.
     """
     triangles = _without_loose_triangles(triangles)
     open_edges = find_open_edges(triangles)

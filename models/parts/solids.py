@@ -91,7 +91,7 @@ def measure_distance(
 ) -> float:
     """Return the largest distance of sampled points of one surface from another surface [m].
 
-    The arguments are those of `measure_deviation`.
+    See `measure_deviation` for the arguments.
     """
     points, _ = sample_surface(*points_of, count)
     return float(SurfaceLocator(*surface).find_nearest(points)[1].max())
@@ -102,7 +102,7 @@ def measure_deviation(
 ) -> float:
     """Return the sampled Hausdorff distance of two surfaces [m].
 
-    Each surface is a pair of vertices (V, 3) [m] and triangles (T, 3); `count` is that of `sample_surface`.
+    Each surface is a pair of vertices (V, 3) [m] and triangles (T, 3). See `sample_surface` for `count`.
     """
     return max(measure_distance(first, second, count), measure_distance(second, first, count))
 

@@ -102,7 +102,7 @@ def demonstrator_motions(seed: int, times: np.ndarray) -> np.ndarray:
 
 
 def _interpolate(times: np.ndarray, at: list[float], deviations: dict[str, np.ndarray]) -> np.ndarray:
-    """Return standard deviations (N, 6) at `times` (N,), given those of each coordinate at the times `at` [s]."""
+    """Interpolate the standard deviations of each coordinate, given at the times `at` [s]; return (N, 6)."""
     return np.stack([np.interp(times, at, deviation) for deviation in deviations.values()], axis=1)
 
 

@@ -57,7 +57,7 @@ class BncDimensions:
     pad_radius: float = 3.0 * MM
     pad_height: float = 0.6 * MM  # height of the pad's top above the barrel's open end
     pad_thickness: float = 2.0 * MM
-    seat_height: float = 10.7 * MM  # height of the plug's face that meets the pad, from the mouth
+    seat_height: float = 10.7 * MM  # height above the mouth of the plug's face that touches the pad
     seat_width: float = 8.0 * MM
     seat_thickness: float = 2.0 * MM
     shell_radius: float = 5.0 * MM  # radius of the shell, where the tool holds the plug

@@ -60,7 +60,7 @@ def jack_sdf(
 ) -> str:
     """Return the jack's model: link `jack` is frame J, with geometry `barrel`, `pad`, `lug_0` and `lug_1`.
 
-    `friction` and `margin` [m] are those of barrel and lugs. The collision geometry of the barrel is an inscribed
+    `friction` and `margin` [m] apply to barrel and lugs. The collision geometry of the barrel is an inscribed
     polygon, or with `equal_area` a polygon of the same area.
     """
     d = dimensions
@@ -82,7 +82,7 @@ def jack_sdf(
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
     """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`.
 
-    `friction` is that of bore and slots.
+    `friction` applies to bore and slots.
     """
     d, ring = dimensions, replace(RING, friction=friction)
     seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
@@ -98,7 +98,7 @@ def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
 def files(
     dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
 ) -> dict[str, str]:
-    """Return the content of each file by name; the arguments are those of `jack_sdf`."""
+    """Return the content of each file by name; see `jack_sdf` for the arguments."""
     return {
         "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
@@ -113,7 +113,7 @@ def folder_of(
 ) -> Path:
     """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments.
 
-    The arguments are those of `jack_sdf`; default dimensions are `BncDimensions()`.
+    See `jack_sdf` for the arguments; default dimensions are `BncDimensions()`.
     """
     if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
         return FOLDER

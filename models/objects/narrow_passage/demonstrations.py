@@ -20,33 +20,25 @@ NUM_DEMONSTRATIONS = 9
 NUM_STEPS = 400
 PERIOD = 0.02  # time between points [s]
 
-# Knots (progress, value) of the mean of x, and of the standard deviations of x and y [m]. The progress along the path
-# is from 0 to 1.
-_MEAN_X = [(0, 0.30), (0.25, 0.55), (0.42, 0.35), (0.66, 0.35), (0.80, 0.47), (0.95, 0.40), (1, 0.40)]
-_DEVIATION_X = [
-    (0, 0.012),
-    (0.08, 0.05),
-    (0.16, 0.11),
-    (0.28, 0.11),
-    (0.36, 0.03),
-    (0.41, 0.005),
-    (0.67, 0.005),
-    (0.72, 0.03),
-    (0.79, 0.09),
-    (0.86, 0.08),
-    (0.95, 0.012),
-    (1, 0.012),
-]
-_DEVIATION_Y = [
-    (0, 0.01),
-    (0.20, 0.025),
-    (0.30, 0.025),
-    (0.42, 0.010),
-    (0.62, 0.010),
-    (0.78, 0.025),
-    (0.95, 0.01),
-    (1, 0.01),
-]
+# Mean of x, and standard deviations of x and y. Rows: progress along the path from 0 to 1, and value [m].
+_MEAN_X = np.array(
+    [
+        [0.0, 0.25, 0.42, 0.66, 0.80, 0.95, 1.0],
+        [0.3, 0.55, 0.35, 0.35, 0.47, 0.40, 0.4],
+    ]
+)
+_DEVIATION_X = np.array(
+    [
+        [0.000, 0.08, 0.16, 0.28, 0.36, 0.410, 0.670, 0.72, 0.79, 0.86, 0.950, 1.000],
+        [0.012, 0.05, 0.11, 0.11, 0.03, 0.005, 0.005, 0.03, 0.09, 0.08, 0.012, 0.012],
+    ]
+)
+_DEVIATION_Y = np.array(
+    [
+        [0.00, 0.200, 0.300, 0.42, 0.62, 0.780, 0.95, 1.00],
+        [0.01, 0.025, 0.025, 0.01, 0.01, 0.025, 0.01, 0.01],
+    ]
+)
 _Y = (0.05, 0.95)  # y of start and goal [m]
 _ARRIVAL = 0.95  # fraction of the duration after which the goal is reached
 _CORRELATION = 0.22  # correlation time of the deviations, as a fraction of the duration
@@ -75,5 +67,5 @@ def load() -> Demonstrations:
     return Demonstrations.load(PATH)
 
 
-def _profile(knots: list[tuple[float, float]], progress: np.ndarray) -> np.ndarray:
-    return PchipInterpolator(*np.array(knots).T)(progress)
+def _profile(knots: np.ndarray, progress: np.ndarray) -> np.ndarray:
+    return PchipInterpolator(*knots)(progress)

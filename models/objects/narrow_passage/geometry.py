@@ -81,7 +81,7 @@ class PassageGeometry:
     def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the cost r_o of one obstacle as a reward, zero or negative (equation 4.24).
 
-        The arguments are those of `obstacle_distance`.
+        See `obstacle_distance` for the arguments.
         """
         return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
