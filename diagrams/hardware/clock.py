@@ -122,9 +122,9 @@ def garbage_collection_disabled() -> Iterator[None]:
 class WallClock(Clock):
     """Clock that advances a hardware station in real time: one step when a status arrives.
 
-    A step is made without a status if none arrives for one and a half periods; the station's watchdog detects this.
-    If this program was delayed, only the newest status is used: lost time is not made up for. If statuses arrive more
-    often than once a period, some are skipped: the station is never more than half a period ahead of the wall clock.
+    If no status arrives for one and a half periods, a step is made without one; the station's watchdog detects this.
+    If this program was delayed, only the newest status is used, and lost time is not made up for. If statuses arrive
+    more often than once a period, some are skipped: the station is at most half a period ahead of the wall clock.
 
     Attributes:
         intervals: Intervals between steps.

@@ -23,9 +23,6 @@ from guiderail.models.control.motion_constraints import MotionLimits
 
 logger = logging.getLogger(__name__)
 
-# Limits of the commands: a fifth of the robot's linear and four fifths of its angular velocity, and half of its
-# accelerations and jerks. A single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
-MOTION_LIMITS = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 NO_ERRORS = "[]"  # the client's list of errors as text, if the robot has none
 MAX_TORQUE_STEP = 1.0  # largest change of a torque within 1 ms [Nm]; the interface's limit
 POSTURE_STIFFNESS = 5.0  # stiffness of the posture task in the null space [Nm/rad]
@@ -55,7 +52,9 @@ class FciDriver(PoseDriver):
     torque_reflex_limits = TORQUE_THRESHOLD
     has_command_timeout = True
     hold_off = 0.25  # statuses are checked for this time before the first command [s]; the robot needs no pause
-    motion_limits = MOTION_LIMITS
+    # A fifth of the robot's linear and four fifths of its angular velocity, and half of its accelerations and jerks. A
+    # single axis has 1/√3 of a limit, which still lets a policy turn a bayonet at 1 rad/s.
+    motion_limits = MotionLimits((0.34, 6.5, 3250.0), (2.0, 12.5, 6250.0))
 
     def __init__(self, url: str = "", *, client: Any = None):
         """Construct the driver; the first `read` connects to the robot.

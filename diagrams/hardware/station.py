@@ -63,19 +63,19 @@ PROCESS_CHECK_PERIOD = 0.5  # time between checks of the robot's program during 
 class HardwareStation(Station):
     """A real arm with an impedance at its tool center, connected by a `Driver`.
 
-    Statuses are joint states. Commands are the joint torques of this station's impedance controller. If the driver is a
-    `PoseDriver`, they are desired poses, and the robot's own program runs the impedance controller. The robot's own
+    Statuses are joint states. Commands are the joint torques of this station's impedance controller. With a
+    `PoseDriver`, commands are desired poses, and the robot's own program runs the impedance controller. The robot's own
     controller compensates gravity in torque mode, so this station does not. The wrench is estimated from the external
     joint torques; there is no wrist sensor. `start` waits for the first status. Nothing is sent until statuses have
-    been valid for the settling time; then the torques are blended in, and the arm stays where it is until there is a
+    been valid for the settling time. Then the torques are blended in, and the arm stays at its pose until there is a
     valid command.
 
     A `StatusWatchdog` checks the statuses, a `HeartbeatMonitor` the safety monitor's heartbeat, and a
-    `TorqueSafetyLimiter` measurements and torques. Each of them can stop the arm; the output ``fault`` is then the
-    reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. With a `PoseDriver` there is no
-    input ``max_wrench``, because the robot's own controller bounds the wrench, and its bound is fixed. In addition
-    to every station's ports it has these outputs. As in Drake's own stations, the driver's name and a dot precede the
-    names of joint ports:
+    `TorqueSafetyLimiter` measurements and torques. Each of these systems can stop the arm; the output ``fault`` is then
+    the reason, and `resume` ends the stop. A `Clock` calls `receive` before each step. With a `PoseDriver` there is no
+    input ``max_wrench``, because the bound of the robot's own controller is fixed. This station has the following
+    outputs in addition to the ports of every station. As in Drake's own stations, the driver's name and a dot precede
+    the names of joint ports:
 
     =====================  =====  =====================================================================================
     output                 size   meaning
@@ -230,7 +230,6 @@ class HardwareStation(Station):
             tare = WrenchTare(period, *tare_steps(period))
             add_system(builder, "tare", tare, measured_wrench=measured_wrench)
             measured_wrench = tare.get_tared_wrench_output_port()
-        # With a `PoseDriver`, the robot's own controller bounds the wrench, and its bound is fixed.
         max_wrench = None
         if tank is not None and not isinstance(self.driver, PoseDriver):
             max_wrench = tank.get_max_wrench_input_port()
@@ -325,7 +324,7 @@ class HardwareStation(Station):
         self._limiter.stop(self._limiter.GetMyMutableContextFromRoot(context))
 
     def resume(self, context: Context) -> None:
-        """End a stop, and continue from where the arm is; `context` is the root context.
+        """End a stop, and continue from the arm's current pose; `context` is the root context.
 
         Without a valid command the arm stays at its pose, even if it was moved by hand during the stop.
 

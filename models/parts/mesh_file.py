@@ -101,7 +101,7 @@ def load_part(path: Path, unit: str) -> Part:
     """
     _check_unit(unit)
     if path.suffix.lower() not in ENDINGS:
-        raise InputError(f"{path} has the ending {path.suffix!r}: a part is {', '.join(ENDINGS[:-1])}")
+        raise InputError(f"{path} has the ending {path.suffix!r}: give a file with {', '.join(ENDINGS[:-1])}")
     import_extra("trimesh")
     if path.suffix.lower() in (".step", ".stp"):
         import_extra("cascadio")
@@ -117,12 +117,12 @@ def load_part(path: Path, unit: str) -> Part:
             f"{path} has {number} triangles, more than {MAX_TRIANGLES}: export it with a coarser tolerance"
         )
     if not len(triangles):
-        raise InputError(f"{path} holds no triangles: export the part as a mesh")
+        raise InputError(f"{path} has no triangles: export the part as a mesh")
     if not 0 <= triangles.min() <= triangles.max() < len(vertices):
-        raise InputError(f"{path} holds triangles of vertices that it lacks: export it again")
+        raise InputError(f"{path} has triangles with vertices that do not exist: export it again")
     corners = vertices[triangles.ravel()]
     if not np.isfinite(corners).all():
-        raise InputError(f"{path} holds vertices that are NaN or infinite: export it again")
+        raise InputError(f"{path} has vertices that are NaN or infinite: export it again")
     with np.errstate(over="ignore"):
         size = float(np.ptp(corners, axis=0).max()) * UNITS[unit]
     if not SMALLEST <= size <= LARGEST:
@@ -132,7 +132,7 @@ def load_part(path: Path, unit: str) -> Part:
     mesh = import_extra("trimesh").Trimesh(vertices, triangles, process=False)
     mesh.merge_vertices(merge_norm=True, merge_tex=True)
     if not (mesh.area > 0.0):
-        raise InputError(f"{path} holds only triangles without an area: export the part as a mesh")
+        raise InputError(f"{path} has only triangles without an area: export the part as a mesh")
     vertices, triangles = np.asarray(mesh.vertices) * UNITS[unit], np.asarray(mesh.faces)
     bodies, repair = close_surface(path.name, vertices, triangles)
     return Part(path, tuple(bodies), repair)

@@ -234,7 +234,7 @@ def _shoulders(d: BncDimensions, a: np.ndarray, wall: np.ndarray, i: int, facing
     """Return the shoulders of the edge from column i to i + 1 of a wall; `facing` is 1 for up and −1 for down."""
     wide, h = SHOULDER / d.slot_radius, facing * wall
     slope = (h[i + 1] - h[i]) / (a[i + 1] - a[i])
-    # To the right the wall may be below the line of the edge; to the left the solid always reaches that line.
+    # A shoulder is below the line of the edge and below the wall; the right one is also below the edge's right end.
     right_surface = min(np.interp(a[i + 1] + wide, a, h), h[i + 1])
     points = [[a[i + 1] + wide, facing * (min(h[i + 1] + slope * wide, right_surface) - BELOW)]]
     if left:

@@ -112,7 +112,7 @@ def test_load_part_refuses_triangles_of_missing_vertices(index, tmp_path):
         "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     )
     (tmp_path / "part.ply").write_text(header + f"0 0 0\n10 0 0\n0 10 0\n3 0 1 {index}\n")
-    with pytest.raises(InputError, match="vertices that it lacks"):
+    with pytest.raises(InputError, match="vertices that do not exist"):
         load_part(tmp_path / "part.ply", "mm")
 
 
@@ -222,7 +222,7 @@ def test_load_part_uses_the_best_of_several_repairs(tmp_path, monkeypatch):
     [
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
         (lambda mesh: mesh.apply_scale(1e30), "mm", "would be 2e.28 m long"),
-        (lambda mesh: mesh.apply_scale(1e-30), "mm", "would be 2e-32 m long|holds no triangles"),
+        (lambda mesh: mesh.apply_scale(1e-30), "mm", "would be 2e-32 m long|has no triangles"),
         (lambda mesh: trimesh.Trimesh(np.zeros((1, 3)), [[0, 0, 0]], process=False), "mm", "would be 0 m long"),
         (lambda mesh: trimesh.Trimesh([[0, 0, 0], [9, 0, 0]], [[0, 0, 1]], process=False), "mm", "without an area"),
     ],
