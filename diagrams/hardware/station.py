@@ -288,7 +288,7 @@ class HardwareStation(Station):
     def take_over(self, simulator: Simulator, other: HardwareStation, other_context: Context) -> None:
         """Initialize a simulator that contains this station, and take control from another station without a gap.
 
-        If the driver fails, this method neither waits nor raises an exception, because the arm may be moving. See
+        This method does not wait. If the driver fails, it raises no exception, because the arm may be moving. See
         `copy_state_from` for `other` and `other_context`.
         """
         self.driver.guard.receive()

@@ -138,7 +138,7 @@ class PouringStation(Station):
     ``tip_in_mug`` is the tip's pose in the actual mug's frame, (6,), position and rotation vector; ``balls_in_mug`` and
     ``balls_in_thermos`` are the poses of all n balls in the vessels' tip frames, (6 n,), in the same form.
     ``collision`` (1,) is 1 while the arm or the thermos touches table or mug; ``touched`` (1,) is 1 from the first
-    plant step with such a contact on.
+    plant step with such a contact.
     """
 
     wraps_angles = True
