@@ -28,14 +28,14 @@ from guiderail.tools.learning.learner import LEARNERS
 def describe_all() -> dict[str, Any]:
     """Describe all registered tasks, guidance, stations, robots, end effectors, drivers, learners, kernels and engines.
 
-    Guidance and stations have their ports and options, tasks their options. The entry `options` has the options that
-    tasks share. Entries of installed packages that cannot be used are left out.
+    The descriptions of guidance and stations include ports and options, those of tasks include options. The key
+    `options` has the options that all tasks share. Entries of installed packages that cannot be used are left out.
     """
-    described: dict[str, Registry[Any]] = {"drivers": DRIVERS, "kernels": KERNELS, "engines": ENGINES}
+    registries: dict[str, Registry[Any]] = {"drivers": DRIVERS, "kernels": KERNELS, "engines": ENGINES}
     return {
         "tasks": {name: describe_task(name) for name in TASKS.usable()},
-        "guidance": {name: _guidance(name) for name in GUIDANCE.usable()},
-        "stations": {name: _station(name) for name in STATIONS.usable()},
+        "guidance": {name: _describe_guidance(name) for name in GUIDANCE.usable()},
+        "stations": {name: _describe_station(name) for name in STATIONS.usable()},
         "robots": {
             name: {"description": find_robot(name).title, "joints": find_robot(name).num_joints}
             for name in ROBOTS.usable()
@@ -43,8 +43,8 @@ def describe_all() -> dict[str, Any]:
         "end_effectors": {name: {"description": find_end_effector(name).title} for name in END_EFFECTORS.usable()},
         "learners": {name: {} for name in LEARNERS.usable()},
         **{
-            key: {name: {"description": _first_line(registry.get(name))} for name in registry.usable()}
-            for key, registry in described.items()
+            key: {name: {"description": _first_paragraph(registry.get(name))} for name in registry.usable()}
+            for key, registry in registries.items()
         },
         "options": {
             "common": describe_options(CommonOptions),
@@ -63,7 +63,7 @@ def describe_task(name: str) -> dict[str, Any]:
     """
     declared = TASKS.get(name)
     return {
-        "description": _first_line(declared),
+        "description": _first_paragraph(declared),
         "environment": environment_id(name),
         "guidance": possible_guidance(declared.provides()),
         "stations": declared.stations(),
@@ -99,14 +99,14 @@ def describe_task_options(name: str) -> dict[str, str]:
     for model in (CommonOptions, *map(type, config.parts.values())):
         for row in describe_options(model):
             texts[row["name"]] = _describe_option(row, config.options[row["name"]], choices.get(row["name"], ()))
-    others: dict[tuple[str, str, str], list[str]] = {}  # names of guidance or stations, by option and text
+    names_by_text: dict[tuple[str, str, str], list[str]] = {}  # names of guidance or stations, by option and text
     registries: dict[str, Registry[Any]] = {"guidance": GUIDANCE, "station": STATIONS}
     for choice, registry in registries.items():
         for kind in map(registry.get, choices[choice]):
             for row in describe_options(kind.options) if kind.name != getattr(config, choice) else ():
                 key = row["name"], choice, _describe_option(row, row["default"])
-                others.setdefault(key, []).append(kind.name)
-    for (name, choice, text), names in others.items():
+                names_by_text.setdefault(key, []).append(kind.name)
+    for (name, choice, text), names in names_by_text.items():
         text = f"with {choice}={' or '.join(names)}: {text}"
         texts[name] = f"{texts[name]}; {text}" if name in texts else text
     for difficulty, settings in declared.difficulties.items():
@@ -127,12 +127,14 @@ def _describe_option(row: Mapping[str, Any], default: Any, choices: Collection[s
     values = [f"one of {', '.join(map(str, allowed))}"] if allowed else []
     if {"minimum", "maximum"} <= row.keys():
         values = [f"from {row['minimum']:g} to {row['maximum']:g}"]
-    if default not in (None, (), "") or "default" not in row["description"]:  # else the description explains it
+    if (
+        default not in (None, (), "") or "default" not in row["description"]
+    ):  # otherwise the description explains the default
         values.append(f"default {default!r}")
     return ": ".join([str(row["description"]), *(["; ".join(values)] if values else [])])
 
 
-def _guidance(name: str) -> dict[str, Any]:
+def _describe_guidance(name: str) -> dict[str, Any]:
     kind = GUIDANCE.get(name)
     return {
         "description": kind.label,
@@ -143,7 +145,7 @@ def _guidance(name: str) -> dict[str, Any]:
     }
 
 
-def _station(name: str) -> dict[str, Any]:
+def _describe_station(name: str) -> dict[str, Any]:
     kind = STATIONS.get(name)
     return {
         "description": kind.description,
@@ -161,5 +163,5 @@ def _format_value(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _first_line(thing: object) -> str:
-    return str(thing.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").strip()
+def _first_paragraph(entry: object) -> str:
+    return str(entry.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").strip()

@@ -35,7 +35,7 @@ from guiderail.tools.tables import write_table
 GUIDANCE = ("kmp", "kgrl", "skgrl")  # guidance that can be certified
 SEARCH_STEPS = 100_000  # steps of the adversary that determines the budgets
 BUDGET_MARGIN = 1.5  # ratio of the budgets to the worst corrections of the adversary
-# Addition to the budget of the excess, at one step and in total; see `Budget.excess`.
+# Amounts added to the budget of the excess, at one step and in total; see `Budget.excess`.
 MIN_EXCESS = ((0.01,), (0.1,))
 MIN_KEY_BYTES = 16  # shortest key that the checker accepts
 ROUNDING = 1.0 + 1e-6  # tolerance factor: an adversary may reach an exact bound up to rounding
@@ -71,12 +71,12 @@ def certify_skill(
         InputError: If there is no such run or task, its guidance cannot be certified, or an argument is invalid.
     """
     if attack < 0:
-        raise InputError(f"an attack has a number of steps, not {attack}")
+        raise InputError(f"the number of steps of an attack is at least 0, not {attack}")
     skill = _find_skill(subject, environment, start_within)
     signing_key = _read_key(key)
     if out is None:
         if not Path(subject).is_dir():
-            raise InputError("name the folder of the certificate of a task, or of pretrained:NAME, with --out")
+            raise InputError("a certificate of a task or of pretrained:NAME needs a folder: name it with --out")
         out = Path(subject) / "certificate"
     loop, primitive = skill.loop, skill.loop.primitive
     budget = None
@@ -121,15 +121,15 @@ def verify_certificate(
     """Check a certificate, and compare its assumptions with a skill.
 
     The checker proves that the bounds follow from the primitive, the constraints, the impedance and the budget in the
-    files. This function also computes the first three from the skill and compares them with the files. It then repeats
-    the search for the worst corrections, which must not exceed the budget.
+    files. This function also computes primitive, constraints and impedance from the skill, and compares them with the
+    files. It then repeats the search for the worst corrections, which must not exceed the budget.
 
     Args:
         subject: Folder of a run, `pretrained:NAME`, or name of a task.
         environment: As in `certify_skill`.
         folder: Folder of the certificate.
         start_within: As in `certify_skill`.
-        key: File of the key that must have signed the certificate; None: a signature is not checked.
+        key: File of the key that signed the certificate; None: the signature is not checked.
 
     Returns:
         The certificate's path and the verdict, "yes" or "no" with the reason.
@@ -148,12 +148,12 @@ def verify_certificate(
         if different is not None:
             if different == "about":
                 different = _different_option(json.loads(files[CERTIFICATE])["about"], skill.about)
-            verdict = f"no: its {different} is not that of {subject}"
+            verdict = f"no: the {different} of the certificate is not that of {subject}"
         elif (budgeted := json.loads(files[CERTIFICATE])["budgeted"]) is not None:
             worst = _search_budget(skill.loop)
             for name in checker.BUDGETS:
                 if not (getattr(worst, name) <= np.array(budgeted[name])).all():  # NaN exceeds every budget
-                    verdict = f"no: corrections of {subject} exceed its budget of {name}"
+                    verdict = f"no: corrections of {subject} exceed the certificate's budget of {name}"
     return {"certificate": str(folder / CERTIFICATE), "checker": verdict}
 
 
@@ -175,7 +175,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
             f"guidance={guidance!r} cannot be certified: use {' or '.join(GUIDANCE)}, with a "
-            "history of commands and of one length (neither adaptive_history nor history_source=measured)"
+            "history that has a fixed length and contains commands (neither adaptive_history nor history_source=measured)"
         )
     loop = _make_loop(config, start_within)
     impedance = config.make_task().impedance()
@@ -207,9 +207,9 @@ def _read_key(key: Path | None) -> bytes | None:
     try:
         content = key.read_bytes()
     except OSError as error:
-        raise InputError(f"the key {key} can't be read ({error.strerror})") from error
+        raise InputError(f"the key {key} can't be read ({error.strerror}): check the path") from error
     if len(content) < MIN_KEY_BYTES:
-        raise InputError(f"a key has at least {MIN_KEY_BYTES} bytes: head -c 32 /dev/urandom > {key}")
+        raise InputError(f"a key needs at least {MIN_KEY_BYTES} bytes: create one with head -c 32 /dev/urandom > {key}")
     return content
 
 
@@ -246,9 +246,10 @@ def _attack(loop: CertifiedLoop, certified: CertifiedBounds, steps: int, out: Pa
     }
     rows: list[dict[str, Any]] = []
     for quantity, is_corrected, output in itertools.product(QUANTITIES, (False, True), range(len(loop.gains))):
-        at = can_be_corrected == is_corrected
-        if at.any():
-            bound, value = certified_values[quantity][at, output], worst.largest[quantity][at, output]
+        steps_of_kind = can_be_corrected == is_corrected
+        if steps_of_kind.any():
+            bound = certified_values[quantity][steps_of_kind, output]
+            value = worst.largest[quantity][steps_of_kind, output]
             rows.append(
                 {
                     "quantity": quantity,
@@ -284,7 +285,7 @@ def _declared_start(config: EnvConfig, size: int) -> np.ndarray:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
     except (TypeError, ValueError):
         raise InputError(
-            f"start_within of {config.task} is a number, or {size} of them, not {brief(declared)}"
+            f"start_within of {config.task} must return a number or {size} numbers, not {brief(declared)}"
         ) from None
     disturbances = config.parts["disturbances"]
     if isinstance(disturbances, Disturbances):

@@ -44,7 +44,7 @@ def open_environment(name: str, options: dict[str, Any]) -> DiagramEnv:
         config.refuse_changed_task(Path(name), "open the task by its name")
         name, options = config.task, config.environment | options
     if "task" in options:
-        raise InputError("the task is given as the name, and not as the option 'task'")
+        raise InputError("the task is the first argument: leave the option 'task' out")
     return make_env(name, **as_arguments(options))
 
 
@@ -60,11 +60,11 @@ class EnvServer:
         self._station = env.task.diagram.GetSubsystemByName("station")
         self._is_done, self._info = False, {"is_success": False, "termination": ""}
         # A reset with a seed begins a new run, so that the seed determines the values that are hidden for a whole run.
-        self._seeded: dict[str, Any] = {"new_run": True}
+        self._seed_options: dict[str, Any] = {"new_run": True}
         try:
-            self._observation = env.reset(seed=0, options=self._seeded)[0]
-        except InputError:  # a task without such values
-            self._seeded = {}
+            self._observation = env.reset(seed=0, options=self._seed_options)[0]
+        except InputError:  # the task has no values that are hidden for a whole run
+            self._seed_options = {}
             self._observation = env.reset(seed=0)[0]
 
     def describe(self) -> dict[str, Any]:
@@ -81,7 +81,7 @@ class EnvServer:
                 seed = request["reset"]
                 if seed is not None and (type(seed) is not int or not 0 <= seed < 2**31):
                     raise InputError("a seed is a whole number from 0 to 2147483647, or null")
-                options = {} if seed is None else self._seeded
+                options = {} if seed is None else self._seed_options
                 self._observation, self._info = self._env.reset(seed=seed, options=options)
                 self._is_done = False
             else:
@@ -115,7 +115,7 @@ def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
 
 
 def _check_complete(line: str, requests: IO[str]) -> None:
-    """Raise a ValueError if a line is too long; the rest of it is read first, so that it is answered only once."""
+    """Raise a ValueError if a line is too long, after reading its rest, so that it gets only one answer."""
     if len(line) < MAX_LINE or line.endswith("\n"):
         return
     while len(line) == MAX_LINE and not line.endswith("\n"):

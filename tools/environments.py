@@ -39,32 +39,32 @@ from guiderail.models.common.registry import did_you_mean
 _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder
 
 
-def task_named(typed: str) -> tuple[str, tuple[str, ...]]:
-    """Return the name of a task, given its name or its folder's path, and the imports that a run of it needs.
+def task_named(name_or_folder: str) -> tuple[str, tuple[str, ...]]:
+    """Return the name of a task from its name or folder, and the imports that a run of the task needs.
 
     An unknown name is returned unchanged.
 
     Raises:
         InputError: If the folder's task is not valid, or its learner is unknown.
     """
-    if typed in TASKS.names() or not is_task_folder(typed):
-        return typed, ()
-    name = register_task_folder(typed)
-    from guiderail.tools.learning.config import resolve_preset  # it imports this module
+    if name_or_folder in TASKS.names() or not is_task_folder(name_or_folder):
+        return name_or_folder, ()
+    name = register_task_folder(name_or_folder)
+    from guiderail.tools.learning.config import resolve_preset  # config imports this module
 
     try:
         resolve_preset(**{"preset": None, **TASKS.get(name).learner})
     except InputError as error:
-        raise InputError(f"recommended.learner in {Path(typed) / 'task.yaml'} is invalid: {error}") from None
-    return name, (str(Path(typed).resolve()),)
+        raise InputError(f"recommended.learner in {Path(name_or_folder) / 'task.yaml'} is invalid: {error}") from None
+    return name, (str(Path(name_or_folder).resolve()),)
 
 
 def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[str]) -> str:
     """Return a digest of the files that a task consists of; "" if all of them belong to installed packages.
 
-    These are the files of the task folder, the files that an option of the environment names, such as demonstrations
-    or the code of FILE.py:FUNCTION, the policy of a folder that an option names, such as a base policy, and the
-    imported files. Only absolute paths are read, as `import_modules` returns them.
+    The digest covers the task folder and the imported files. It also covers the files that an option of the environment
+    names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names, such
+    as a base policy. Relative paths are skipped; `import_modules` returns absolute ones.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
@@ -76,8 +76,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
 
         folder_digest = task_folder_digest(folder)
     texts = [value for _, value in sorted(environment.items()) if isinstance(value, str)]
-    named = [*imports, *(re.sub(r"\.py:\w+$", ".py", text) for text in texts)]
-    paths = [path for path in map(Path, named) if path.is_absolute() and folder not in (path, *path.parents)]
+    sources = [*imports, *(re.sub(r"\.py:\w+$", ".py", text) for text in texts)]
+    paths = [path for path in map(Path, sources) if path.is_absolute() and folder not in (path, *path.parents)]
     files = [file for path in paths for file in (path, *(path / name for name in _POLICY_FILES)) if file.is_file()]
     if not files:
         return folder_digest
@@ -92,7 +92,7 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """Return the options of a task's environment with their defaults; `inspect.Parameter.empty` for a required one.
+    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none.
 
     Raises:
         InputError: If the task is unknown.
@@ -102,15 +102,15 @@ def task_options(task: str) -> dict[str, Any]:
     check_task_name(task)
     entry = gymnasium.spec(environment_id(task)).entry_point
     creator = load_env_creator(entry) if isinstance(entry, str) else cast(Any, entry)
-    taken = inspect.signature(creator).parameters.items()
-    return {name: parameter.default for name, parameter in taken if name not in ("self", "render_mode")}
+    parameters = inspect.signature(creator).parameters.items()
+    return {name: parameter.default for name, parameter in parameters if name not in ("self", "render_mode")}
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a task's environment with all defaults filled in; register its base policy, if any.
 
     Raises:
-        InputError: If the task or an argument is unknown, or a value is refused.
+        InputError: If the task or an argument is unknown, or a value is invalid.
     """
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
@@ -126,27 +126,27 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task} has no option {brief(name)}: {did_you_mean(name, options)}")
         if not _is_like(value, options[name]):
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
-    given = {name: arguments.get(name, default) for name, default in options.items()}
-    return {name: value for name, value in given.items() if value is not inspect.Parameter.empty}
+    values = {name: arguments.get(name, default) for name, default in options.items()}
+    return {name: value for name, value in values.items() if value is not inspect.Parameter.empty}
 
 
 def declared_models(task: str) -> list[type[Options]]:
     """Return the pydantic models of all options that a registered task may have, with any guidance and station."""
-    declared: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
-    declared += [PrimitiveOptions, TemplateOptions]
+    models: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
+    models += [PrimitiveOptions, TemplateOptions]
     workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"
-    declared += [Disturbances] if workcell_kind == "insertion" else []
+    models += [Disturbances] if workcell_kind == "insertion" else []
     stations = stations_for(workcell_kind)
-    declared += [STATIONS.declared(name, "options") for name in stations if STATIONS.declares(name, "options")]
-    declared += [GUIDANCE.declared(name, "options") for name in GUIDANCE.names() if GUIDANCE.declares(name, "options")]
-    return list(dict.fromkeys(model for model in declared if model is not None))
+    models += [STATIONS.declared(name, "options") for name in stations if STATIONS.declares(name, "options")]
+    models += [GUIDANCE.declared(name, "options") for name in GUIDANCE.names() if GUIDANCE.declares(name, "options")]
+    return list(dict.fromkeys(model for model in models if model is not None))
 
 
 def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
-    """Refuse an unknown option, and a value that every model with this option refuses.
+    """Check single options quickly, before Drake is imported; `EnvConfig.resolve` checks all of them together.
 
-    This is a quick check of single options; `EnvConfig.resolve` checks all of them. Nothing is checked if the task,
-    a guidance or a station is not of this package, because it may have options of its own.
+    A value is refused if it is invalid in every model that has the option. Nothing is checked if the task, a guidance
+    or a station is of another package, because that package may declare further options.
 
     Raises:
         InputError: If an option is unknown or its value is out of range.
@@ -161,24 +161,27 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
             check_choice(option, options[option], list(TASKS.declared(task, choices)), task)
     models = declared_models(task)
     for option in options:
-        holders = [model for model in models if option in model.model_fields]
-        if not holders:
+        option_models = [model for model in models if option in model.model_fields]
+        if not option_models:
             known = {name for model in models for name in model.model_fields}
             raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
-        checked = [option, *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ())]  # validated together
+        checked = [
+            option,
+            *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ()),
+        ]  # kernel options are validated together
         values = {name: options[name] for name in checked if name in options}
         errors = []
-        for model in holders:
+        for model in option_models:
             try:
                 validate_options(model, values, task)
             except InputError as error:
                 errors.append(error)
-        if len(errors) == len(holders):
+        if len(errors) == len(option_models):
             raise errors[0]
 
 
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
-    """Raise an InputError if a reset option of a guiderail task is invalid; other environments check their own."""
+    """Raise an InputError if a reset option of a guiderail task is invalid; other tasks are not checked."""
     if task in TASKS.names():
         validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
@@ -190,7 +193,7 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
     defaults that these three determine.
 
     Raises:
-        InputError: If the task or one of the three is unknown.
+        InputError: If the task, guidance, station or difficulty is unknown.
     """
     chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
     defaults = check_environment(task, chosen) | {key: check_environment(task, {}).get(key) for key in chosen}
@@ -224,7 +227,7 @@ def _options_of_station_only(own: Any, other: Any) -> set[str]:
 
 
 def _is_like(value: Any, default: Any) -> bool:
-    """Return True if a value has the type of a default, or there is no default or it is None."""
+    """Return True if a value has the type of the default, or the default is missing or None."""
     if default is None or default is inspect.Parameter.empty:
         return True
     if isinstance(default, float):
@@ -237,23 +240,25 @@ def _is_like(value: Any, default: Any) -> bool:
 def as_value(text: str) -> Any:
     """Return a value typed on the command line, parsed as YAML; text that is not YAML is returned unchanged.
 
-    A list becomes a tuple, and any text that `float` accepts becomes a number, quoted text included.
+    A list becomes a tuple. Text that `float` accepts becomes a number, even if it is quoted.
     """
-    if re.fullmatch(r"-?(0|[1-9][0-9]{0,14})", text):  # plain values do not need the reader, which is slow to import
+    if re.fullmatch(
+        r"-?(0|[1-9][0-9]{0,14})", text
+    ):  # plain values do not need the YAML reader, which is slow to import
         return int(text)
     if text not in ("null", "true", "false") and re.fullmatch(r"-?[0-9]{1,9}\.[0-9]{1,15}|[a-z_]+", text):
-        return _numbers(text)
+        return _parse_numbers(text)
     from guiderail.models.common.yaml import parse_yaml
 
     try:
-        return _numbers(parse_yaml(text))
+        return _parse_numbers(parse_yaml(text))
     except InputError:
         return text
 
 
-def _numbers(value: Any) -> Any:
+def _parse_numbers(value: Any) -> Any:
     if isinstance(value, list):
-        return tuple(_numbers(one) for one in value)
+        return tuple(map(_parse_numbers, value))
     try:
         return parse_number(value) if isinstance(value, str) else value
     except ValueError:
@@ -261,7 +266,7 @@ def _numbers(value: Any) -> Any:
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """Make the environment of a task. From this call on the process computes with one thread; see `make_env`.
+    """Make the environment of a task, and limit this process to one thread; see `make_env`.
 
     Raises:
         InputError: If the task or an argument is unknown, or options are incompatible.
@@ -275,11 +280,9 @@ def task_of(env: gymnasium.Env, name: str) -> Any:
     """Return the task of an environment; `name` is the environment's name for the message.
 
     Raises:
-        InputError: If the environment is not one of a task of guiderail.
+        InputError: If the environment has no task of guiderail.
     """
     task = getattr(env.unwrapped, "task", None)
     if task is None:
-        raise InputError(
-            f"{name} is an environment without a task of guiderail, which can only be evaluated: register a task for it"
-        )
+        raise InputError(f"{name} has no task of guiderail, so it can only be evaluated: register a task for it")
     return task

@@ -27,7 +27,7 @@ _PARTIAL = re.compile(r"\..*\.(\d+)\.part")
 def remove_partial_files(folder: Path) -> None:
     """Remove partial files that killed calls of `write_atomically` and `atomic_folder` left in a folder and below it.
 
-    Files that another process is still writing stay, and so does everything in a subfolder with a lock of its own.
+    Files that another process is still writing are not removed, nor is anything in a subfolder with its own lock file.
     """
     for parent, subfolders, files in os.walk(folder):
         for name in filter(_is_abandoned, subfolders):
@@ -69,12 +69,12 @@ check_page = partial(_check_output, "page", PAGES)
 def check_writable(path: Path) -> None:
     """Raise an InputError if a file, or a new folder, cannot be written.
 
-    Causes are an existing folder at the path, a parent that is a file or has no write permission, or too long a path.
+    The causes are a folder at the path, a parent that is a file or has no write permission, or a path that is too long.
     """
     try:
         if path.is_dir():
             raise InputError(f"{path} is a folder that already exists: name another path")
-        parent = next(one for one in path.absolute().parents if one.exists())
+        parent = next(folder for folder in path.absolute().parents if folder.exists())
         with tempfile.TemporaryFile(dir=parent):  # permission bits do not suffice: root can ignore them
             pass
     except OSError as error:
@@ -91,16 +91,16 @@ def atomic_folder(out: Path) -> Iterator[Path]:
         InputError: If the folder cannot be written. An OSError about another file is raised unchanged.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
-    for left in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
-        if _is_abandoned(left.name) and not left.is_symlink():
-            shutil.rmtree(left, ignore_errors=True)
+    for partial_folder in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
+        if _is_abandoned(partial_folder.name) and not partial_folder.is_symlink():
+            shutil.rmtree(partial_folder, ignore_errors=True)
     try:
         temporary.mkdir(parents=True)
         yield temporary
         temporary.rename(out)
     except OSError as error:
-        named = str(temporary if error.filename is None else error.filename)
-        if not (named.startswith(str(temporary)) or str(temporary).startswith(named)):
+        failed = str(temporary if error.filename is None else error.filename)
+        if not (failed.startswith(str(temporary)) or str(temporary).startswith(failed)):
             raise
         raise write_error(out, error) from error
     finally:
@@ -116,7 +116,7 @@ def path_exists(path: Path) -> bool:
     """Return True if a path is an existing file or folder.
 
     Raises:
-        InputError: If the file system refuses the path, as for a name that is too long.
+        InputError: If the file system refuses the path, for example because a name is too long.
     """
     try:
         return path.exists()
@@ -127,7 +127,7 @@ def path_exists(path: Path) -> bool:
 def check_room(path: Path, size: int) -> None:
     """Raise an InputError if the file system of a file or a new folder has room for less than `size` bytes."""
     try:
-        room = shutil.disk_usage(next(one for one in path.absolute().parents if one.exists())).free
+        room = shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.exists())).free
     except OSError as error:
         raise write_error(path, error) from error
     if room < size:
@@ -154,9 +154,9 @@ def write_record(path: Path, write: Callable[[Path], object]) -> tuple[Path, str
     except (InputError, OSError) as error:
         for parent in (None, os.path.expanduser("~")):
             with suppress(InputError, OSError):
-                other = Path(tempfile.mkdtemp(prefix="guiderail-", dir=parent)) / path.name
-                write(other)
-                return other, f"{path} cannot be written, so the record is in {other}"
+                fallback = Path(tempfile.mkdtemp(prefix="guiderail-", dir=parent)) / path.name
+                write(fallback)
+                return fallback, f"{path} cannot be written, so the record is in {fallback}"
         raise InputError(f"{error}; the record could not be written to another folder either") from error
     return path, ""
 
@@ -174,7 +174,7 @@ ENDINGS = (".npz", ".csv")  # endings of demonstration files
 def load_demonstrations(path: Path) -> Demonstrations:
     """Return the demonstrations of a file, or of all .npz and .csv files of a folder that are not hidden.
 
-    Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts a folder only of
+    Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts only folders of
     .csv files.
 
     Raises:
@@ -189,7 +189,7 @@ def load_demonstrations(path: Path) -> Demonstrations:
             if part.names != parts[0].names:
                 raise InputError(
                     f"{file} has the outputs {', '.join(part.names)}, and {files[0].name} {', '.join(parts[0].names)}: "
-                    "record the same ones in all of them"
+                    "record the same outputs in all files"
                 )
         times, outputs = ([array for part in parts for array in getattr(part, name)] for name in ("times", "outputs"))
         return Demonstrations(times, outputs, parts[0].names)
@@ -197,12 +197,14 @@ def load_demonstrations(path: Path) -> Demonstrations:
 
 
 def refuse_existing_run(path: Path) -> None:
-    """Raise an InputError if the path of a new run is a file, or a folder that holds anything but hidden files.
+    """Raise an InputError if the path of a new run is a file, or a folder with a file that is not hidden.
 
     Hidden files may be left over from a run that was killed before its configuration was written.
     """
     try:
-        is_taken = path.exists() and (not path.is_dir() or any(not one.name.startswith(".") for one in path.iterdir()))
+        is_taken = path.exists() and (
+            not path.is_dir() or any(not file.name.startswith(".") for file in path.iterdir())
+        )
     except OSError as error:
         raise InputError(f"{brief(path)} is no folder for a run: {error.strerror}") from error
     if is_taken and path == Path():  # also the empty path

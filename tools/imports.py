@@ -22,13 +22,9 @@ _TRUSTED = ContextVar("trusted", default=False)  # True if imports that a file n
 
 
 @contextmanager
-def trust_imports(trusted: bool = True) -> Iterator[None]:
-    """Let files that are read in this context, such as run folders, import the code that they name.
-
-    Args:
-        trusted: True to allow such imports; False to forbid them within a context that allows them.
-    """
-    token = _TRUSTED.set(trusted)
+def trust_imports() -> Iterator[None]:
+    """Allow files that are read in this context, such as run folders, to import the code that they name."""
+    token = _TRUSTED.set(True)
     try:
         yield
     finally:
@@ -40,14 +36,12 @@ def is_trusted() -> bool:
     return _TRUSTED.get()
 
 
-def import_modules(
-    modules: Iterable[str], otherwise: str = ": restore it, or give another --import"
-) -> tuple[str, ...]:
+def import_modules(modules: Iterable[str], remedy: str = ": restore it, or give another --import") -> tuple[str, ...]:
     """Import modules, files (.py) or task folders that register tasks, guidance, stations or learners.
 
     Args:
         modules: Names of modules, or paths of files or task folders.
-        otherwise: End of the message about a missing module, file or folder.
+        remedy: End of the message about a missing module, file or folder.
 
     Returns:
         Names with which the modules can be imported again. Files and folders have absolute paths, so that a run can be
@@ -69,8 +63,8 @@ def import_modules(
                 names.append(import_module(module).__name__)
         else:
             kind = "file or task folder" if path.is_absolute() or len(path.parts) > 1 else "module, file or task folder"
-            shown = module if module.isprintable() else brief(module)
-            raise InputError(f"there is no {kind} {shown} to import{otherwise}")
+            name = module if module.isprintable() else brief(module)
+            raise InputError(f"there is no {kind} {name} to import{remedy}")
     return tuple(names)
 
 
@@ -82,7 +76,7 @@ def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
 
     Args:
         modules: Names of modules, or paths of files or task folders.
-        source: File that names them, for messages.
+        source: File that names the modules, for messages.
 
     Returns:
         Names with which the modules can be imported again, as `import_modules` returns them.
@@ -115,14 +109,14 @@ def _executes(module: str) -> bool:
 
 
 def _is_dotted_name(name: str) -> bool:
-    """Return True for identifiers joined by dots; `find_spec` would also take paths and relative names."""
+    """Return True for identifiers joined by dots; `find_spec` would also accept paths and relative names."""
     return all(part.isidentifier() for part in name.split("."))
 
 
 def _is_module(name: str) -> bool:
     """Return True if there is a module of that name, even if its package cannot be imported.
 
-    A folder without `__init__.py`, which Python imports as a namespace, is none: it registers nothing.
+    A folder without `__init__.py` does not count: Python imports it as a namespace package, which registers nothing.
     """
     if not _is_dotted_name(name):
         return False
@@ -131,12 +125,12 @@ def _is_module(name: str) -> bool:
         return spec is not None and spec.origin is not None
     except ModuleNotFoundError as error:
         return not f"{name}.".startswith(f"{error.name}.")
-    except (Exception, SystemExit):  # its package fails, which importing it reports, or it has no specification
+    except (Exception, SystemExit):  # its package raises an error, which the import reports, or it has no spec
         return name not in sys.modules  # for example __main__
 
 
 def module_name(path: Path) -> str:
-    """Return the name in `sys.modules` of an imported file; files of equal names in two folders have two names."""
+    """Return the name in `sys.modules` of an imported file; it differs for files of the same name in two folders."""
     path = path.resolve()
     return f"guiderail_imported_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
 

@@ -26,7 +26,7 @@ Rows: TypeAlias = pd.DataFrame | Sequence[Mapping[str, Any]]
 
 
 def table_text(rows: Rows) -> str:
-    """Return rows as CSV with a header; reading a number gives the same number, bit for bit."""
+    """Return rows as CSV with a header; `read_table` returns the same numbers, bit for bit."""
     table = pd.DataFrame(rows, dtype=object)  # integers stay integers in a column with missing values
     return table.to_csv(index=False, lineterminator="\n") if len(table.columns) else ""
 
@@ -102,7 +102,7 @@ def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
         values = [group.column(number).num_values for group in groups for number in range(group.num_columns)]
         num_rows += max(metadata.num_rows, max(values, default=0) // _MAX_LIST)
     if num_rows > max_rows:
-        raise InputError(f"{file} and the files before it have more than {max_rows} rows: read fewer of them")
+        raise InputError(f"{file} and the files before it have more than {max_rows} rows: read fewer files")
 
 
 def write_table(path: Path, rows: Rows) -> Path:

@@ -40,12 +40,15 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
     for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
         verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
-        assert verdict == f"no: its {name} is not that of NarrowPassage"
+        assert verdict == f"no: the {name} of the certificate is not that of NarrowPassage"
     assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
     for excess in (9.0, np.nan):
         needed = SimpleNamespace(excess=np.full((2, 2), excess), residue=np.zeros((2, 2)))
         monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop, needed=needed: needed)
-        assert "exceed its budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
+        assert (
+            "exceed the certificate's budget of excess"
+            in verify_certificate("NarrowPassage", environment, folder)["checker"]
+        )
     with pytest.raises(InputError, match="name the folder of a certificate"):
         verify_certificate("NarrowPassage", environment, tmp_path)
     key.write_bytes(b"short")

@@ -213,7 +213,7 @@ def test_command_refuses_a_path_when_it_is_too_long(command, capsys):
     code, out, err = call(capsys, command, 5000 * "x", *options)
     assert (code, out) == (2, "")
     assert err.count("\n") == 1
-    assert "(File name too long): name another" in err
+    assert "(File name too long): name another path" in err
 
 
 def test_train_refuses_an_existing_folder(capsys, trained):
@@ -386,7 +386,7 @@ def test_environment_without_a_task_is_refused(words, capsys, tmp_path, monkeypa
     code, _, err = call(capsys, *words)
     gymnasium.registry.pop(environment_id("Foreign"))
     assert (code, err.count("\n")) == (2, 1)
-    assert "Foreign is an environment without a task of guiderail" in err
+    assert "Foreign has no task of guiderail" in err
     assert not list(tmp_path.iterdir())
 
 
