@@ -175,7 +175,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
         raise InputError(
             f"guidance={guidance!r} cannot be certified: use {' or '.join(GUIDANCE)}, with a "
-            "history that has a fixed length and contains commands (neither adaptive_history nor history_source=measured)"
+            "history of fixed length that contains commands (neither adaptive_history nor history_source=measured)"
         )
     loop = _make_loop(config, start_within)
     impedance = config.make_task().impedance()

@@ -197,7 +197,7 @@ def load_demonstrations(path: Path) -> Demonstrations:
 
 
 def refuse_existing_run(path: Path) -> None:
-    """Raise an InputError if the path of a new run is a file, or a folder with a file that is not hidden.
+    """Raise an InputError if the path of a new run is a file, or a folder with content that is not hidden.
 
     Hidden files may be left over from a run that was killed before its configuration was written.
     """

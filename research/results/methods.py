@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.subject import hides
+from guiderail.tools.evaluation.subject import has_constant_offset
 from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.experiments.job import Job
 from guiderail.tools.imports import import_modules
@@ -231,7 +231,9 @@ def has_run_offset(row: Row) -> bool:
     import_modules(study.imports)
     environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment
     sets = [one for one in study.eval_set if row.eval_set in (None, one.name)]
-    return any(hides(study.task, {**environment, **one.env}) and not one.options.get("new_run") for one in sets)
+    return any(
+        has_constant_offset(study.task, {**environment, **one.env}) and not one.options.get("new_run") for one in sets
+    )
 
 
 def offsets(section: Section, tables: Path) -> list[str]:

@@ -143,13 +143,13 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
 
 
 class Command(typer.core.TyperCommand):
-    """Command with a help text that expands `{name}` to the choices that exist when the help is printed.
+    """Command whose help text expands `{name}` to the choices that exist when the help is printed.
 
-    It refuses an empty argument: as a path it would be the current folder.
+    An empty argument is refused, because as a path it would be the current folder.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; raise an `InputError` before if one is empty."""
+        """Parse the arguments; raise an `InputError` if an argument is empty."""
         for before, word in pairwise(["", *args]):
             option = before if word == "" else word.removesuffix("=") if re.fullmatch("--[^=]+=", word) else None
             if option is not None:
@@ -226,26 +226,17 @@ Env = Annotated[
         metavar="key=value",
     ),
 ]
-Imports = Annotated[
-    list[str] | None,
-    option(
-        "Module or file (.py) that registers a task, guidance, a station or a learner; a run stores its name.",
-        "--import",
-        metavar="MODULE",
-    ),
-]
-TaskImports = Annotated[
-    list[str] | None, option("Module or file (.py) that registers the task.", "--import", metavar="MODULE")
-]
 
 
-HardwareImports = Annotated[
-    list[str] | None, option("Module or file (.py) that registers a robot or a driver.", "--import", metavar="MODULE")
-]
-TemplateImports = Annotated[
-    list[str] | None,
-    option("Module or file (.py) that registers parts of templates.", "--import", metavar="MODULE"),
-]
+def _import_option(content: str) -> Any:
+    """Return the option --import for modules that register `content`."""
+    return option(f"Module or file (.py) that registers {content}.", "--import", metavar="MODULE")
+
+
+Imports = Annotated[list[str] | None, _import_option("a task, guidance, a station or a learner; a run stores its name")]
+TaskImports = Annotated[list[str] | None, _import_option("the task")]
+HardwareImports = Annotated[list[str] | None, _import_option("a robot or a driver")]
+TemplateImports = Annotated[list[str] | None, _import_option("parts of templates")]
 
 
 def _trust(context: typer.Context, value: bool) -> bool:
@@ -260,7 +251,7 @@ def _trust(context: typer.Context, value: bool) -> bool:
 TrustImports = Annotated[
     bool,
     option(
-        "Execute the modules and files that config.yaml or a study names under imports; without it they are refused.",
+        "Execute the modules and files that config.yaml or a study names under imports. By default they are refused.",
         "--trust-imports",
         callback=_trust,
     ),
@@ -361,7 +352,7 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
 
 
 def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:
-    """Return the options of an environment: values of `--env`, read as YAML, and other options that are not None.
+    """Return the options of an environment: values of `--env`, read as YAML, and all `options` that are not None.
 
     Raises:
         InputError: If a value of `--env` has no `=`, or two values of one option differ.
@@ -388,20 +379,21 @@ def import_files(imports: Sequence[str] | None) -> None:
         import_modules(imports)
 
 
-def find_task(typed: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
-    """Import modules and register the task if it is given by its folder.
+def find_task(name_or_folder: str, imports: Sequence[str] | None = None) -> tuple[str, tuple[str, ...]]:
+    """Import modules, and register the task if it is given by its folder.
 
-    Returns the task's name and, for a folder, the imports that a run must store; another text is returned unchanged.
+    Returns:
+        Name of the task, and the imports that a run must store. A text that is no folder is returned unchanged.
 
     Raises:
         InputError: If an import fails or the task folder is invalid.
     """
     import_files(imports)
-    if not (Path(typed) / "task.yaml").is_file():
-        return typed, ()
+    if not (Path(name_or_folder) / "task.yaml").is_file():
+        return name_or_folder, ()
     from guiderail.tools.environments import task_named
 
-    return task_named(typed)
+    return task_named(name_or_folder)
 
 
 def is_hardware(station: Any) -> bool:
@@ -435,7 +427,7 @@ def connect(
 
 
 def refuse_hardware_options(**given: Any) -> None:
-    """Raise InputError if an option that needs a hardware station was given; None and False count as not given."""
+    """Raise an InputError if an option that needs a hardware station is given, that is neither None nor False."""
     if any(value is not None and value is not False for value in given.values()):
         *names, last = (f"--{name}" for name in given)
         raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")

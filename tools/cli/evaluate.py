@@ -58,14 +58,14 @@ def evaluate(
     module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
     on initial conditions from random numbers that training never uses. The demonstration alone, random actions and the
     scripted policy of the task run on the same episodes: if they succeed as well, the task is too easy to show
-    learning. The row evaluation_scope of the table states what the result is valid for, and the last line is the
-    result in one sentence.
+    learning. The row evaluation_scope states the conditions that the result is valid for. The last line is the result
+    in one sentence.
     """
     if quick and episodes is not None:
         raise InputError("--quick sets the number of episodes: leave --episodes out")
     episodes = QUICK if quick else 100 if episodes is None else episodes
     environment = cli.parse_environment(env, station=station, robot=robot, robot_url=robot_url, driver=driver)
-    name = cli.find_task(subject, imports)[0]  # first, because an import may register the station
+    name = cli.find_task(subject, imports)[0]  # before the next line, because an import may register the station
     if cli.is_hardware(environment.get("station")):
         given = environment.keys() - {"station", "robot", "robot_url", "driver"} or task or baselines or save
         if given or resample_offsets or seed != SEED or signal != "commanded" or processes is not None or trust_policy:

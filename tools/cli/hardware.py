@@ -62,14 +62,14 @@ def teleoperate(
     """Act in place of the policy, or demonstrate a task.
 
     Without --record, a gamepad, sliders or keys give the action of the task's guidance. With --record, they move the
-    desired pose, the robot follows by its impedance, and the page in the browser shows the force.
-    Each demonstration is kept or discarded, and written as soon as it is kept.
+    desired pose, the robot follows under impedance control, and the page in the browser shows the force. Each
+    demonstration is kept or discarded; a kept demonstration is written at once.
     """
     name = cli.find_task(task, imports)[0]
     environment = cli.parse_environment(env, guidance=guidance)
     if record is None:
         if as_json:
-            raise InputError("--json prints what was demonstrated: give --record too")
+            raise InputError("--json prints a summary of the demonstrations: give --record too")
     elif guidance is not None:
         raise InputError("a demonstration is recorded without guidance: leave --guidance out")
     from guiderail.tools.teleop import recorder
@@ -132,8 +132,8 @@ def safety_monitor(
 ) -> None:
     """Bring a robot to rest when torque commands stop arriving, or its status is wrong.
 
-    It is for drivers that repeat the last torque after the program that sent it has ended. It runs next to the driver,
-    on the same machine, until it is terminated; without it, guiderail deploy does not move such a robot.
+    Some drivers repeat the last torque after the program that sent it has ended. For such a driver, guiderail deploy
+    moves the robot only if this monitor runs. The monitor runs on the driver's machine until it is terminated.
     """
     from guiderail.tools.hardware.sim_driver import run_safety_monitor
 

@@ -84,7 +84,7 @@ def main(arguments: list[str] | None = None) -> None:
         if error.filename is None and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             message = f"the output cannot be written ({error.strerror}): choose a place with room to write"
         elif error.filename is not None and error.errno in (errno.ENAMETOOLONG, errno.EACCES):
-            message = f"the path {brief(error.filename)} cannot be used ({error.strerror}): name another"
+            message = f"the path {brief(error.filename)} cannot be used ({error.strerror}): name another path"
         else:
             raise
         print_message(message)
@@ -149,7 +149,7 @@ def _usage_sentence(error: Any, arguments: list[str]) -> str:
         return f"there is no option {error.option_name}: {did_you_mean(error.option_name, known)}"
     if "command" in message and context is not None and hasattr(context.command, "list_commands"):
         names = context.command.list_commands(context)
-        if typed := message.partition("'")[2].partition("'")[0]:
-            return f"there is no command {typed}: {did_you_mean(typed, names)}"
+        if name := message.partition("'")[2].partition("'")[0]:
+            return f"there is no command {name}: {did_you_mean(name, names)}"
         return f"{path} needs a command: choose one of {', '.join(names)}"
     return f"{message}: see {path} --help"

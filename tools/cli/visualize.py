@@ -38,7 +38,7 @@ def visualize(
 
     The page compares episodes before and after learning on one time axis: robots in motion, demonstrations, paths,
     constraints, and plots of force, violation, action and phase. It is self-contained. "Before" is the demonstration
-    alone where the guidance has one, and random actions otherwise.
+    alone if the guidance has one, and random actions otherwise.
     """
     from guiderail.tools.evaluation.subject import EpisodeSpec
     from guiderail.tools.files import check_picture, check_video

@@ -1,4 +1,4 @@
-"""Policies that show the success rate of a task without learning: baseline policies, and scripted ones of a task.
+"""Policies that show the success rate of a task without learning: baseline policies, and a task's scripted policies.
 
 Baseline policies ignore the observation.
 """
@@ -43,7 +43,7 @@ def constant(rng: np.random.Generator, size: int) -> PolicyFn:
 
 
 def random_hold(rng: np.random.Generator, size: int) -> PolicyFn:
-    """Return a policy of uniform actions, each applied `HOLD` times, which lead further than independent actions."""
+    """Return a policy of uniform actions, each applied `HOLD` times to move further than with independent actions."""
     return _repeat(lambda: rng.uniform(-1.0, 1.0, size), lambda count: count % HOLD == 0)
 
 
@@ -82,14 +82,14 @@ class BaselinePolicy(Callback):
     def __init__(self, factory: BaselineFactory, env: gymnasium.Env, seed: int = 0):
         """Construct the policy with the action size of `env`; the generator of episode number i has the seed [seed, i].
 
-        The number is that of the last `start_episode` and counts on with every episode; without it, it begins at 0.
+        The episodes are numbered from 0. `start_episode` sets the number of the next episode.
         """
         self._factory, self._seed, self._episode = factory, seed, -1
         self._size = int(np.prod(env.action_space.shape or ()))
         self._act: PolicyFn = zero(np.random.default_rng(0), self._size)
 
     def start_episode(self, number: int) -> None:
-        """Make `on_episode_start` begin episode `number`, whichever episodes this process has run before."""
+        """Set the number of the next episode, so that it does not depend on the earlier episodes of this process."""
         self._episode = number - 1
 
     def on_episode_start(self) -> None:

@@ -61,7 +61,7 @@ from guiderail.tools.tables import table_text
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 
-# Function from an environment and an episode's row to the data that is kept of the episode.
+# Function from an environment and an episode's row to further data of the episode.
 Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
 
 
@@ -91,10 +91,10 @@ def evaluate_policies(
         seed: Seed of the first episode; episode i has seed + i.
         options: Further options of the resets.
         labels: Labels of the progress bars on standard error, by policy name; no bar by default.
-        collect: Function from the environment and an episode's row to the data to keep of the episode.
+        collect: Function from the environment and an episode's row to further data of the episode.
         processes: Largest number of processes; None for the number of cores.
-        first_number: Number for `start_episode` in the first episode, from which the others count on; by default
-            `seed` - `HELD_OUT_SEED`, modulo 2^32.
+        first_number: Number for `start_episode` in the first episode, incremented in each further one; by default
+            `seed` - `HELD_OUT_SEED`. Numbers are taken modulo 2^32.
 
     Yields:
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
@@ -112,12 +112,12 @@ def evaluate_policies(
 
     def run(number: int) -> tuple[dict[str, Any], Any]:
         name, index = names[number // episodes], number % episodes
-        act, what = policies[name], "the policy" if name == POLICY else f"the baseline policy {name!r}"
+        act, title = policies[name], "the policy" if name == POLICY else f"the baseline policy {name!r}"
         if (start := getattr(act, "start_episode", None)) is not None:
             start((first + index) % 2**32)
 
         def named_act(observation: np.ndarray) -> np.ndarray:
-            with naming_failures(what):
+            with naming_failures(title):
                 return act(observation)
 
         callbacks = (act,) if isinstance(act, Callback) else ()
@@ -126,18 +126,18 @@ def evaluate_policies(
 
     results = forked_map(run, len(names) * episodes, processes)
     for name in names:
-        rows, kept = [], []
+        rows, data = [], []
         label = (labels or {}).get(name, "")
         with EpisodeProgress(episodes, name=label, window=None) if label else nullcontext() as progress:
             for _ in range(episodes):
                 row, collected = next(results)
                 rows.append(row)
-                kept.append(collected)
+                data.append(collected)
                 if progress is not None:
                     progress.update(row)
         table = pd.DataFrame(rows)
         text = [column for column, kind in table.dtypes.items() if isinstance(kind, pd.StringDtype)]
-        yield name, table.astype(dict.fromkeys(text, object)), kept  # as `read_table` returns stored rows
+        yield name, table.astype(dict.fromkeys(text, object)), data  # as `read_table` returns stored rows
 
 
 def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
@@ -210,7 +210,8 @@ def evaluate_once(
 def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.DataFrame:
     """Return held-out episodes of a run's policy in its own environment, one row each.
 
-    They are stored in the run's folder; stored ones are returned. The number of processes is that of the cores.
+    The episodes are stored in the run's folder, and read from there if they are stored already. They are simulated in
+    as many processes as there are cores.
 
     Raises:
         InputError: If the run has no policy, a stored file is damaged or cannot be written, or `episodes` is not a
@@ -248,19 +249,20 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
 
-    The rows of the baseline policies are stored in the run's folder, under the policies' names, and used again; those
-    of given functions are stored only if the functions are `partial(BaselinePolicy, FACTORY)`. The rows of the run's
+    The rows of baseline policies are stored in the run's folder, under the policies' names, and used again. For a
+    baseline policy that is given as a function, this needs `partial(BaselinePolicy, FACTORY)`. The rows of the run's
     policy in its own environment are stored for a report.
 
     Args:
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` reads, the name of a
             baseline policy, a function from an observation to an action, or an object with a `predict` method, such as
-            a model of Stable-Baselines3. An object that does not declare `observation_space` and `action_space` is
-            tried before the first episode, with constant observations: a deep copy of it if it can be copied.
+            a model of Stable-Baselines3. Before the first episode, an object that does not declare
+            `observation_space` and `action_space` is called with constant observations; a deep copy of the object is
+            called if it can be copied.
         env: Environment of a policy without a run: name of a task, an environment, or an id that is registered with
-            Gymnasium. An environment that is not of this package is reset with the seed of the episode, which succeeds
-            if `info["is_success"]` or `info["success"]` is true at any step. If `info` has neither, the statistics of
-            success are None. It needs a limit of steps, such as that of `gymnasium.wrappers.TimeLimit`.
+            Gymnasium. An environment of another package is reset with the seed of the episode. The episode succeeds if
+            `info["is_success"]` or `info["success"]` is true at any step. If `info` has neither, the statistics of
+            success are None. The environment needs a limit of steps, such as `gymnasium.wrappers.TimeLimit`.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
             None is the default set of the task. The demonstration alone is always evaluated if the guidance of a task
@@ -285,19 +287,18 @@ def evaluate(
         largest of the one-sided p-values against each baseline policy, if there is a `Comparison`; `episodes` and
         `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run; `saved`, the
         number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is given.
-        `collisions` and `collision_steps` are None if the task declares no collision
-        signal.
+        `collisions` and `collision_steps` are None if the task declares no collision signal.
 
     Raises:
         InputError: If there is no trained policy, an argument is out of range, the policy's observation, action or
             guidance does not match the environment, a baseline policy cannot have its name, `save` cannot be written,
             or the environment records no poses to save. With `resample_offsets`, also if the task has no hidden offset,
-            or an episode has the seed of the run and so its offset.
+            or an episode has the seed, and so the offset, of the run.
     """
     save = None if save is None else Path(save)
     _check_saved(save, signal)
     episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
-    given, env = env, find_environment(env)
+    given_env, env = env, find_environment(env)
     subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
     how: dict[str, Any] = {"episodes": episodes, "seed": seed}
@@ -307,10 +308,10 @@ def evaluate(
                 "an environment that is given as an object takes no options, resample_offsets or save: give the name "
                 "of a task"
             )
-        where, scope = {}, "seeds of the environment as it was given"
+        eval_environment, scope = {}, "seeds of the environment as it was given"
     else:
-        where = subject.changed_environment(environment or {})
-        scope = evaluation_scope(config.task, where, resample_offsets)
+        eval_environment = subject.changed_environment(environment or {})
+        scope = evaluation_scope(config.task, eval_environment, resample_offsets)
     if resample_offsets and config is not None:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
@@ -318,26 +319,31 @@ def evaluate(
                 f"episode {config.seed - seed} of these has the offset of the run itself: give another --seed, such as "
                 f"{config.seed + 1}"
             )
-    others = {"demonstration": zero_policy} if is_demonstrated(where.get("guidance")) else {}
-    others |= make_baselines(config, where, baselines)
-    if POLICY in others:
+    makers = {"demonstration": zero_policy} if is_demonstrated(eval_environment.get("guidance")) else {}
+    makers |= make_baselines(config, eval_environment, baselines)
+    if POLICY in makers:
         raise InputError(f"a baseline policy cannot be called {POLICY!r}, which is the evaluated policy")
-    opened: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
-    if config is not None or env is not given:
-        opened = closing(cast(gymnasium.Env, env) if config is None else make_environment(config.task, where))
-    with opened as evaluation_env:
+    env_context: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
+    if config is not None or env is not given_env:
+        env_context = closing(
+            cast(gymnasium.Env, env) if config is None else make_environment(config.task, eval_environment)
+        )
+    with env_context as evaluation_env:
         if config is not None:
             if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
                 raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
-        files = {name: _episodes_file(subject, name, where, how, functions.get(name)) for name in (POLICY, *others)}
+        files = {
+            name: _episodes_file(subject, name, eval_environment, how, functions.get(name))
+            for name in (POLICY, *makers)
+        }
         stored = {
             name: rows
-            for name in others
+            for name in makers
             if (file := files[name]) is not None and (rows := read_complete(file, episodes)) is not None
         }
-        missing = {name: make for name, make in others.items() if name not in stored}
+        missing = {name: make for name, make in makers.items() if name not in stored}
         policies = {POLICY: subject.make_policy(evaluation_env)}
         for name, make in missing.items():
             with naming_failures(f"the baseline policy {name!r}"):
@@ -345,22 +351,22 @@ def evaluate(
                     policies[name] = make(evaluation_env)
         skipped = [name for name in missing if name not in policies]
         labels = {
-            name: f"series {number} of {1 + len(others)}: {LABELS.get(name, name)}"
-            for number, name in enumerate((POLICY, *others), start=1)
+            name: f"series {number} of {1 + len(makers)}: {LABELS.get(name, name)}"
+            for number, name in enumerate((POLICY, *makers), start=1)
         }
         for name in stored:
             print(f"{labels[name]}: evaluated before, and used again", file=sys.stderr, flush=True)
         evaluated, motions = dict(stored), []
         collect = None if save is None else partial(_successful_motion, signal)
-        for name, rows, kept in evaluate_policies(
+        for name, rows, data in evaluate_policies(
             evaluation_env, policies, labels=labels, processes=processes, collect=collect, **how
         ):
             evaluated[name] = rows
             if name == POLICY:
-                motions = kept
+                motions = data
             if (file := files[name]) is not None:
                 write_atomically(file, table_text(rows).encode())
-    rows_of = {name: evaluated[name] for name in (POLICY, *others) if name in evaluated}
+    rows_of = {name: evaluated[name] for name in (POLICY, *makers) if name in evaluated}
     counts = config is None or counts_collisions(config.task)
     result = {"evaluation_scope": scope, **_statistics(rows_of, counts), "baselines": [*rows_of][1:]}
     result |= {"skipped_baselines": skipped, "episodes": episodes, "seed": seed} | _training(folder)
@@ -369,7 +375,7 @@ def evaluate(
     if save is not None:
         result["saved"] = _save_demonstrations(motions, save)
     if describe_differences is not None and config is not None:
-        result["differences"] = list(describe_differences(replace(config, environment=where)))
+        result["differences"] = list(describe_differences(replace(config, environment=eval_environment)))
     return Evaluation(result, rows_of, is_held_out=config is not None)
 
 
@@ -400,8 +406,9 @@ def _episodes_file(
 ) -> Path | None:
     """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
 
-    `function` is what the caller gave for a baseline policy instead of a name; `digest_of` must identify it. Episodes
-    of the run's own policy are stored only in the run's own environment, and if nothing is resampled.
+    `function` is the caller's function for a baseline policy, or None for one that is given by name. Episodes of a
+    function are stored only if `digest_of` identifies it. Episodes of the run's own policy are stored only in the run's
+    own environment, and without resampled offsets.
     """
     folder, config = subject.folder, subject.config
     if folder is None or config is None or not subject.is_stored:

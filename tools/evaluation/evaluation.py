@@ -24,14 +24,14 @@ from guiderail.tools.tables import read_table, table_text
 
 POLICY = "policy"  # name of the evaluated policy
 POLICY_FOLDER = "held_out"  # folder of the policy's evaluated episodes, in the run's folder
-MAX_NAME_BYTES = 200  # largest size of the name of a policy in a file's name, of which 255 are possible
+MAX_NAME_BYTES = 200  # largest size of a policy's name in a file's name; a file system allows 255 for all of it
 BASELINES_FOLDER = "baselines"  # folder of the baseline policies' evaluated episodes, in the run's folder
 
 
 def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: int | None = None) -> pd.DataFrame:
     """Return the rows of a file; if it does not exist, compute and write them. An empty table is not written.
 
-    Rows are also computed again if the file does not have one for each of `episodes`.
+    With `episodes`, rows are also computed again if the file has another number of them.
 
     Raises:
         InputError: If the file is damaged or cannot be written.
@@ -46,7 +46,7 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: i
 
 
 def read_complete(file: Path, episodes: int | None = None) -> pd.DataFrame | None:
-    """Return the rows of a table; None if it does not exist, or does not have a row for each of `episodes`.
+    """Return the rows of a table; None if it does not exist, or the number of rows is not `episodes`.
 
     Raises:
         InputError: If the table is damaged.
@@ -94,14 +94,15 @@ def policy_digest(source: Path) -> str:
 
 
 def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator[tuple[str, pd.DataFrame]]:
-    """Yield the name of each policy and its stored episodes in the run's own environment that begin at `seed`."""
+    """Yield the name of each policy and its stored episodes in the run's own environment, with `seed` as first seed."""
     digest = policy_digest(folder.path)
     for file in sorted(
         path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
     ):
         name, rows = file.stem.rpartition("-")[0], read_table(file)
         how = {"episodes": len(rows), "seed": seed}
-        abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)  # by name, or given as a function
+        # `about` of a baseline policy is None if it was given by name, and its name if it was given as a function.
+        abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)
         if _can_name_file(name) and any(
             file == episodes_file(file.parent, name, config, config.environment, about=about, **how) for about in abouts
         ):
@@ -136,7 +137,7 @@ class Evaluation(Mapping[str, Any]):
     Attributes:
         statistics: Statistics, as `guiderail evaluate --json` prints them.
         rows: Episodes by name of the policy, one row each; the first policy is the evaluated one.
-        is_held_out: False if the environment was given as an object; its episodes may have the conditions of training.
+        is_held_out: False if the environment was given as an object: its episodes may have the conditions of training.
     """
 
     statistics: Mapping[str, Any]
@@ -211,10 +212,10 @@ def compare(rows: Mapping[str, pd.DataFrame]) -> Comparison | None:
     """Compare the success of the policy named `POLICY` with that of baseline policies under the same conditions.
 
     The test is McNemar's, exact and one-sided. It uses only the episodes in which exactly one of the two policies
-    succeeds: a policy that is not better succeeds in at most half of these on average. The result has the largest
-    p-value of all baseline policies, so that "better than the best baseline" means better than each of them
-    (intersection-union test). No correction for the number of baseline policies is needed. The result is None without
-    a baseline policy, and in an environment that reports no success.
+    succeeds: a policy that is not better succeeds in at most half of these episodes on average. The result has the
+    largest p-value of all baseline policies, so that "better than the best baseline" means better than each of them
+    (intersection-union test). No correction for the number of baseline policies is needed. The result is None if there
+    is no baseline policy, or the environment reports no success.
     """
     if not reports_success(rows[POLICY]):
         return None
@@ -235,7 +236,7 @@ def _mcnemar(won: Any, other: Any) -> float:
 def statistics(rows: pd.DataFrame, prefix: str = "") -> dict[str, Any]:
     """Return the statistics `COMPARED` of episodes; a statistic is None without rows or without its column.
 
-    Those of success are also None if the environment reports no success.
+    The statistics of success are also None if the environment reports no success.
     """
     result: dict[str, Any] = dict.fromkeys(prefix + name for name in COMPARED)
     for name in COMPARED if len(rows) else ():

@@ -61,12 +61,12 @@ class Forks:
         self._busy: list[Connection] = []
         self._workers = []
         for _ in range(processes):
-            here, there = context.Pipe()
-            self._idle.append(here)
-            arguments = (compute, there, list(self._idle), os.getpid())
+            parent_end, fork_end = context.Pipe()
+            self._idle.append(parent_end)
+            arguments = (compute, fork_end, list(self._idle), os.getpid())
             self._workers.append(context.Process(target=_serve, args=arguments, daemon=True))
             self._workers[-1].start()
-            there.close()
+            fork_end.close()
 
     @property
     def has_idle(self) -> bool:
@@ -90,7 +90,7 @@ class Forks:
         """Return the results that are complete, at least one unless the timeout [s] passes.
 
         At least one process must be computing. An exception of `compute` is raised again, with the traceback of the
-        fork as a note; one that cannot be pickled is raised as a RuntimeError.
+        fork as a note. An exception that cannot be pickled is replaced by a RuntimeError.
 
         Raises:
             KilledError: If a process was killed.
@@ -135,16 +135,16 @@ def forked_map(compute: Callable[[int], Result], count: int, processes: int) -> 
         yield from map(compute, range(count))
         return
     results: dict[int, Result] = {}
-    assigned, given = 0, 0
+    num_submitted, next_index = 0, 0
     with closing(Forks(lambda index: (index, compute(index)), processes)) as forks:
-        while given < count:
-            while forks.has_idle and assigned < count:
-                forks.submit(assigned)
-                assigned += 1
+        while next_index < count:
+            while forks.has_idle and num_submitted < count:
+                forks.submit(num_submitted)
+                num_submitted += 1
             results |= dict(forks.collect())
-            while given in results:
-                yield results.pop(given)
-                given += 1
+            while next_index in results:
+                yield results.pop(next_index)
+                next_index += 1
 
 
 class KilledError(RuntimeError):
@@ -154,10 +154,12 @@ class KilledError(RuntimeError):
         super().__init__("a process that simulated episodes was killed: give fewer processes, or more memory")
 
 
-def _serve(compute: Callable[[Any], Any], connection: Connection, others: Sequence[Connection], parent: int) -> None:
+def _serve(
+    compute: Callable[[Any], Any], connection: Connection, parent_ends: Sequence[Connection], parent: int
+) -> None:
     """Compute and send the result of each received argument, until the other end of the connection is closed."""
-    for one in others:
-        one.close()  # the parent's ends, which would stay open after the parent has ended
+    for parent_end in parent_ends:
+        parent_end.close()  # otherwise it would stay open after the parent has ended
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # on Ctrl-C the parent ends its forks
     # A fork inherits the parent's file locks, so it must not outlive the parent.
     threading.Thread(target=_exit_with_parent, args=(parent,), daemon=True).start()

@@ -24,11 +24,11 @@ from guiderail.models.common.registry import did_you_mean
 
 CONFIDENCE = 0.95  # level of all confidence intervals
 RESAMPLES = 1000  # number of bootstrap resamples
-MEAN_RESAMPLES = 20_000  # the same for an interquartile mean, whose resamples take few distinct values
-MAX_ENUMERATED = 6  # number of seeds up to which all their resamples are used
+MEAN_RESAMPLES = 20_000  # number of bootstrap resamples of an interquartile mean, which have few distinct values
+MAX_ENUMERATED = 6  # largest number of seeds for which all resamples are enumerated
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
-REPORTS_SUCCESS = "reports_success"  # column of an outside environment: 1 if `info` had a success, true or not
+REPORTS_SUCCESS = "reports_success"  # column of another package's environment: 1 if `info` has a success flag
 TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
@@ -83,7 +83,7 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the fraction of runs that have not converged, by the Kaplan-Meier estimator.
 
-    A run that never converged is censored at the last episode after which ten consecutive successes would have fitted.
+    A run that never converged is censored at the last episode that ten consecutive successes could still have followed.
 
     Args:
         converged: Episodes to convergence of each run; None for a run that never converged.
@@ -92,11 +92,11 @@ def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[
     Returns:
         Numbers of episodes in order, beginning with 0, and the fraction from each of them on, (k,) each.
     """
-    known = [after for after in converged if after is not None]
+    uncensored = [after for after in converged if after is not None]
     censored = [max(n - CONVERGED_SUCCESSES, 0) for after, n in zip(converged, episodes, strict=True) if after is None]
-    if not known:
+    if not uncensored:
         return np.array([0.0]), np.array([1.0])
-    function = scipy.stats.ecdf(scipy.stats.CensoredData(uncensored=known, right=censored)).sf
+    function = scipy.stats.ecdf(scipy.stats.CensoredData(uncensored=uncensored, right=censored)).sf
     return np.append(0.0, function.quantiles), np.append(1.0, function.probabilities)
 
 
@@ -137,7 +137,7 @@ class Episode:
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
     """Return the mean jerk of poses (n, O) at intervals of `period` [s]: "linear" [m/s³] and "angular" [rad/s³].
 
-    The latter is that of the orientation's three coordinates; it is 0 unless O is 6.
+    The angular jerk is that of the three orientation coordinates; it is 0 unless O is 6.
     """
     poses = np.array(poses)
     angular = mean_jerk(poses[:, 3:], period) if poses.shape[1] == 6 else 0.0
@@ -178,7 +178,10 @@ COLUMNS = (
     Metric("success", "", "1 if the task was done", lambda e: int(bool(e.info["is_success"]))),
     Metric("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})", lambda e: e.termination),
     Metric(
-        "steps", STEPS, "length (actions in an outside environment that does not count them)", lambda e: len(e.trace)
+        "steps",
+        STEPS,
+        "length (number of actions if another package's environment does not count control steps)",
+        lambda e: len(e.trace),
     ),
     Metric("peak_force", "N", "largest contact force of any control step", _statistic("peak_force")),
     Metric("mean_force", "N", "contact force, mean over control steps", _statistic("mean_force")),
@@ -213,8 +216,8 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step;
     without either in any step, the column `REPORTS_SUCCESS` is 0. The largest `constraint_violation` and
     `contact_force` of any step are the columns `max_commanded_violation` and `peak_force`. `steps` is the last
-    `control_steps`, which `GuidedEnv` counts, or without it the number of actions. `is_terminated` is False if the
-    episode was truncated.
+    `control_steps`, which `GuidedEnv` counts, or the number of actions if `info` does not have it. `is_terminated` is
+    False if the episode was truncated.
 
     Raises:
         InputError: If `control_steps` is no whole number.
@@ -229,7 +232,7 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     }
     for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
         if values := [float(info[name]) for info in infos if name in info]:
-            row[column] = float(np.max(values))  # NaN if one is NaN
+            row[column] = float(np.max(values))  # NaN if any value is NaN
     return row | {REPORTS_SUCCESS: int(any("is_success" in info or "success" in info for info in infos))}
 
 
@@ -247,12 +250,14 @@ def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
     """Return a table of episodes unchanged; `source` is its file, for the message.
 
     Raises:
-        InputError: If a column other than `WORDS` holds text, a column of `COUNTS` holds a number that is not whole, or
-            `success` holds a number other than 0 and 1.
+        InputError: If a column other than `WORDS` has text, a column of `COUNTS` has a number that is not whole, or
+            `success` has a number other than 0 and 1.
     """
-    words = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
-    parts = [name for name in COUNTS if name in rows and name not in words and not (rows[name] % 1 == 0).all()]
-    wrong = [*(words if len(rows) else ()), *parts]
+    text_columns = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
+    fractional_columns = [
+        name for name in COUNTS if name in rows and name not in text_columns and not (rows[name] % 1 == 0).all()
+    ]
+    wrong = [*(text_columns if len(rows) else ()), *fractional_columns]
     if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():
         wrong = ["success"]
     if wrong:
@@ -367,7 +372,7 @@ SYMBOLS = ("N", "N²", "s", VIOLATION, *JERKS.values())
 
 
 def statistics_of(task: str | None = None) -> dict[str, Metric]:
-    """Return the statistics of a task's episodes by name: the common ones and its own; with None, those of all."""
+    """Return the statistics of a task's episodes by name: common and its own; None: the statistics of all tasks."""
     tasks = TASKS.usable() if task is None else [task] if task in TASKS.names() else []
     return STATISTICS | {metric.name: metric for name in tasks for metric in TASKS.get(name).statistics}
 

@@ -55,15 +55,15 @@ _SB3_UNUSED: dict[str, Any] = {
     "buffer_size": 1,
 }
 
-_MAX_ERROR = 200  # largest number of characters of an exception's message that are repeated
+_MAX_ERROR = 200  # largest number of characters of an exception's message that are quoted
 
 
 class ForeignPolicy(Callback):
     """Policy of another library, as a function from an observation to an action.
 
     Attributes:
-        observation_shape: Shape of the observation that it takes; None if unknown.
-        action_shape: Shape of the action that it returns; None if unknown.
+        observation_shape: Shape of the observation that the policy takes; None if unknown.
+        action_shape: Shape of the action that the policy returns; None if unknown.
     """
 
     def __init__(
@@ -110,16 +110,16 @@ def _describe_error(error: BaseException) -> str:
 
 
 class FunctionPolicy(ForeignPolicy):
-    """Policy of a function from an observation to an action, which is returned as it is."""
+    """Policy of a function from an observation to an action; the action is returned unchanged."""
 
     def __init__(self, function: Callable[[np.ndarray], Any]):
-        """Construct the policy of `function`, whose name is in error messages."""
+        """Construct the policy of `function`; error messages contain the name of the function."""
         name = getattr(function, "__name__", type(function).__name__)
         super().__init__(function, name="" if name == "<lambda>" else name)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the function, such as `start_episode` of an object that can be called."""
-        if name.startswith("_"):  # `_act` itself, before a copy has it
+        if name.startswith("_"):  # a copy does not have `_act` at first
             raise AttributeError(name)
         return getattr(self._act, name)
 
@@ -133,7 +133,7 @@ class FunctionPolicy(ForeignPolicy):
 
 
 def _is_pair(returned: tuple[Any, Any]) -> bool:
-    """Return True if a tuple of two is an action and a state, and not an action of two numbers."""
+    """Return True if a tuple is an action and a state, and False if it is an action of two numbers."""
     if returned[1] is None:
         return True
     try:
@@ -152,14 +152,11 @@ class PredictPolicy(ForeignPolicy):
 
     def __init__(self, model: Any):
         """Construct the policy of `model`, whose `predict` returns an action, or an action and a state."""
-        shapes = (getattr(getattr(model, f"{kind}_space", None), "shape", None) for kind in ("observation", "action"))
-        observation_shape, action_shape = shapes
-        super().__init__(
-            self._predict,
-            observation_shape=observation_shape,
-            action_shape=action_shape,
-            name=type(model).__name__,
+        observation_shape, action_shape = (
+            getattr(getattr(model, f"{kind}_space", None), "shape", None) for kind in ("observation", "action")
         )
+        name = type(model).__name__
+        super().__init__(self._predict, observation_shape=observation_shape, action_shape=action_shape, name=name)
         self.model = model
         parameters = inspect.signature(model.predict).parameters
         self._options = {"deterministic": True} if "deterministic" in parameters else {}
@@ -191,7 +188,7 @@ class PredictPolicy(ForeignPolicy):
 def as_policy(given: Any) -> PolicyFn:
     """Convert a function or an object with a `predict` method to a policy whose errors name the policy.
 
-    A policy of this package and a `Callback` that can be called are returned unchanged.
+    A policy of this package, or a callable `Callback`, is returned unchanged.
 
     Raises:
         InputError: If `given` is neither.
@@ -211,7 +208,7 @@ def as_policy(given: Any) -> PolicyFn:
 
 
 def is_policy_file(source: str | Path) -> bool:
-    """Return True if a source is a policy's file, by its ending, or `module:function`."""
+    """Return True if a source has the ending of a policy's file, or is `module:function`."""
     return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
 
 
@@ -274,7 +271,7 @@ def _load_function(module: str, name: str) -> PolicyFn:
     (imported,) = import_modules([module], f" for {module}:{name}: give MODULE:FUNCTION or FILE.py:FUNCTION")
     loaded = sys.modules.get(module_name(Path(imported)) if imported.endswith(".py") else imported)
     if not hasattr(loaded, name):
-        names = [one for one in vars(loaded or object) if not one.startswith("_")]
+        names = [public for public in vars(loaded or object) if not public.startswith("_")]
         raise InputError(f"{module} has no {brief(name)}: {did_you_mean(name, names)}")
     result = getattr(loaded, name)
     try:
@@ -343,7 +340,9 @@ def _load_onnx(path: Path) -> PolicyFn:
         raise InputError(f"{path} is no ONNX file that can be read: export it again") from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if len(inputs) != 1 or inputs[0].type != "tensor(float)":
-        raise InputError(f"{path} has the inputs {[one.name for one in inputs]}: a policy has one, of float32")
+        raise InputError(
+            f"{path} has the inputs {[tensor.name for tensor in inputs]}: a policy has one input, of float32"
+        )
     name, shape = inputs[0].name, inputs[0].shape
     is_batched = not (shape and isinstance(shape[0], int) and shape[0] > 1) and len(shape) > 1
     observation_shape = tuple(shape[1:] if is_batched else shape)
@@ -357,9 +356,9 @@ def _load_onnx(path: Path) -> PolicyFn:
 
 
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
-    """Return a policy, as `as_policy` does, if its observation and action shapes match an environment.
+    """Return `as_policy(policy)` if its observation and action shapes match an environment.
 
-    `learned_in` has the options of the environment in training; the error message names those that differ.
+    `learned_in` are the options of the environment in training; the error message names those that differ.
 
     Raises:
         InputError: If the shape of the policy's observations or actions differs from the environment's, a model's
@@ -397,8 +396,8 @@ def _describe_mismatch(
 ) -> str:
     """Return a sentence with the shapes of policy and environment, and the options that differ or would fit.
 
-    `raised` is the policy's exception for this environment's observations. It is the sentence if the policy takes these
-    observations otherwise, or takes none at all.
+    `raised` is the policy's exception for this environment's observations. If the shapes match anyway, or the policy
+    fails for all flat observations too, the sentence is the message of `raised`.
     """
     observation_shape, action_shape = shapes(policy, env)
     expected = env.action_space.shape
@@ -420,7 +419,7 @@ def _describe_mismatch(
     if changed:
         hint = f"; it learned with {', '.join(changed)}: change --env"
     elif task and (fitting := fitting_options(task, options, policy)):
-        hint = f"; it fits with {' or '.join(f'--env {one}' for one in fitting)}"
+        hint = f"; it fits with {' or '.join(f'--env {changes}' for changes in fitting)}"
     elif observation_shape == env.observation_space.shape and action_shape not in (None, expected):
         hint = f": it must return {f'an array of shape {expected}' if expected else 'one number'}"
     else:
@@ -435,7 +434,7 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
     """Return the shapes of a policy's observation and action; None if a shape is unknown.
 
     If a policy declares no shape and fails for the environment's observations, it is called with flat observations of
-    all sizes up to `_MAX_SIZE`. The result is known if it takes exactly one of them, as a network does.
+    all sizes up to `_MAX_SIZE`. The shapes are known if the policy takes exactly one size, as a network does.
     """
     if isinstance(policy, Policy):
         return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
@@ -483,15 +482,15 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
         for combination in product(*values.values())
     ]
-    fitting = (one for one in sorted(candidates, key=len) if one and _fits(policy, task, options, one))
+    fitting = (changes for changes in sorted(candidates, key=len) if changes and _fits(policy, task, options, changes))
     texts = (" --env ".join(f"{name}={value}" for name, value in changes.items()) for changes in fitting)
     return list(islice(texts, _MAX_FITTING))
 
 
 def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:
     try:
-        known = beyond_defaults(task, options)  # without defaults, because guidance kinds have different options
-        env = make_environment(task, changed_environment(task, known, changes))
+        given = beyond_defaults(task, options)  # without defaults, because guidance kinds have different options
+        env = make_environment(task, changed_environment(task, given, changes))
     except InputError:
         return False
     try:

@@ -30,7 +30,7 @@ from guiderail.tools.evaluation.subject import (
     Subject,
     default_baselines,
     find_subject,
-    hides,
+    has_constant_offset,
     make_baselines,
 )
 from guiderail.tools.learning.run_folder import RunConfig
@@ -44,7 +44,7 @@ Environment = Mapping[str, Any]
 class Axis:
     """Disturbance of the environment, varied over several values."""
 
-    name: str  # name, as `--axes` takes it
+    name: str  # name in `--axes`
     label: str  # label of the plot's axis, with the unit
     values: tuple[float, ...]  # values, including the default
     default: float  # value that the default options have
@@ -85,7 +85,7 @@ def _offsets(environment: Environment, value: float) -> dict[str, Any]:
         raise InputError("the task has no range of offsets")
     default = environment["offset_range"] or OFFSET_RANGES[environment["fixture_offset"]]
     low, high = (value * distance for distance in default)
-    # "none" refuses larger offsets, which "per_episode" samples in the same way.
+    # fixture_offset=none refuses offsets above `KNOWN_OFFSET`; per_episode samples them in the same way.
     is_refused = environment["fixture_offset"] == "none" and high > KNOWN_OFFSET
     return {"offset_range": (low, high)} | ({"fixture_offset": "per_episode"} if is_refused else {})
 
@@ -145,7 +145,8 @@ class Point:
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
     """Return the points of `axes` that an environment supports, and sentences about the points that are left out.
 
-    There is one sentence for each axis and reason. An axis whose points with a disturbance are all left out has none.
+    There is one sentence for each axis and reason. If all points of an axis with a
+    disturbance are left out, its point without one is left out too.
 
     Raises:
         InputError: If the environment itself is invalid.
@@ -155,7 +156,7 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
     for axis in axes:
         trained = axis.default if _is_default(axis, resolved) else None
         reasons: dict[str, list[str]] = {}
-        of_axis = []
+        axis_points = []
         for value in axis.values:
             try:
                 changes = {} if value == trained else axis.change(resolved, value)
@@ -163,14 +164,16 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                     raise InputError("only an arm carries a payload")
                 check_environment(task, {**resolved, **changes})
                 changed = {**environment, **changes}
-                options = {"new_run": True} if axis.resamples and hides(task, {**resolved, **changed}) else {}
-                of_axis.append(Point(axis, value, changed, trained, options))
+                options = (
+                    {"new_run": True} if axis.resamples and has_constant_offset(task, {**resolved, **changed}) else {}
+                )
+                axis_points.append(Point(axis, value, changed, trained, options))
             except InputError as error:
                 reasons.setdefault(str(error).partition(": choose one of")[0], []).append(f"{value:g}")
-        if reasons and of_axis and all(point.value == axis.default for point in of_axis):
+        if reasons and axis_points and all(point.value == axis.default for point in axis_points):
             next(iter(reasons.values())).insert(0, f"{axis.default:g}")
-            of_axis = []
-        result += of_axis
+            axis_points = []
+        result += axis_points
         left_out += [f"{axis.name} {', '.join(values)} left out: {reason}" for reason, values in reasons.items()]
     return result, left_out
 
@@ -187,7 +190,7 @@ def _is_default(axis: Axis, resolved: Environment) -> bool:
     return all(np.allclose(value, neutral[option]) for option, value in known.items())
 
 
-COLUMNS = 4
+COLUMNS = 4  # largest number of axes next to each other in the picture
 SPACING = 0.06  # distance between the markers of two policies, as a fraction of the distance between two values
 COLORS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3aa6a6")
 
@@ -195,8 +198,8 @@ COLORS = ("#1f5fbf", "#8a8a8a", "#c0504d", "#4f9d55", "#8064a2", "#d98b2b", "#3a
 def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
     """Draw the rows of a table to a picture: success rate and force over each axis, with a line for each policy.
 
-    Bars are Wilson's 95 % intervals. A solid line shows the mean of the episodes' peak forces, a dot the largest one. A
-    dashed line marks the value that the first policy was trained with.
+    Bars are Wilson's 95 % intervals. A solid line shows the mean of the episodes' peak forces, a dot the largest peak
+    force. A dashed line marks the value that the first policy was trained with.
 
     Raises:
         InputError: If the picture cannot be written.
@@ -214,7 +217,7 @@ def draw(path: Path, rows: Sequence[Mapping[str, Any]]) -> Path:
         of_axis = table[table["axis"] == name]
         positions = {value: position for position, value in enumerate(dict.fromkeys(of_axis["value"]))}
         for policy, of_policy in of_axis.groupby("policy", sort=False):
-            # Shifted sideways, because lines of equal success rates would cover each other.
+            # Shifted sideways, because lines of equal success rates would hide each other.
             shift = SPACING * (order[policy] - (len(order) - 1) / 2)
             x = [positions[value] + shift for value in of_policy["value"]]
             rate, color = of_policy["success_rate"], colors[policy]
@@ -253,7 +256,7 @@ class _Actor:
     make_policy: MakePolicy  # function from an environment to the policy
     # Configuration of the run, with the `environment` options given to `robustness`.
     config: RunConfig
-    about: str | None = None  # digest of the policy; None for a baseline policy of the same name
+    about: str | None = None  # digest of the policy; None for a baseline policy that its name identifies
     is_stored: bool = True  # False if nothing identifies the policy
 
 
@@ -288,7 +291,7 @@ def robustness(
             the task without "constant". A name that is among `policies` too is evaluated once. Episodes of functions
             other than `partial(BaselinePolicy, FACTORY)` are not stored.
         out: Folder to write; by default `robustness/<station>` in the run. Required for several policies, and for a
-            policy without a run. The table's name there contains those of the policies.
+            policy without a run. The names of the policies are then part of the table's name.
         log: Function called with a sentence on the differences between the runs, and the sentences of `points`.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it.
         trust_policy: True to read a policy file that can execute code.
@@ -348,19 +351,21 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
     configs = [subject.config for subject in subjects if subject.config is not None]
     tasks = sorted({config.task for config in configs})
     if len(tasks) > 1:
-        raise InputError(f"runs that are compared are of one task, not of {' and '.join(tasks)}")
+        raise InputError(f"compared runs have one task, not {' and '.join(tasks)}")
     kinds = [label(str(config.environment.get("guidance"))) for config in configs]
     names = [POLICY] if len(subjects) == 1 else kinds
     if len(set(names)) < len(names):
         names = [subject.name for subject in subjects]
     if len(set(names)) < len(names):
-        raise InputError("runs that are compared are different ones, in folders of different names")
+        raise InputError(
+            "two of the compared runs have the same name: give each run once, in a folder with its own name"
+        )
     changed = [subject.changed_environment(environment) for subject in subjects]
     settings: list[dict[str, Any]] = [
         {"seed": config.seed, **options} for config, options in zip(configs, changed, strict=True)
     ]
-    keys = sorted({key for one in settings for key in one})
-    if differing := [key for key in keys if any(one.get(key) != settings[0].get(key) for one in settings)]:
+    keys = sorted(set().union(*settings))
+    if differing := [key for key in keys if any(values.get(key) != settings[0].get(key) for values in settings)]:
         log(f"the runs differ in {', '.join(differing)}")
     return [
         _Actor(name, subject.make_policy, replace(config, environment=options), subject.digest)
@@ -371,9 +376,10 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
 def _baseline_actors(
     compared: Sequence[_Actor], baselines: Mapping[str, MakePolicy], *, are_functions: bool
 ) -> list[_Actor]:
-    """Return the demonstration alone and the baseline policies, without those that are compared by their names.
+    """Return the demonstration alone and the baseline policies that are not among the compared policies by name.
 
-    With `are_functions`, the caller gave the functions, and only those that `digest_of` identifies are stored.
+    With `are_functions`, `baselines` are functions of the caller. Their episodes are stored only if `digest_of`
+    identifies the function.
 
     Raises:
         InputError: If two policies have the same name.

@@ -70,7 +70,7 @@ class Callback:
 
 
 class EnvCallback(Callback):
-    """Callback that reads more data of an environment than those that a step returns.
+    """Callback that reads data of the environment which a step does not return.
 
     Attributes:
         env: Environment.
@@ -83,7 +83,7 @@ class EnvCallback(Callback):
 
 
 def check_seed(seed: object) -> int:
-    """Return a seed as an int; raise an InputError if it is no whole number, negative or does not fit into 31 bits."""
+    """Return a seed as an int; raise an InputError if it is not a whole number from 0 to 2^31 - 1."""
     number = as_whole(seed, "a seed")
     if not 0 <= number < 2**31:
         raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {number}")
@@ -104,9 +104,10 @@ def rollout(
     held_out: bool = False,
     options: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Run one episode and return its statistics as a table row; the environment's trace holds that episode afterwards.
+    """Run one episode and return its statistics as a table row.
 
-    An environment from outside this package has no trace, and its row has fewer columns; see `outside_row`.
+    Afterwards the environment's trace contains the episode. An environment of another package has no trace, and its row
+    has fewer columns; see `outside_row`.
 
     Args:
         env: Environment.
@@ -114,15 +115,15 @@ def rollout(
             called too.
         callbacks: Callbacks, called in this order, after the policy.
         index: Number of the episode, for its row.
-        seed: Seed of the reset, a whole number of at least 0. By default the random stream continues; with `held_out`
-            the seed is then 0.
+        seed: Seed of the reset, a whole number of at least 0. None: the random stream continues, but the seed is 0 with
+            `held_out`.
         held_out: True to sample the conditions from the held-out distribution instead of that of training.
         options: Options of the reset.
 
     Raises:
         InputError: If `env` is no environment, `act` is no policy, the seed is invalid, the reset is refused, an action
-            is refused or does not fit the environment's actions, the reward of an environment from outside this package
-            is NaN, or a callback returns wrong columns (`new_columns`).
+            is invalid, the reward of an environment of another package is NaN, or a callback returns wrong columns
+            (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
     from guiderail.tools.evaluation.policies import as_policy
@@ -135,10 +136,11 @@ def rollout(
         raise InputError(f"a seed is a whole number of at least 0, not {seed}")
     base: Any = env.unwrapped
     is_own = hasattr(base, "trace")
-    given = None if options is None else dict(options)
-    if held_out:  # an environment from outside this package has no such option: its conditions depend on the seed
-        seed, given = seed or 0, {"held_out": True, **(given or {})} if is_own else given or None
-    observation, _ = env.reset(seed=seed, options=given)
+    reset_options = None if options is None else dict(options)
+    if held_out:  # an environment of another package has no such option: its conditions depend on the seed
+        seed = seed or 0
+        reset_options = {"held_out": True, **(reset_options or {})} if is_own else reset_options or None
+    observation, _ = env.reset(seed=seed, options=reset_options)
     if isinstance(act, Callback) and act not in callbacks:
         callbacks = (act, *callbacks)
     for callback in callbacks:
@@ -150,11 +152,11 @@ def rollout(
         action, privileged = _without_batch(act(observation), env), getattr(base, "privileged", None)
         if not is_own:
             _check_action(action, env)
-        following, reward, terminated, truncated, info = env.step(action)
+        next_observation, reward, terminated, truncated, info = env.step(action)
         if not is_own and math.isnan(reward):
             raise InputError("the environment returned NaN as reward: a reward is a number")
         transition = Transition(
-            observation, action, float(reward), following, terminated, truncated, info,
+            observation, action, float(reward), next_observation, terminated, truncated, info,
             privileged, getattr(base, "privileged", None),
         )  # fmt: skip
         total += transition.reward
@@ -163,7 +165,7 @@ def rollout(
             infos.append(info)
         for callback in callbacks:
             callback.on_step(transition)
-        observation, is_over = following, transition.is_last
+        observation, is_over = next_observation, transition.is_last
     row = (
         episode_row(Episode(index, base.trace, total, terms, info))
         if is_own
@@ -175,13 +177,13 @@ def rollout(
 
 
 def _without_batch(action: Any, env: gymnasium.Env) -> Any:
-    """Return the only row of an action (1, A) in an environment with actions (A,); return another one unchanged."""
+    """Return the only row of an action (1, A) in an environment with actions (A,), and any other action unchanged."""
     shape = env.action_space.shape
     return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
 
 
 def _check_action(action: Any, env: gymnasium.Env) -> None:
-    """Raise an InputError if an action does not have the shape of an environment's actions, or is not one of them."""
+    """Raise an InputError if an action has another shape than the action space, or is outside a discrete space."""
     space = env.action_space
     expected = space.shape
     try:
@@ -195,7 +197,7 @@ def _check_action(action: Any, env: gymnasium.Env) -> None:
     if isinstance(space, gymnasium.spaces.Discrete):
         try:
             is_inside = bool(0 <= action - space.start < space.n)
-        except TypeError:  # no number
+        except TypeError:  # not a number
             is_inside = False
         if not is_inside:
             last = space.start + space.n - 1
@@ -208,7 +210,7 @@ def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]
     """Return the columns that a callback adds to an episode's row.
 
     Raises:
-        InputError: If the callback returns no columns by name, or one that the row has already.
+        InputError: If the callback does not return a mapping, or returns a column that the row already has.
     """
     columns = callback.on_episode_end(row)
     if not isinstance(columns, Mapping):
@@ -248,9 +250,9 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
 def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
     """Return True if the policy's actions for several observations have the shape of the environment's actions.
 
-    It is called with 21 constant observations from −1 to 1, because a scripted policy may read a component only if
-    others have certain values. An object with `predict` is not called if it declares both shapes; otherwise a deep
-    copy of it is called, if it can be copied. An exception of the policy is passed on.
+    The policy is called with 21 constant observations from −1 to 1, because a scripted policy may read some components
+    only for certain values of the others. An object with `predict` is not called if it declares both shapes. Otherwise
+    a deep copy of the object is called, if it can be copied. An exception of the policy is not caught.
     """
     from guiderail.tools.evaluation.policies import PredictPolicy
 
@@ -324,13 +326,13 @@ class EpisodeProgress:
 
     def update(self, row: Mapping[str, Any]) -> None:
         """Add a finished episode, given its row."""
-        from guiderail.tools.evaluation.metrics import REPORTS_SUCCESS  # pandas takes a second
+        from guiderail.tools.evaluation.metrics import REPORTS_SUCCESS  # imports pandas, which takes a second
 
         self._done, self._count = int(row["episode"]) + 1, self._count + 1
         self._recent.append((float(row["success"]), float(row["return"])))
         self._reports_success |= bool(row.get(REPORTS_SUCCESS, True))
         violation = float(row.get("max_commanded_violation", -math.inf))
-        self._max_violation = float(np.maximum(self._max_violation, violation))  # NaN if one is NaN
+        self._max_violation = float(np.maximum(self._max_violation, violation))  # NaN if any violation is NaN
         self._bar.update(self._task, completed=self._done, status=self.status(), refresh=True)
         now = time.monotonic()
         is_due = self._count == 1 or self._done == self._episodes or now - self._printed > INTERVAL
@@ -340,11 +342,11 @@ class EpisodeProgress:
             self._console.print(text, soft_wrap=True)
 
     def status(self) -> str:
-        """Return success and return of the last episodes and the largest violation of all; call it after `update`.
+        """Return success rate and mean return of the last episodes, and the largest violation of all, as text.
 
-        The success is left out if the environment reports none.
+        At least one `update` must precede the call. The success rate is left out if the environment reports no success.
         """
-        from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # pandas takes a second
+        from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION  # imports pandas, which takes a second
 
         success, returns = (sum(values) / len(self._recent) for values in zip(*self._recent, strict=True))
         violation = "none" if self._max_violation <= TOLERANCE else f"{self._max_violation:.1e} {VIOLATION}"

@@ -62,9 +62,9 @@ class StepLog(EnvCallback):
         Raises:
             InputError: If the file cannot be written.
         """
-        started = time.perf_counter()
+        start_time = time.perf_counter()
         write_step_log(step_log_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
-        self.seconds += time.perf_counter() - started
+        self.seconds += time.perf_counter() - start_time
         return {}
 
 
@@ -85,11 +85,11 @@ def remove_step_logs(folder: Path, episodes: int) -> None:
 
 
 def table(trace: EpisodeTrace, episode: int) -> pa.Table:
-    """Return an episode's control steps, one row each, with the columns of `MEANINGS` that its trace holds."""
-    number = len(trace)
+    """Return an episode's control steps, one row each, with the columns of `MEANINGS` that its trace has."""
+    num_steps = len(trace)
     columns: dict[str, np.ndarray] = {
-        "episode": np.full(number, episode, np.int32),
-        "step": np.arange(number, dtype=np.int32),
+        "episode": np.full(num_steps, episode, np.int32),
+        "step": np.arange(num_steps, dtype=np.int32),
     }
     columns |= _numbered("desired_pose", trace.commanded) | _numbered("pose", trace.measured)
     columns["contact_force"] = trace.force
@@ -130,7 +130,7 @@ def read_step_log(folder: Path) -> pd.DataFrame:
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
-        raise InputError(f"{folder} holds no step log: the run was trained without one")
+        raise InputError(f"{folder} has no step log: the run was trained without one")
     check_parquet(files)
     tables = []
     for file in files:
@@ -141,4 +141,4 @@ def read_step_log(folder: Path) -> pd.DataFrame:
     try:
         return pa.concat_tables(tables).to_pandas()
     except pa.ArrowInvalid as error:
-        raise InputError(f"{folder} holds step logs of different environments: restore them, or train again") from error
+        raise InputError(f"{folder} has step logs of different environments: restore them, or train again") from error

@@ -37,11 +37,11 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Raise an InputError if the guidance is not that of the training: guidance defines the meaning of actions."""
+    """Raise an InputError if the guidance differs from that of the training: it defines the meaning of actions."""
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
         raise InputError(
-            f"the policy was trained with guidance {trained}, and its actions mean something else with {used}: leave "
+            f"the policy was trained with guidance {trained}, and its actions have another meaning with {used}: leave "
             "guidance out of --env, or train a policy with that guidance"
         )
 
@@ -52,23 +52,23 @@ def evaluation_scope(task: str, environment: Mapping[str, Any], resample_offsets
     Raises:
         InputError: If `resample_offsets` is True and a run of the task has no hidden offset.
     """
-    if resample_offsets and not _can_hide(task):
+    if resample_offsets and not _has_hidden_offset(task):
         raise InputError(f"a run of {task} has no hidden offset to resample: leave --resample-offsets out")
     if not has_held_out_distribution(task):
         return f"conditions as in training: {task} declares no held-out conditions"
-    if not _can_hide(task):
+    if not _has_hidden_offset(task):
         return "held-out starts"
-    if resample_offsets or not hides(task, environment):
+    if resample_offsets or not has_constant_offset(task, environment):
         return "any offset: sampled again in every episode"
     return "the one offset that is hidden in this run (--resample-offsets: any offset)"
 
 
-def hides(task: str, environment: Mapping[str, Any]) -> bool:
+def has_constant_offset(task: str, environment: Mapping[str, Any]) -> bool:
     """Return True if all episodes of a run have the same hidden offset, unless a reset has the option `new_run`."""
-    return _can_hide(task) and environment.get("fixture_offset", "per_run") == "per_run"
+    return _has_hidden_offset(task) and environment.get("fixture_offset", "per_run") == "per_run"
 
 
-def _can_hide(task: str) -> bool:
+def _has_hidden_offset(task: str) -> bool:
     return task in TASKS.names() and "new_run" in TASKS.get(task).Reset.model_fields
 
 
@@ -111,8 +111,8 @@ class Subject:
 def find_environment(env: Any) -> Any:
     """Return the environment or the name of the task that `env` denotes.
 
-    The id of an environment of another package is made into an environment, and "guiderail/NAME-v0" into the name. All
-    else is returned unchanged, unknown names included.
+    For an id of another package the environment is made, and for "guiderail/NAME-v0" the task's name is returned. Any
+    other value is returned unchanged, including an unknown name.
 
     Args:
         env: Environment, name or folder of a task, id of an environment registered with Gymnasium, or None.
@@ -150,7 +150,7 @@ def find_environment(env: Any) -> Any:
 def find_subject(
     policy: Any, env: Any, environment: Mapping[str, Any] | None = None, *, trust_policy: bool = False
 ) -> Subject:
-    """Return a policy that is evaluated or shown.
+    """Return the subject of an evaluation or a visualization: a policy, and where it acts.
 
     Args:
         policy: A run, its folder, or `pretrained:NAME`. With `env`: any policy that `load_policy` or `as_policy` takes,
@@ -184,10 +184,10 @@ def find_subject(
     config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
     if not isinstance(policy, Path | str):
         act = as_policy(policy)
-        unknown = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
+        digest = str(time.time_ns())  # unique, so that a function's stored episodes are never used again
         if isinstance(act, FunctionPolicy) or (act is policy and not isinstance(act, Policy)):
-            return Subject("policy", config, lambda env: act, digest=unknown)
-        return Subject("policy", config, partial(check_compatible, act), digest=unknown)
+            return Subject("policy", config, lambda env: act, digest=digest)
+        return Subject("policy", config, partial(check_compatible, act), digest=digest)
     source = find_run(policy)
     if is_policy_file(policy) or (path_exists(source) and source.is_dir()):
         make_policy = partial(check_compatible, load_policy(source, trust_policy=trust_policy))
@@ -201,8 +201,8 @@ def _make_compatible(name: str, make_policy: MakePolicy, env: gymnasium.Env) -> 
     """Return a baseline or scripted policy for an environment; raise an InputError if it does not fit."""
     if not is_compatible(make_policy, env):
         raise InputError(
-            f"the policy {name!r} does not fit the observations or actions of this environment: choose another one, or "
-            "the options that it is written for, such as difficulty=hard"
+            f"the policy {name!r} does not fit the observations or actions of this environment: choose another policy, "
+            "or the options that the policy is written for, such as difficulty=hard"
         )
     return make_policy(env)
 
@@ -218,12 +218,14 @@ def make_baselines(
         baselines: Names of baseline policies, or the functions themselves by name; None for the default set.
 
     Raises:
-        InputError: If a name is unknown, or `baselines` are neither functions by name nor names.
+        InputError: If a name is unknown, or `baselines` has another type.
     """
     if isinstance(baselines, Mapping):
-        for name, make in baselines.items():
-            if not callable(make):
-                raise InputError(f"baseline {name} is a function from an environment to a policy, not {brief(make)}")
+        for name, make_policy in baselines.items():
+            if not callable(make_policy):
+                raise InputError(
+                    f"baseline {name} must be a function from an environment to a policy, not {brief(make_policy)}"
+                )
         return baselines
     if isinstance(baselines, str) or not (baselines is None or isinstance(baselines, Iterable)):
         raise InputError(f"baselines are a list of names, or functions by name, not {brief(baselines)}")
@@ -270,8 +272,7 @@ class EpisodeSpec:
             trust_policy: True to read a policy file that can execute code.
 
         Raises:
-            InputError: If there is no such policy, the seed is invalid, or `environment` has another guidance than the
-                run.
+            InputError: If there is no such policy, the seed is invalid, or `environment` changes the guidance of a run.
         """
         subject = find_subject(policy, task, environment, trust_policy=trust_policy)
         config, folder = subject.config, subject.folder

@@ -78,7 +78,7 @@ class _Strict(BaseModel):
 
 
 class LearnerChoice(_Strict):
-    """Learner of a method; the task's own is the default."""
+    """Learner of a method, by default that of the task."""
 
     algorithm: str | None = None  # registered name of the learner
     preset: str | None = None  # preset of the learner's settings
@@ -157,7 +157,7 @@ class _SeedChoice(_Strict):
 
 
 class Ratio(_Strict):
-    """Ratio of a table's column for one method to that for another one."""
+    """Ratio of a column's value for one method to its value for another method."""
 
     of: str  # name of the column
     method: str  # method of the numerator
@@ -184,7 +184,7 @@ class Study(_Strict):
     folder: RunName = "{method}-{seed}"  # folder of a run
     # Modules, files (.py) or task folders that register the task, the learner, …; relative to the working directory.
     imports: tuple[str, ...] = ()
-    _whole: dict[str, Method] = PrivateAttr(default_factory=dict)  # methods of the study of which this is a part
+    _whole: dict[str, Method] = PrivateAttr(default_factory=dict)  # methods of the whole study if this is a subset
 
     @property
     def all_methods(self) -> dict[str, Method]:
@@ -210,7 +210,8 @@ class Study(_Strict):
     @model_validator(mode="after")
     def _check_after_episodes(self) -> Study:
         learners = [method.learner for method in self.methods.values() if method.policy == LEARNED]
-        episodes = [one.episodes or self.learner.episodes or max(self.after_episodes, default=0) for one in learners]
+        common = self.learner.episodes or max(self.after_episodes, default=0)
+        episodes = [learner.episodes or common for learner in learners]
         if unreached := [number for number in self.after_episodes if episodes and number > max(episodes)]:
             raise ValueError(
                 f"no method trains for {unreached[0]} episodes, only for {max(episodes)}: leave {unreached[0]} out of "
@@ -227,7 +228,7 @@ class Study(_Strict):
     def subset(self, methods: Sequence[str] | None = None, seeds: Sequence[int] | None = None) -> Study:
         """Return the study with some of its methods, or with other seeds.
 
-        A method that declares seeds of its own keeps them.
+        The seeds of a method that declares its own are not changed.
 
         Raises:
             InputError: If a method is unknown, or the seeds are not valid.
@@ -240,16 +241,16 @@ class Study(_Strict):
             changed_seeds = self.seeds if seeds is None else _SeedChoice(seeds=tuple(seeds)).seeds
         except ValidationError as error:
             raise InputError(_sentence(error)) from error
-        part = self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
-        part._whole = self.all_methods
-        return part
+        subset = self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
+        subset._whole = self.all_methods
+        return subset
 
 
 def load_study(file: Path | str) -> Study:
     """Read a study's YAML file.
 
-    A task may be the path of a task folder. It, and the paths in `imports`, are relative to the working directory, as
-    in `guiderail train`.
+    The task may be the path of a task folder. This path and those in `imports` are relative to the working directory,
+    as in `guiderail train`.
 
     Raises:
         InputError: If the file does not exist or is not a valid study, or if the task folder is not valid.
@@ -269,12 +270,12 @@ def load_study(file: Path | str) -> Study:
 
 
 def source_file(out: Path, study: str) -> Path:
-    """Return the file, in the folder `out` of a study, that tells from which file the study was run."""
+    """Return the file, in a study's folder `out`, that stores the path of the study's YAML file."""
     return out / "logs" / f"{study}.json"
 
 
 def _sentence(error: ValidationError) -> str:
-    """Return the first error as a sentence: where it is and what is allowed."""
+    """Return the first error as a sentence: the key, and the values that are allowed."""
     first = error.errors()[0]
     where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":

@@ -123,7 +123,7 @@ class Job:
 
     @cached_property
     def source_job(self) -> Job | None:
-        """Job that trains the source, also of a method that the selected part of the study leaves out."""
+        """Job that trains the source run; its method may be one that a subset of the study leaves out."""
         if self.source is None:
             return None
         whole = self.study.model_copy(update={"methods": self.study.all_methods})
@@ -158,8 +158,10 @@ def check_job(job: Job) -> None:
     contents: dict[Path, str] = {}
     for episodes, eval_set in itertools.product(job.after_episodes, job.study.eval_sets):
         file, content = _evaluated_file(job, episodes, eval_set)
-        if (part := file.relative_to(job.folder.path).parts[0]) in RUN_FILES:
-            raise InputError(f"the evaluation set {eval_set.name!r} has a file of the run, {part}: name another one")
+        if (first_part := file.relative_to(job.folder.path).parts[0]) in RUN_FILES:
+            raise InputError(
+                f"the evaluation set {eval_set.name!r} has a file of the run, {first_part}: name another file"
+            )
         if contents.setdefault(file, content) != content:
             raise InputError(
                 f"the evaluation set {eval_set.name!r} has the file {file.name} of other evaluated episodes: write "
@@ -176,12 +178,12 @@ def check_job(job: Job) -> None:
 
 
 def check_source(job: Job, *, is_selected: bool = False) -> str:
-    """Return the state of the run that a job starts from; empty without one, or if only tables are to be read.
+    """Return the state of the run that a job starts from; "" if there is no such run, or the job needs no training.
 
-    With `is_selected`, the study trains that run before the job, so that it may be unfinished.
+    With `is_selected`, that run may be unfinished, because the study trains it before the job.
 
     Raises:
-        InputError: If that run is not finished, or is another than when the job's run began.
+        InputError: If that run is not finished, or its state differs from that at the start of the job's training.
     """
     if job.source is None:
         return ""
@@ -207,7 +209,7 @@ def check_source(job: Job, *, is_selected: bool = False) -> str:
 
 
 def is_done(job: Job) -> bool:
-    """Return True if a job is trained and evaluated, so that its rows only have to be read."""
+    """Return True if a job is trained and evaluated, so that only its rows need to be read."""
     pairs = itertools.product(job.after_episodes, job.study.eval_sets)
     is_evaluated = all(_is_evaluated(job, *pair) for pair in pairs)
     return is_evaluated and not any(_needs_training(job, episodes) for episodes in job.after_episodes)
@@ -293,11 +295,11 @@ def _refuse_lost_policy(job: Job, episodes: int) -> None:
 
 
 def digest(job: Job, eval_set: EvalSet | None = None, episodes: int = 0) -> str:
-    """Return the digest of what decides evaluated episodes, for the name of their file.
+    """Return the digest of everything that evaluated episodes depend on, for the name of their file.
 
     It contains the resolved environment, because the options that a difficulty sets may change. It does not contain the
-    learner, because a run's folder holds a run of one learner only. Seed and number of training episodes are contained
-    only if the names of folder and file do not contain them.
+    learner, because a run's folder has a run of one learner only. It contains the seed and the number of training
+    episodes only if the names of folder and file do not contain them.
     """
     method = job.study.methods[job.method].model_dump_json(include={"policy", "grid"})
     evaluation = "" if eval_set is None else eval_set.model_dump_json(exclude={"name", "file"})
@@ -369,7 +371,7 @@ def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
         sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in eval_set.sampled.items()}
         seed = eval_set.first_seed + done
         how: dict[str, Any] = {"episodes": number, "seed": seed, "options": eval_set.options}
-        # Every set has the same random actions, from the run's seed alone, so that published tables stay as they are.
+        # `first_number=0`: random actions depend on the run's seed alone, as in the published tables.
         rows = evaluate_run(config, policy, environment | sampled, **how, first_number=0)
         tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
     return pd.concat(tables, ignore_index=True)

@@ -32,7 +32,7 @@ class StudyProgress:
         Args:
             jobs: Jobs to run, by key.
             total: Number of jobs of the study, including those that are done.
-            call: Text that identifies this study's attempts in the logs, which other processes may write too.
+            call: Identifier of the attempts of this call in the logs, which other processes may write too.
             console: Console; standard error by default, so that results can be piped.
         """
         self._console = console or Console(stderr=True)
@@ -60,13 +60,13 @@ class StudyProgress:
     def end(self, key: int, job: Any, outcome: Outcome) -> None:
         """Print the outcome of a job."""
         attempts = count_attempts(job.log, self._call) if key in self._open else 0
-        self._open = {other: one for other, one in self._open.items() if other != key}  # copy: _watch may be iterating
+        self._open = {k: entry for k, entry in self._open.items() if k != key}  # copy: `_watch` may be iterating
         self._num_ended += 1
         self._num_failed += bool(outcome.failure)
         text = f": failed: {outcome.failure}" if outcome.failure else ""
         if outcome.rows and (last := outcome.rows[-1])["eval_set"]:
             text = f": {last['eval_set']} {last['success_rate']:.0%}"
-        retry = f" (by worker {attempts}, those before it were lost)" if attempts > 1 else ""
+        retry = f" (by worker {attempts}; the workers before it were lost)" if attempts > 1 else ""
         self._print(f"{self._num_ended}/{self._total} {job.method}, seed {job.seed}{text}{retry}")
 
     def _print(self, text: str) -> None:

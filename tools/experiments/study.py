@@ -79,7 +79,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataF
     for job in jobs:
         check_job(job)
     _refuse_shared_folders(jobs)
-    outcomes = _run_jobs(jobs, _in_order(jobs), engine or make_engine())
+    outcomes = _run_jobs(jobs, _order_jobs(jobs), engine or make_engine())
     pairs = [(job, outcomes[index]) for index, job in enumerate(jobs)]
     rows = pd.DataFrame([row for _, outcome in pairs for row in outcome.rows], dtype=object)
     failed = [f"{job.method}, seed {job.seed}, failed: {one.failure}" for job, one in pairs if one.failure]
@@ -199,15 +199,15 @@ def _check_columns(study: Study) -> None:
             raise InputError(f"the study {study.name} has no column {one.of!r}: {did_you_mean(one.of, known)}")
 
 
-def _in_order(jobs: list[Job]) -> list[list[int]]:
+def _order_jobs(jobs: list[Job]) -> list[list[int]]:
     """Return the indices of the jobs in groups: a job is in a later group than the job whose run it starts from.
 
     Raises:
-        InputError: If jobs start from each other's runs, or a run that a job starts from is missing or another one.
+        InputError: If jobs start from each other's runs, or `check_source` refuses the run that a job starts from.
     """
     indices = {job.folder.path: index for index, job in enumerate(jobs)}
     sources = [None if job.source_job is None else indices.get(job.source_job.folder.path) for job in jobs]
-    sorter = TopologicalSorter({index: () if one is None else (one,) for index, one in enumerate(sources)})
+    sorter = TopologicalSorter({index: () if source is None else (source,) for index, source in enumerate(sources)})
     try:
         sorter.prepare()
     except CycleError as error:
@@ -280,9 +280,9 @@ def draw_sweeps(study: Study, rows: pd.DataFrame, path: Path) -> Path:
     """Draw a panel for each sweep, the success rate of all seeds against the quantity; return the picture's path.
 
     The band spans all seeds' 95 % intervals. Harder values are to the right. A cross marks where the success rate of a
-    method falls below `BREAKING_SUCCESS`; there is none if the rate is below it at the first value.
+    method falls below `BREAKING_SUCCESS`, unless it is below at the first value.
 
-    For a method evaluated after several numbers of training episodes, the largest number is drawn.
+    If a method is evaluated after several numbers of training episodes, the results of the largest number are drawn.
     """
     width = max(4.4 * len(study.sweeps), 1.3 * len(study.methods))  # the legend is one line
     figure, axes = new_figure(1, len(study.sweeps), (width, 3.6))
@@ -333,7 +333,7 @@ def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], lis
 
     A point is the success rate of all seeds, and the lowest and highest end of the seeds' 95 % intervals.
     """
-    points = {value: _success(rows, name, sweep.eval_set(value).name) for value in sweep.at}
+    points = {value: _pooled_success(rows, name, sweep.eval_set(value).name) for value in sweep.at}
     evaluated = {value: point for value, point in points.items() if point is not None}
     return list(evaluated), list(evaluated.values())
 
@@ -341,7 +341,7 @@ def curve(sweep: Sweep, rows: pd.DataFrame, name: str) -> tuple[list[float], lis
 def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | str:
     """Return the value where the success rate first falls below `BREAKING_SUCCESS`, interpolated linearly.
 
-    Return `AT_ONCE` if the rate at the first, easiest value is below it already, and `NEVER` if no rate is below it.
+    The result is `AT_ONCE` if the rate at the first, easiest value is below it, and `NEVER` if no rate is below it.
     """
     if rates[0] < BREAKING_SUCCESS:
         return AT_ONCE
@@ -351,7 +351,7 @@ def breaking_point(values: Sequence[float], rates: Sequence[float]) -> float | s
     return NEVER
 
 
-def _success(rows: pd.DataFrame, method: str, eval_set: str) -> tuple[float, float, float] | None:
+def _pooled_success(rows: pd.DataFrame, method: str, eval_set: str) -> tuple[float, float, float] | None:
     """Return the success rate of all seeds, and the lowest and highest end of their intervals; None without rows."""
     selected = rows[(rows["method"] == method) & (rows["eval_set"] == eval_set)]
     selected = selected[selected["after_episodes"] == selected["after_episodes"].max()]

@@ -342,7 +342,7 @@ def test_sentence_says_that_a_violation_is_not_a_number():
 @pytest.mark.parametrize("other", ["residual", "kgrl", "none"])
 def test_another_guidance_is_refused(other):
     refuse_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"})
-    with pytest.raises(InputError, match=f"its actions mean something else with {other}"):
+    with pytest.raises(InputError, match=f"its actions have another meaning with {other}"):
         refuse_guidance_change({"guidance": "skgrl"}, {"guidance": other})
 
 

@@ -477,7 +477,7 @@ class Constant:
     [
         ("constant", "baselines are a list of names"),
         (5, "baselines are a list of names"),
-        ({"still": 5}, "baseline still is a function from an environment to a policy, not 5"),
+        ({"still": 5}, "baseline still must be a function from an environment to a policy, not 5"),
         ({"still": lambda point: np.zeros(2)}, "must return a policy, not array"),
     ],
 )

@@ -67,7 +67,7 @@ def test_removal_of_step_logs_leaves_other_files(tmp_path):
 
 
 def test_step_log_is_refused_when_absent_or_damaged(logged, tmp_path):
-    with pytest.raises(InputError, match="holds no step log"):
+    with pytest.raises(InputError, match="has no step log"):
         read_step_log(tmp_path)
     step_log_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")
     with pytest.raises(InputError, match="damaged"):

@@ -49,4 +49,4 @@ def test_progress_prints_a_line_per_ended_job_in_a_file(tmp_path):
         begin(one, 4, workers=2)
         begin(one, 0, call="other")  # by another process, which the lock of the run refuses
         board.end(0, one, Outcome(({"eval_set": "held out", "success_rate": 0.5},)))
-    assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2, those before it were lost)\n"
+    assert console.file.getvalue() == "1/1 kgrl, seed 0: held out 50% (by worker 2; the workers before it were lost)\n"

@@ -254,7 +254,7 @@ def test_safety_is_counted_in_control_steps_with_a_step_log(tmp_path):
     assert run.safety["max_commanded_violation"] == row["max_commanded_violation"]
     assert run.safety["collision_steps"] == row["collision_steps"]
     (tmp_path / "run" / "steps" / "episode-000000.parquet").unlink()
-    with pytest.raises(InputError, match="holds no step log"):
+    with pytest.raises(InputError, match="has no step log"):
         _ = run.safety
 
 

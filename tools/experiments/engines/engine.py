@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_callable
 
 MAX_ATTEMPTS = 3  # number of lost workers after which a job is given up: the job itself may kill its worker
-GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost with it, one after the other"
+GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost while they ran it, one after the other"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Engine(AbstractContextManager[Any]):
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
         """Yield keys and outcomes of the jobs as they finish, in any order.
 
-        It is called again for jobs that start from the runs of earlier ones.
+        It is called again for jobs that start from the runs of earlier jobs.
 
         Args:
             work: Function from a job to its outcome; it can be pickled and raises nothing.

@@ -53,7 +53,7 @@ class ProcessEngine(Engine):
     def _assign(self, waiting: deque[int], work: Work, jobs: Mapping[int, Any]) -> None:
         """Assign waiting jobs to free workers; start workers until there are `processes` of them."""
         while waiting:
-            worker = next((one for one in self._workers if one.key is None), None)
+            worker = next((worker for worker in self._workers if worker.key is None), None)
             if worker is None:
                 if len(self._workers) == self.processes:
                     return
@@ -80,7 +80,7 @@ class _Worker:
         self.key: int | None = None
         self._process = context.Process(target=_serve, args=(child_connection, work), daemon=True)
         self._process.start()
-        child_connection.close()  # so that the connection closes when the process ends
+        child_connection.close()  # otherwise the connection would stay open after the process ends
 
     def begin(self, key: int, job: Any) -> bool:
         """Send a job; return False if the process has ended."""
@@ -107,7 +107,7 @@ class _Worker:
         return signal.Signals(-code).name if code < 0 else f"exit code {code}"
 
     def stop(self) -> None:
-        """Kill the process: its results are on disk or received already."""
+        """Kill the process, whose results are on disk or already received."""
         self._process.kill()
         self._process.join()
         self.connection.close()
