@@ -127,9 +127,7 @@ def _describe_option(row: Mapping[str, Any], default: Any, choices: Collection[s
     values = [f"one of {', '.join(map(str, allowed))}"] if allowed else []
     if {"minimum", "maximum"} <= row.keys():
         values = [f"from {row['minimum']:g} to {row['maximum']:g}"]
-    if (
-        default not in (None, (), "") or "default" not in row["description"]
-    ):  # otherwise the description explains the default
+    if default not in (None, (), "") or "default" not in row["description"]:  # otherwise the description explains it
         values.append(f"default {default!r}")
     return ": ".join([str(row["description"]), *(["; ".join(values)] if values else [])])
 

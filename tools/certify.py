@@ -148,7 +148,7 @@ def verify_certificate(
         if different is not None:
             if different == "about":
                 different = _different_option(json.loads(files[CERTIFICATE])["about"], skill.about)
-            verdict = f"no: the {different} of the certificate is not that of {subject}"
+            verdict = f"no: the certificate's {different} is not that of {subject}"
         elif (budgeted := json.loads(files[CERTIFICATE])["budgeted"]) is not None:
             worst = _search_budget(skill.loop)
             for name in checker.BUDGETS:

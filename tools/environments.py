@@ -165,10 +165,7 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
         if not option_models:
             known = {name for model in models for name in model.model_fields}
             raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
-        checked = [
-            option,
-            *(KERNEL_OPTIONS if option in KERNEL_OPTIONS else ()),
-        ]  # kernel options are validated together
+        checked = KERNEL_OPTIONS if option in KERNEL_OPTIONS else (option,)  # kernel options are validated together
         values = {name: options[name] for name in checked if name in options}
         errors = []
         for model in option_models:
@@ -242,9 +239,8 @@ def as_value(text: str) -> Any:
 
     A list becomes a tuple. Text that `float` accepts becomes a number, even if it is quoted.
     """
-    if re.fullmatch(
-        r"-?(0|[1-9][0-9]{0,14})", text
-    ):  # plain values do not need the YAML reader, which is slow to import
+    # Plain values do not need the YAML reader, which is slow to import.
+    if re.fullmatch(r"-?(0|[1-9][0-9]{0,14})", text):
         return int(text)
     if text not in ("null", "true", "false") and re.fullmatch(r"-?[0-9]{1,9}\.[0-9]{1,15}|[a-z_]+", text):
         return _parse_numbers(text)

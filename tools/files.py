@@ -99,8 +99,8 @@ def atomic_folder(out: Path) -> Iterator[Path]:
         yield temporary
         temporary.rename(out)
     except OSError as error:
-        failed = str(temporary if error.filename is None else error.filename)
-        if not (failed.startswith(str(temporary)) or str(temporary).startswith(failed)):
+        error_path = str(temporary if error.filename is None else error.filename)
+        if not (error_path.startswith(str(temporary)) or str(temporary).startswith(error_path)):
             raise
         raise write_error(out, error) from error
     finally:
@@ -202,9 +202,7 @@ def refuse_existing_run(path: Path) -> None:
     Hidden files may be left over from a run that was killed before its configuration was written.
     """
     try:
-        is_taken = path.exists() and (
-            not path.is_dir() or any(not file.name.startswith(".") for file in path.iterdir())
-        )
+        is_taken = path.exists() and not (path.is_dir() and all(file.name.startswith(".") for file in path.iterdir()))
     except OSError as error:
         raise InputError(f"{brief(path)} is no folder for a run: {error.strerror}") from error
     if is_taken and path == Path():  # also the empty path

@@ -40,15 +40,12 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
     for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
         verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
-        assert verdict == f"no: the {name} of the certificate is not that of NarrowPassage"
-    assert "its start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
+        assert verdict == f"no: the certificate's {name} is not that of NarrowPassage"
+    assert "'s start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
     for excess in (9.0, np.nan):
         needed = SimpleNamespace(excess=np.full((2, 2), excess), residue=np.zeros((2, 2)))
         monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop, needed=needed: needed)
-        assert (
-            "exceed the certificate's budget of excess"
-            in verify_certificate("NarrowPassage", environment, folder)["checker"]
-        )
+        assert "'s budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
     with pytest.raises(InputError, match="name the folder of a certificate"):
         verify_certificate("NarrowPassage", environment, tmp_path)
     key.write_bytes(b"short")
@@ -81,7 +78,7 @@ def test_command_of_an_attack_violates_a_bound_if_it_is_nan(tmp_path, monkeypatc
     ("of", "environment", "words"),
     [
         ("NarrowPassage", {"guidance": "residual"}, "cannot be certified"),
-        ("NarrowPassage", {"guidance": "skgrl", "adaptive_history": True}, "of one length"),
+        ("NarrowPassage", {"guidance": "skgrl", "adaptive_history": True}, "of fixed length"),
         ("Pouring", {}, "cannot be certified"),
         ("nowhere", {}, "no task"),
     ],
@@ -168,7 +165,7 @@ def test_history_begins_within_the_declared_offset(far):
 
 def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_path):
     monkeypatch.setattr(NarrowPassage, "start_within", lambda self: [0.1, 0.1, 0.1])
-    with pytest.raises(InputError, match="start_within of NarrowPassage is a number, or 2 of them"):
+    with pytest.raises(InputError, match="start_within of NarrowPassage must return a number or 2 numbers"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path)
 
 
@@ -185,5 +182,5 @@ def test_via_points_move_the_motion_but_not_its_start(tmp_path):
 def test_pretrained_policy_is_certified_like_a_run():
     task, environment, about = _find_subject("pretrained:passage", {})
     assert (task, environment["guidance"], set(about)) == ("NarrowPassage", "skgrl", {"task", "config.yaml"})
-    with pytest.raises(InputError, match="or of pretrained:NAME, with --out"):
+    with pytest.raises(InputError, match="or of pretrained:NAME needs a folder"):
         certify_skill("pretrained:passage", {})

@@ -427,7 +427,7 @@ def connect(
 
 
 def refuse_hardware_options(**given: Any) -> None:
-    """Raise an InputError if an option that needs a hardware station is given, that is neither None nor False."""
+    """Raise an InputError if one of these options, which need a hardware station, is neither None nor False."""
     if any(value is not None and value is not False for value in given.values()):
         *names, last = (f"--{name}" for name in given)
         raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -103,7 +103,7 @@ def evaluate_policies(
         InputError: If `episodes`, `seed` or `processes` is out of range, or a policy raises an exception.
         KilledError: If a process is killed.
     """
-    episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
+    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     policies = {name: act if callable(act) else as_policy(act) for name, act in policies.items()}
@@ -297,7 +297,7 @@ def evaluate(
     """
     save = None if save is None else Path(save)
     _check_saved(save, signal)
-    episodes, seed, processes = _check_episodes(episodes), check_seed(seed), check_processes(processes)
+    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
     given_env, env = env, find_environment(env)
     subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
@@ -308,10 +308,10 @@ def evaluate(
                 "an environment that is given as an object takes no options, resample_offsets or save: give the name "
                 "of a task"
             )
-        eval_environment, scope = {}, "seeds of the environment as it was given"
+        environment, scope = {}, "seeds of the environment as it was given"
     else:
-        eval_environment = subject.changed_environment(environment or {})
-        scope = evaluation_scope(config.task, eval_environment, resample_offsets)
+        environment = subject.changed_environment(environment or {})
+        scope = evaluation_scope(config.task, environment, resample_offsets)
     if resample_offsets and config is not None:
         how["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
@@ -319,24 +319,19 @@ def evaluate(
                 f"episode {config.seed - seed} of these has the offset of the run itself: give another --seed, such as "
                 f"{config.seed + 1}"
             )
-    makers = {"demonstration": zero_policy} if is_demonstrated(eval_environment.get("guidance")) else {}
-    makers |= make_baselines(config, eval_environment, baselines)
+    makers = {"demonstration": zero_policy} if is_demonstrated(environment.get("guidance")) else {}
+    makers |= make_baselines(config, environment, baselines)
     if POLICY in makers:
         raise InputError(f"a baseline policy cannot be called {POLICY!r}, which is the evaluated policy")
-    env_context: AbstractContextManager[gymnasium.Env] = nullcontext(cast(gymnasium.Env, env))
-    if config is not None or env is not given_env:
-        env_context = closing(
-            cast(gymnasium.Env, env) if config is None else make_environment(config.task, eval_environment)
-        )
-    with env_context as evaluation_env:
+    evaluation_env = cast(gymnasium.Env, env) if config is None else make_environment(config.task, environment)
+    with nullcontext() if evaluation_env is given_env else closing(evaluation_env):
         if config is not None:
             if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
                 raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {
-            name: _episodes_file(subject, name, eval_environment, how, functions.get(name))
-            for name in (POLICY, *makers)
+            name: _episodes_file(subject, name, environment, how, functions.get(name)) for name in (POLICY, *makers)
         }
         stored = {
             name: rows
@@ -375,11 +370,11 @@ def evaluate(
     if save is not None:
         result["saved"] = _save_demonstrations(motions, save)
     if describe_differences is not None and config is not None:
-        result["differences"] = list(describe_differences(replace(config, environment=eval_environment)))
+        result["differences"] = list(describe_differences(replace(config, environment=environment)))
     return Evaluation(result, rows_of, is_held_out=config is not None)
 
 
-def _check_episodes(episodes: object) -> int:
+def check_num_episodes(episodes: object) -> int:
     """Return a number of episodes as an int; raise an InputError if it is no whole number, or less than 1."""
     number = as_whole(episodes, "the number of episodes")
     if number < 1:

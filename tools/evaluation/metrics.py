@@ -83,7 +83,7 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the fraction of runs that have not converged, by the Kaplan-Meier estimator.
 
-    A run that never converged is censored at the last episode that ten consecutive successes could still have followed.
+    A run that never converged is censored at the last episode after which ten more episodes followed.
 
     Args:
         converged: Episodes to convergence of each run; None for a run that never converged.
@@ -178,10 +178,7 @@ COLUMNS = (
     Metric("success", "", "1 if the task was done", lambda e: int(bool(e.info["is_success"]))),
     Metric("termination", "", f"reason of the end: {ENDINGS} (collision: {COLLISION})", lambda e: e.termination),
     Metric(
-        "steps",
-        STEPS,
-        "length (number of actions if another package's environment does not count control steps)",
-        lambda e: len(e.trace),
+        "steps", STEPS, "length (in actions if the environment does not count control steps)", lambda e: len(e.trace)
     ),
     Metric("peak_force", "N", "largest contact force of any control step", _statistic("peak_force")),
     Metric("mean_force", "N", "contact force, mean over control steps", _statistic("mean_force")),
@@ -253,11 +250,9 @@ def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
         InputError: If a column other than `WORDS` has text, a column of `COUNTS` has a number that is not whole, or
             `success` has a number other than 0 and 1.
     """
-    text_columns = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
-    fractional_columns = [
-        name for name in COUNTS if name in rows and name not in text_columns and not (rows[name] % 1 == 0).all()
-    ]
-    wrong = [*(text_columns if len(rows) else ()), *fractional_columns]
+    text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
+    fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
+    wrong = [*(text if len(rows) else ()), *fractional]
     if not wrong and "success" in rows and not rows["success"].isin([0, 1]).all():
         wrong = ["success"]
     if wrong:

@@ -340,9 +340,7 @@ def _load_onnx(path: Path) -> PolicyFn:
         raise InputError(f"{path} is no ONNX file that can be read: export it again") from error
     inputs, outputs = session.get_inputs(), session.get_outputs()
     if len(inputs) != 1 or inputs[0].type != "tensor(float)":
-        raise InputError(
-            f"{path} has the inputs {[tensor.name for tensor in inputs]}: a policy has one input, of float32"
-        )
+        raise InputError(f"{path} has the inputs {[given.name for given in inputs]}: a policy has one, of float32")
     name, shape = inputs[0].name, inputs[0].shape
     is_batched = not (shape and isinstance(shape[0], int) and shape[0] > 1) and len(shape) > 1
     observation_shape = tuple(shape[1:] if is_batched else shape)

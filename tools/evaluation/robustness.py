@@ -14,14 +14,13 @@ import pandas as pd
 
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
-from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives.io import find_repeated
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
-from guiderail.tools.evaluation.evaluate import evaluate_once
+from guiderail.tools.evaluation.evaluate import check_num_episodes, evaluate_once
 from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import summary
@@ -145,8 +144,8 @@ class Point:
 def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[list[Point], list[str]]:
     """Return the points of `axes` that an environment supports, and sentences about the points that are left out.
 
-    There is one sentence for each axis and reason. If all points of an axis with a
-    disturbance are left out, its point without one is left out too.
+    There is one sentence for each axis and reason. If all points of an axis with a disturbance are left out, the point
+    without a disturbance is left out too.
 
     Raises:
         InputError: If the environment itself is invalid.
@@ -164,9 +163,8 @@ def points(task: str, environment: Environment, axes: Sequence[Axis]) -> tuple[l
                     raise InputError("only an arm carries a payload")
                 check_environment(task, {**resolved, **changes})
                 changed = {**environment, **changes}
-                options = (
-                    {"new_run": True} if axis.resamples and has_constant_offset(task, {**resolved, **changed}) else {}
-                )
+                needs_new_run = axis.resamples and has_constant_offset(task, {**resolved, **changed})
+                options = {"new_run": True} if needs_new_run else {}
                 axis_points.append(Point(axis, value, changed, trained, options))
             except InputError as error:
                 reasons.setdefault(str(error).partition(": choose one of")[0], []).append(f"{value:g}")
@@ -304,10 +302,7 @@ def robustness(
         InputError: If there is no trained run, runs are of different tasks, two policies have the same name, an
             argument is invalid or missing, or all points are left out.
     """
-    episodes, seed = as_whole(episodes, "the number of episodes"), check_seed(seed)
-    if episodes < 1:
-        raise InputError(f"robustness needs at least one episode at each point, not {episodes}")
-    processes = check_processes(processes)
+    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
     subjects = [find_subject(policy, task, environment, trust_policy=trust_policy) for policy in policies]
     compared = _actors(subjects, dict(environment or {}), log)
     first, folder = compared[0].config, subjects[0].folder if subjects[0].is_stored else None
@@ -357,9 +352,7 @@ def _actors(subjects: Sequence[Subject], environment: Mapping[str, Any], log: Ca
     if len(set(names)) < len(names):
         names = [subject.name for subject in subjects]
     if len(set(names)) < len(names):
-        raise InputError(
-            "two of the compared runs have the same name: give each run once, in a folder with its own name"
-        )
+        raise InputError("two compared runs have the same name: give each run once, in a folder with its own name")
     changed = [subject.changed_environment(environment) for subject in subjects]
     settings: list[dict[str, Any]] = [
         {"seed": config.seed, **options} for config, options in zip(configs, changed, strict=True)

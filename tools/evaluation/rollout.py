@@ -115,8 +115,8 @@ def rollout(
             called too.
         callbacks: Callbacks, called in this order, after the policy.
         index: Number of the episode, for its row.
-        seed: Seed of the reset, a whole number of at least 0. None: the random stream continues, but the seed is 0 with
-            `held_out`.
+        seed: Seed of the reset, a whole number of at least 0. None: the random stream continues, or the seed is 0 if
+            `held_out` is True.
         held_out: True to sample the conditions from the held-out distribution instead of that of training.
         options: Options of the reset.
 

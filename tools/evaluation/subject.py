@@ -37,7 +37,7 @@ def default_baselines(task: str, environment: Mapping[str, Any]) -> list[str]:
 
 
 def refuse_guidance_change(own: Mapping[str, Any], other: Mapping[str, Any]) -> None:
-    """Raise an InputError if the guidance differs from that of the training: it defines the meaning of actions."""
+    """Raise an InputError if the guidance is not that of the training: guidance defines the meaning of actions."""
     trained, used = own.get("guidance"), other.get("guidance")
     if trained != used:
         raise InputError(
@@ -221,10 +221,10 @@ def make_baselines(
         InputError: If a name is unknown, or `baselines` has another type.
     """
     if isinstance(baselines, Mapping):
-        for name, make_policy in baselines.items():
-            if not callable(make_policy):
+        for name, make in baselines.items():
+            if not callable(make):
                 raise InputError(
-                    f"baseline {name} must be a function from an environment to a policy, not {brief(make_policy)}"
+                    f"baseline {name} must be a function from an environment to a policy, not {brief(make)}"
                 )
         return baselines
     if isinstance(baselines, str) or not (baselines is None or isinstance(baselines, Iterable)):

@@ -142,7 +142,7 @@ def test_episodes_of_another_function_are_not_used_again(run):
 
 
 def test_robustness_refuses_other_tasks_and_the_same_folder(run, tmp_path):
-    with pytest.raises(InputError, match="different ones"):
+    with pytest.raises(InputError, match="the same name"):
         robustness([run, run], out=tmp_path)
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)

@@ -20,7 +20,7 @@ from guiderail.tools.experiments.job import Job, check_job
 from guiderail.tools.experiments.study import (
     AT_ONCE,
     NEVER,
-    _success,
+    _pooled_success,
     breaking_point,
     differences_by_method,
     draw_sweeps,
@@ -642,10 +642,12 @@ def sweep_rows(*rates):
 
 
 def test_band_spans_the_intervals_of_all_seeds():
-    assert _success(sweep_rows(0.8), "one", "x") == pytest.approx((0.8, *wilson(40, 50)))
-    assert _success(sweep_rows(1.0, 0.0), "one", "x") == pytest.approx((0.5, wilson(0, 50)[0], wilson(50, 50)[1]))
-    assert _success(sweep_rows(1.0, 1.0), "one", "x") == pytest.approx((1.0, *wilson(50, 50)))
-    assert _success(sweep_rows(1.0), "another", "x") is None
+    assert _pooled_success(sweep_rows(0.8), "one", "x") == pytest.approx((0.8, *wilson(40, 50)))
+    assert _pooled_success(sweep_rows(1.0, 0.0), "one", "x") == pytest.approx(
+        (0.5, wilson(0, 50)[0], wilson(50, 50)[1])
+    )
+    assert _pooled_success(sweep_rows(1.0, 1.0), "one", "x") == pytest.approx((1.0, *wilson(50, 50)))
+    assert _pooled_success(sweep_rows(1.0), "another", "x") is None
 
 
 def test_sweep_of_one_value_is_drawn(tmp_path):

@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_callable
 
 MAX_ATTEMPTS = 3  # number of lost workers after which a job is given up: the job itself may kill its worker
-GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost while they ran it, one after the other"
+GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost running it, one after the other"
 
 
 @dataclass(frozen=True)

@@ -59,9 +59,7 @@ def test_job_that_kills_its_workers_is_given_up():
     result = run(die, {n: n for n in range(4)})
     assert [result[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
     for n in (1, 3):
-        assert (
-            result[n].failure == "3 workers were lost while they ran it, one after the other, the last by exit code 3"
-        )
+        assert result[n].failure == "3 workers were lost running it, one after the other, the last by exit code 3"
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
