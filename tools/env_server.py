@@ -115,7 +115,7 @@ def serve(server: EnvServer, requests: IO[str], answers: IO[str]) -> None:
 
 
 def _check_complete(line: str, requests: IO[str]) -> None:
-    """Raise a ValueError if a line is too long, after reading its rest, so that it gets only one answer."""
+    """Raise a ValueError if a line is too long; first read the rest of it, so that it is answered only once."""
     if len(line) < MAX_LINE or line.endswith("\n"):
         return
     while len(line) == MAX_LINE and not line.endswith("\n"):

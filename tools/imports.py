@@ -71,7 +71,7 @@ def import_modules(modules: Iterable[str], remedy: str = ": restore it, or give 
 def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
     """Import the modules that a file names, unless that would execute new code without trust (`trust_imports`).
 
-    A task folder holds no code. A module or file that this process has imported before needs no trust; such a file is
+    A task folder contains no code. A module or file that this process has imported before needs no trust; a file is
     executed again if its content has changed.
 
     Args:

@@ -261,7 +261,7 @@ Baselines = Annotated[
     str | None,
     option(
         "Baseline policies that are evaluated on the same episodes, comma-separated: scripted, {baselines}; or none. "
-        "The demonstration is always evaluated if the guidance has one; zero is then the same.  "
+        "The demonstration is always evaluated if the guidance has one; zero is then the same policy.  "
         "[default: uniform_random; scripted if the task has one; constant, only in evaluate; zero without a "
         "demonstration]"
     ),

@@ -70,8 +70,8 @@ def evaluate(
         given = environment.keys() - {"station", "robot", "robot_url", "driver"} or task or baselines or save
         if given or resample_offsets or seed != SEED or signal != "commanded" or processes is not None or trust_policy:
             raise InputError(
-                "on hardware one policy is evaluated in the run's own environment: leave --env, --task, --baselines, "
-                "--save, --signal, --processes, --trust-policy, --seed and --resample-offsets out"
+                "on hardware a single policy is evaluated in the run's own environment: leave --env, --task, "
+                "--baselines, --save, --signal, --processes, --trust-policy, --seed and --resample-offsets out"
             )
         from guiderail.tools.hardware.evaluate import evaluate_on_robot
 

@@ -42,8 +42,11 @@ def list_(
     elif name == "metrics":
         from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
-        metrics = [*(("episode: ", one) for one in COLUMNS), *(("episodes: ", one) for one in statistics_of().values())]
-        text = {prefix + one.name: one.description + (f" [{one.unit}]" if one.unit else "") for prefix, one in metrics}
+        metrics = [
+            *(("episode: ", column) for column in COLUMNS),
+            *(("episodes: ", m) for m in statistics_of().values()),
+        ]
+        text = {prefix + m.name: m.description + (f" [{m.unit}]" if m.unit else "") for prefix, m in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
         print_result({name: _usable(name)}, as_json)

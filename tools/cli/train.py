@@ -85,7 +85,7 @@ def train(
     scenario: cli.Scenario = None,
     yes: cli.Yes = False,
     resume: Annotated[
-        bool, option("Resume the run in --out; one with a simulated driver needs --sim again.", "--resume")
+        bool, option("Resume the run in --out; a run with a simulated driver needs --sim again.", "--resume")
     ] = False,
     imports: cli.Imports = None,
     trust_imports: cli.TrustImports = False,

@@ -140,12 +140,12 @@ def evaluate_policies(
         yield name, table.astype(dict.fromkeys(text, object)), data  # as `read_table` returns stored rows
 
 
-def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **how: Any) -> pd.DataFrame:
+def evaluate_policy(env: gymnasium.Env, act: PolicyFn, *, label: str = "", **kwargs: Any) -> pd.DataFrame:
     """Return the rows of held-out episodes of one policy; see `evaluate_policies` for the other arguments.
 
     `label` is the label of the progress bar on standard error; without a label there is no bar.
     """
-    ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **how)
+    ((_, rows, _),) = evaluate_policies(env, {POLICY: act}, labels={POLICY: label}, **kwargs)
     return rows
 
 
@@ -155,7 +155,7 @@ def evaluate_run(
     environment: Mapping[str, Any] | None = None,
     *,
     skips_incompatible: bool = False,
-    **how: Any,
+    **kwargs: Any,
 ) -> pd.DataFrame:
     """Evaluate a policy in a run's environment, or with other environment options; return the episodes' rows.
 
@@ -168,11 +168,11 @@ def evaluate_run(
     """
     with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
-        with naming_failures(f"making the policy {how.get('label', '')}".rstrip()):
+        with naming_failures(f"making the policy {kwargs.get('label', '')}".rstrip()):
             if skips_incompatible and not is_compatible(make_policy, env):
                 return pd.DataFrame()
             policy = make_policy(env)
-        return evaluate_policy(env, policy, **how)
+        return evaluate_policy(env, policy, **kwargs)
 
 
 def evaluate_once(
@@ -183,7 +183,7 @@ def evaluate_once(
     environment: Mapping[str, Any],
     *,
     about: Any = None,
-    **how: Any,
+    **kwargs: Any,
 ) -> pd.DataFrame | None:
     """Return the stored rows of held-out episodes; if there are none, evaluate the policy and store its rows.
 
@@ -197,13 +197,13 @@ def evaluate_once(
         InputError: If the stored file is damaged or cannot be written, or an argument is invalid.
     """
     compute = partial(
-        evaluate_run, config, make_policy, environment, **{"label": name, "skips_incompatible": True, **how}
+        evaluate_run, config, make_policy, environment, **{"label": name, "skips_incompatible": True, **kwargs}
     )
     if folder is None:
         rows = compute()
     else:
-        file = episodes_file(folder, name, config, environment, about=about, **how)
-        rows = load_or_compute(file, compute, how.get("episodes"))
+        file = episodes_file(folder, name, config, environment, about=about, **kwargs)
+        rows = load_or_compute(file, compute, kwargs.get("episodes"))
     return rows if len(rows) else None
 
 
@@ -265,12 +265,12 @@ def evaluate(
             success are None. The environment needs a limit of steps, such as `gymnasium.wrappers.TimeLimit`.
         episodes: Number of held-out episodes.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
-            None is the default set of the task. The demonstration alone is always evaluated if the guidance of a task
-            has one; in an environment that is given as an object, it is the baseline policy "zero".
+            None is the default set of the task. If the guidance of a task has a demonstration, the demonstration alone
+            is always evaluated; in an environment that is given as an object, it is the baseline policy "zero".
         environment: Options of the environment that differ from the run's options or the task's defaults.
         seed: Seed of the first episode; episode i has seed + i, on which the actions of random baselines depend too.
         processes: Largest number of processes; None for the number of cores. The results do not depend on it: a policy
-            with internal state resets it in `Callback.on_episode_start`, and one that samples random numbers seeds its
+            with internal state resets it in `Callback.on_episode_start`. A policy that samples random numbers seeds its
             generator in a method `start_episode(number)`, whose number depends on the episode's seed.
         trust_policy: True to read a policy file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: True to sample the hidden values, which are constant in a run, again in every episode.
@@ -301,7 +301,7 @@ def evaluate(
     given_env, env = env, find_environment(env)
     subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
     config, folder = subject.config, subject.folder
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed}
+    kwargs: dict[str, Any] = {"episodes": episodes, "seed": seed}
     if config is None:
         if environment or resample_offsets or save is not None:
             raise InputError(
@@ -313,7 +313,7 @@ def evaluate(
         environment = subject.changed_environment(environment or {})
         scope = evaluation_scope(config.task, environment, resample_offsets)
     if resample_offsets and config is not None:
-        how["options"] = {"new_run": True}
+        kwargs["options"] = {"new_run": True}
         if seed <= config.seed < seed + episodes:  # the offset of a run is sampled with its seed
             raise InputError(
                 f"episode {config.seed - seed} of these has the offset of the run itself: give another --seed, such as "
@@ -331,7 +331,7 @@ def evaluate(
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {
-            name: _episodes_file(subject, name, environment, how, functions.get(name)) for name in (POLICY, *makers)
+            name: _episodes_file(subject, name, environment, kwargs, functions.get(name)) for name in (POLICY, *makers)
         }
         stored = {
             name: rows
@@ -354,7 +354,7 @@ def evaluate(
         evaluated, motions = dict(stored), []
         collect = None if save is None else partial(_successful_motion, signal)
         for name, rows, data in evaluate_policies(
-            evaluation_env, policies, labels=labels, processes=processes, collect=collect, **how
+            evaluation_env, policies, labels=labels, processes=processes, collect=collect, **kwargs
         ):
             evaluated[name] = rows
             if name == POLICY:
@@ -396,7 +396,7 @@ def _episodes_file(
     subject: Subject,
     name: str,
     environment: Mapping[str, Any],
-    how: Mapping[str, Any],
+    kwargs: Mapping[str, Any],
     function: MakePolicy | None,
 ) -> Path | None:
     """Return the file in the run's folder that stores a policy's episodes; None if they are not stored.
@@ -412,10 +412,10 @@ def _episodes_file(
         about = None if function is None else digest_of(function)
         if function is not None and about is None:
             return None
-        return episodes_file(folder.path / BASELINES_FOLDER, name, config, environment, about=about, **how)
-    if environment != config.environment or "options" in how:
+        return episodes_file(folder.path / BASELINES_FOLDER, name, config, environment, about=about, **kwargs)
+    if environment != config.environment or "options" in kwargs:
         return None
-    return episodes_file(folder.path / POLICY_FOLDER, POLICY, config, environment, about=subject.digest, **how)
+    return episodes_file(folder.path / POLICY_FOLDER, POLICY, config, environment, about=subject.digest, **kwargs)
 
 
 def _statistics(rows: Mapping[str, pd.DataFrame], counts: bool) -> dict[str, Any]:

@@ -56,12 +56,12 @@ def read_complete(file: Path, episodes: int | None = None) -> pd.DataFrame | Non
 
 
 def episodes_file(
-    folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **how: Any
+    folder: Path, name: str, config: RunConfig, environment: Mapping[str, Any], *, about: Any = None, **kwargs: Any
 ) -> Path:
     """Return the path of the file for a policy's evaluated episodes; its name is `name` and a digest.
 
     The digest covers the task with its files, the options of the environment, the run's seed, package versions, and the
-    arguments `how` of `evaluate_policy` except `label` and `processes`. `about` is anything else that the episodes
+    arguments `kwargs` of `evaluate_policy` except `label` and `processes`. `about` is anything else that the episodes
     depend on, such as the digest of the policy.
 
     Raises:
@@ -71,9 +71,9 @@ def episodes_file(
         raise InputError(
             f"the name of a policy is a printable text of 1 to {MAX_NAME_BYTES} bytes without '/', not {brief(name)}"
         )
-    how = {key: value for key, value in how.items() if key not in ("label", "processes")}
+    kwargs = {key: value for key, value in kwargs.items() if key not in ("label", "processes")}
     content = task_content(config.task, environment, config.imports)
-    parts = [config.task, environment, how, config.seed, installed_versions(), about, content]
+    parts = [config.task, environment, kwargs, config.seed, installed_versions(), about, content]
     key = json.dumps(parts, sort_keys=True, default=str)
     return folder / f"{name}-{hashlib.blake2b(key.encode(), digest_size=6).hexdigest()}.csv"
 
@@ -100,11 +100,12 @@ def stored_episodes(folder: RunFolder, config: RunConfig, seed: int) -> Iterator
         path for part in (POLICY_FOLDER, BASELINES_FOLDER) for path in (folder.path / part).glob("*.csv")
     ):
         name, rows = file.stem.rpartition("-")[0], read_table(file)
-        how = {"episodes": len(rows), "seed": seed}
+        kwargs = {"episodes": len(rows), "seed": seed}
         # `about` of a baseline policy is None if it was given by name, and its name if it was given as a function.
         abouts = (digest,) if file.parent.name == POLICY_FOLDER else (None, name)
         if _can_name_file(name) and any(
-            file == episodes_file(file.parent, name, config, config.environment, about=about, **how) for about in abouts
+            file == episodes_file(file.parent, name, config, config.environment, about=about, **kwargs)
+            for about in abouts
         ):
             yield name, rows
 
@@ -167,7 +168,7 @@ class Evaluation(Mapping[str, Any]):
 
     @property
     def comparison(self) -> Comparison | None:
-        """Comparison with the best baseline policy; None without one, or if the environment reports no success."""
+        """Comparison with the best baseline policy; None without a baseline policy or reports of success."""
         return compare(self.rows)
 
     @property

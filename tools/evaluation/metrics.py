@@ -1,7 +1,7 @@
 """Metrics: the columns of an episode's row, and the statistics of many episodes.
 
-An episode's numbers are computed from its `EpisodeTrace`, which holds every control step and not only the last one of
-each action. `guiderail list metrics` prints the definitions.
+An episode's numbers are computed from its `EpisodeTrace`, which contains all control steps of each action.
+`guiderail list metrics` prints the definitions.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
 def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Estimate the fraction of runs that have not converged, by the Kaplan-Meier estimator.
 
-    A run that never converged is censored at the last episode after which ten more episodes followed.
+    A run that never converged is censored ten episodes before its end: ten successes that begin later would not fit.
 
     Args:
         converged: Episodes to convergence of each run; None for a run that never converged.
@@ -195,7 +195,7 @@ COLUMNS = (
     Metric(
         "fallback_steps",
         STEPS,
-        "control steps at which guidance replaced the requested pose by a safe one",
+        "control steps at which guidance replaced the requested pose by a safe pose",
         _count("fallback_steps"),
     ),
 )
@@ -290,8 +290,8 @@ def _total(column: str) -> Callable[[pd.DataFrame], int]:
     return lambda rows: int(rows[column].sum())
 
 
-def _ended(how: str) -> Callable[[pd.DataFrame], int]:
-    return lambda rows: int((rows["termination"] == how).sum())
+def _ended(reason: str) -> Callable[[pd.DataFrame], int]:
+    return lambda rows: int((rows["termination"] == reason).sum())
 
 
 def _violating(column: str) -> Callable[[pd.DataFrame], int]:

@@ -279,7 +279,7 @@ def robustness(
 
     Args:
         policies: Runs of one task; with `task`, any policies that `find_subject` takes. Baseline policies act in the
-            environment of the first one.
+            environment of the first policy.
         task: Task of policies without a run.
         episodes: Number of held-out episodes of each policy at each point, with the same seeds.
         seed: Seed of the first episode.
@@ -390,7 +390,7 @@ def _baseline_actors(
         elif name not in by_name:
             actors.append(_Actor(name, make_policy, config))
     if repeated := find_repeated([actor.name for actor in (*compared, *actors)]):
-        raise InputError(f"two policies are called {brief(repeated)}: rename one, or leave that baseline out")
+        raise InputError(f"two policies are called {brief(repeated)}: rename a policy, or leave the baseline out")
     return actors
 
 

@@ -91,7 +91,7 @@ def check_seed(seed: object) -> int:
 
 
 def has_image(space: Any) -> bool:
-    """Return True if the observations of a space are images or contain one."""
+    """Return True if the observations of a space are images, or contain an image."""
     return len(space.shape or ()) == 3 or hasattr(space, "image_shape")
 
 

@@ -34,7 +34,7 @@ MEANINGS = {
     "saturation": ("", "1 while the controller is at a limit; in the plane, the largest excess of a joint's force [N]"),
     "collision": ("", "True in a collision"),
     "command_timed_out": ("", "True while the last safe pose is held because commands stopped or are not finite"),
-    "fallback": ("", "True if guidance commanded a safe pose instead of the requested one"),
+    "fallback": ("", "True if guidance commanded a safe pose instead of the requested pose"),
     "state": ("", "number of the template's state, if there is a template"),
     "reward": ("reward", "reward of the control step"),
 }
@@ -130,7 +130,7 @@ def read_step_log(folder: Path) -> pd.DataFrame:
     """
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
-        raise InputError(f"{folder} has no step log: the run was trained without one")
+        raise InputError(f"{folder} has no step log: the run was trained without a step log")
     check_parquet(files)
     tables = []
     for file in files:

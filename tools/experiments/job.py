@@ -117,13 +117,13 @@ class Job:
 
     @cached_property
     def source(self) -> RunFolder | None:
-        """Run from which training starts (`init_from`); None without one."""
+        """Run from which training starts (`init_from`); None without such a run."""
         path = getattr(self.config(1).learner, "init_from", "") if self.learns else ""
         return RunFolder(path) if path else None
 
     @cached_property
     def source_job(self) -> Job | None:
-        """Job that trains the source run; its method may be one that a subset of the study leaves out."""
+        """Job that trains the source run; a subset of the study may leave its method out."""
         if self.source is None:
             return None
         whole = self.study.model_copy(update={"methods": self.study.all_methods})
@@ -203,7 +203,7 @@ def check_source(job: Job, *, is_selected: bool = False) -> str:
         raise InputError(f"{name}, which {missing}: train that run first, with the same --out")
     if stored and not stored.startswith(state):
         raise InputError(
-            f"{name}, which is not the one that it was trained from ({stored}): name another folder with --out"
+            f"{name}, which differs from the run that it was trained from ({stored}): name another folder with --out"
         )
     return state
 
@@ -252,7 +252,7 @@ def _needs_training(job: Job, episodes: int) -> bool:
 
 
 def _num_episodes(folder: RunFolder) -> int:
-    """Return the number of training episodes in a run's table; 0 without one."""
+    """Return the number of training episodes in a run's table; 0 without a table."""
     return len(folder.episodes()) if (folder.path / "episodes.csv").exists() else 0
 
 
@@ -370,9 +370,9 @@ def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
         rng, number = np.random.default_rng([eval_set.first_seed, done]), min(every, eval_set.episodes - done)
         sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in eval_set.sampled.items()}
         seed = eval_set.first_seed + done
-        how: dict[str, Any] = {"episodes": number, "seed": seed, "options": eval_set.options}
+        kwargs: dict[str, Any] = {"episodes": number, "seed": seed, "options": eval_set.options}
         # `first_number=0`: random actions depend on the run's seed alone, as in the published tables.
-        rows = evaluate_run(config, policy, environment | sampled, **how, first_number=0)
+        rows = evaluate_run(config, policy, environment | sampled, **kwargs, first_number=0)
         tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
     return pd.concat(tables, ignore_index=True)
 

@@ -82,7 +82,7 @@ def run_study(study: Study, out: Path, engine: Engine | None = None) -> pd.DataF
     outcomes = _run_jobs(jobs, _order_jobs(jobs), engine or make_engine())
     pairs = [(job, outcomes[index]) for index, job in enumerate(jobs)]
     rows = pd.DataFrame([row for _, outcome in pairs for row in outcome.rows], dtype=object)
-    failed = [f"{job.method}, seed {job.seed}, failed: {one.failure}" for job, one in pairs if one.failure]
+    failed = [f"{job.method}, seed {job.seed}, failed: {end.failure}" for job, end in pairs if end.failure]
     if failed:
         raise RunsFailedError(failed, rows)
     return rows
@@ -135,8 +135,8 @@ def study_command(
         if episodes:
             converged = each(group, "training_episodes_to_convergence")
             result[f"{method}{after}, episodes to convergence, each seed"] = converged
-    for one in study.ratios:
-        result |= ratio(rows, one)
+    for wanted in study.ratios:
+        result |= ratio(rows, wanted)
     if describe_differences is not None:
         result["differences"] = differences_by_method(study, describe_differences)
     return result
@@ -152,13 +152,13 @@ def differences_by_method(study: Study, describe_differences: DescribeDifference
     common = [sentence for sentence in first if all(sentence in other for other in others)]
     groups: dict[tuple[str, ...], list[str]] = {}
     for method, sentences in differences.items():
-        groups.setdefault(tuple(one for one in sentences if one not in common), []).append(method)
+        groups.setdefault(tuple(sentence for sentence in sentences if sentence not in common), []).append(method)
     shared = {ALL_METHODS: common} if common else {}
     return shared | {", ".join(methods): list(sentences) for sentences, methods in groups.items() if sentences}
 
 
 def each(rows: pd.DataFrame, column: str, form: str = "{}") -> str:
-    """Return the values of a column, one per seed; "never" for a missing one."""
+    """Return the values of a column, one per seed, as text; "never" for a missing value."""
     return ", ".join("never" if pd.isna(value) else form.format(value) for value in rows[column])
 
 
@@ -172,7 +172,7 @@ def ratio(rows: pd.DataFrame, wanted: Ratio) -> dict[str, str]:
     of, against = (rows[rows["method"] == method] for method in (wanted.method, wanted.against))
     if not len(of) or of["seed"].tolist() != against["seed"].tolist():
         return {}
-    numerator, denominator = (one[wanted.of].to_numpy(float) for one in (of, against))
+    numerator, denominator = (table[wanted.of].to_numpy(float) for table in (of, against))
     label = f"{wanted.of.replace('_', ' ')} of {wanted.method} as a fraction of {wanted.against}'s"
     texts, place = {}, of.groupby("seed").cumcount().to_numpy()
     for k in range(place.max() + 1):
@@ -194,9 +194,9 @@ def _check_columns(study: Study) -> None:
         if name not in statistics:
             raise InputError(f"there is no statistic {name!r}: {did_you_mean(name, statistics)}")
     known = {*EVALUATED, *(f"training_{name}" for name in (*TRAINING, *study.statistics))}
-    for one in study.ratios:
-        if one.of not in known:
-            raise InputError(f"the study {study.name} has no column {one.of!r}: {did_you_mean(one.of, known)}")
+    for of in (wanted.of for wanted in study.ratios):
+        if of not in known:
+            raise InputError(f"the study {study.name} has no column {of!r}: {did_you_mean(of, known)}")
 
 
 def _order_jobs(jobs: list[Job]) -> list[list[int]]:

@@ -148,7 +148,7 @@ def test_robustness_refuses_other_tasks_and_the_same_folder(run, tmp_path):
     shutil.copytree(run, copy)
     config = (copy / "config.yaml").read_text()
     (copy / "config.yaml").write_text(config.replace("task: Bead", "task: NarrowPassage"))
-    with pytest.raises(InputError, match="of one task, not of Bead and NarrowPassage"):
+    with pytest.raises(InputError, match="have one task, not Bead and NarrowPassage"):
         robustness([run, copy], out=tmp_path)
 
 

@@ -169,7 +169,7 @@ def test_study_with_a_source_can_be_moved_and_resumed(tmp_path):
 @pytest.mark.parametrize(
     ("trained", "wanted", "methods", "words"),
     [
-        (4, continued(6), None, r"is not the one that it was trained from \(coarse-5, 4 episodes, policy"),
+        (4, continued(6), None, r"differs from the run that it was trained from \(coarse-5, 4 episodes, policy"),
         (None, continued(), ["fine"], "coarse-5, which has 0 of its 4 episodes: train that run first"),
         (None, continued(source="corase-{seed}"), None, "corase-5, which is missing or not finished"),
         (None, continued(source="fine-{seed}"), None, "fine, seed 5, would start from its own run"),

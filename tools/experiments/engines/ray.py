@@ -55,7 +55,7 @@ class RayEngine(Engine):
 
     def run(self, work: Work, jobs: Mapping[int, Any]) -> Iterator[tuple[int, Outcome]]:
         """Yield keys and outcomes of the jobs as they finish."""
-        # Ray itself gives the job of a lost worker to another one.
+        # Ray itself assigns the job of a lost worker to another worker.
         remote = self._ray.remote(num_cpus=1, max_retries=MAX_ATTEMPTS - 1)(work_on)
         shared = self._ray.put(work)
         waiting = {remote.remote(shared, job): key for key, job in jobs.items()}
