@@ -128,7 +128,7 @@ def test_baseline_among_the_policies_is_evaluated_once(run, tmp_path, monkeypatc
     rows = robustness(["random_corner", "constant"], baselines=["uniform_random", "constant", "zero"], **how)["rows"]
     assert [row["policy"] for row in rows] == ["random_corner", "constant", "uniform_random", "zero"] * 2
     for names, baseline in ((["zero", "constant"], "constant"), ([run], "policy")):
-        with pytest.raises(InputError, match=f"two policies are called '{baseline}': rename one"):
+        with pytest.raises(InputError, match=f"two policies are called '{baseline}': rename a policy"):
             robustness(names, baselines={baseline: zero_policy}, **how)
 
 
