@@ -12,7 +12,6 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
 from pydrake.systems.primitives import ZeroOrderHold
 
-from guiderail.diagrams.envs.answers import ask, check_takes_arguments, refuse_half_turns, threshold_of
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import (
     CLOCKS,
@@ -24,6 +23,7 @@ from guiderail.diagrams.envs.observation import (
 )
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
 from guiderail.diagrams.envs.scene import Camera, add_meshcat, add_observation_camera, add_picture, scene_of
+from guiderail.diagrams.envs.task_checks import call_checked, check_takes_arguments, refuse_half_turns, threshold_of
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
@@ -39,8 +39,8 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.reference import pass_through
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.episode_monitor import EpisodeMonitor
-from guiderail.systems.reward_system import RewardSystem
+from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
+from guiderail.systems.reward_system import RewardSystem, RewardTerm
 
 
 def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
@@ -52,12 +52,12 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     """
     provides = task.provides()
     primitive = None
-    constraints = ask(task, "constraints") or LinearConstraints.none(station.pose_size)
+    constraints = call_checked(task, "constraints") or LinearConstraints.none(station.pose_size)
     if "demonstrations" in provides:
         options = task.config.part("primitive")
         kernel = kernel_from_options(options)
-        reference = pass_through(ask(task, "reference"), options.get("via_points", ()), kernel)
-        options = {name: value for name, value in options.items() if name not in _NOT_PRIMITIVE}
+        reference = pass_through(call_checked(task, "reference"), options.get("via_points", ()), kernel)
+        options = {name: value for name, value in options.items() if name not in _CONVERTED_OPTIONS}
         _check_clock(reference.times, station.nominal_period)
         if station.wraps_angles:
             refuse_half_turns(reference.means)
@@ -69,15 +69,15 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
             progress=_state_progress(task, station.control_period),
             control_period=station.control_period,
             isotropic_groups=task.isotropic_groups,
-            keep_out=ask(task, "keep_out") if "keep_out" in provides else None,
+            keep_out=call_checked(task, "keep_out") if "keep_out" in provides else None,
             wrench_size=station.wrench_size,
             **options,
         )
     return PriorKnowledge(
         period=station.control_period,
         demonstrations=primitive,
-        template=ask(task, "template") if "template" in provides else None,
-        approach=ask(task, "approach") if "approach" in provides else None,
+        template=call_checked(task, "template") if "template" in provides else None,
+        approach=call_checked(task, "approach") if "approach" in provides else None,
         options=task.config.part("guidance"),
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
@@ -87,7 +87,8 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
 _LIMITS = ("max_speed", "max_acceleration")
 _PROGRESS = ("progress", "progress_tolerance", "max_lag")
 _JOINTS = ("joint_margin", "min_singular_value")
-_NOT_PRIMITIVE = (*KERNEL_OPTIONS, "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
+# Options that are not attributes of `PrimitiveConfig` but determine one of them.
+_CONVERTED_OPTIONS = (*KERNEL_OPTIONS, "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
 
 
 def _state_progress(task: Task, period: float) -> StateProgress | None:
@@ -105,13 +106,13 @@ def _num_steps(task: Task, period: float) -> int:
 
 
 def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
-    """Return a task's motion constraints with the limits from its options, or None if it has neither.
+    """Return a task's motion constraints, extended by the limits in its options; None if there are neither.
 
     Raises:
         InputError: If the station has no joints for `joint_margin`, `min_singular_value` is given without
             `joint_margin`, or the number of limits does not fit the outputs.
     """
-    motion, options = ask(task, "motion_constraints"), task.config.part("primitive")
+    motion, options = call_checked(task, "motion_constraints"), task.config.part("primitive")
     limits: dict[str, Any] = {}
     if options.get("joint_margin") is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
@@ -130,7 +131,7 @@ def _check_clock(times: np.ndarray, period: float) -> None:
     if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
         raise InputError(
             f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
-            f"{period:g} s: resample it, or the motion has another speed than was demonstrated"
+            f"{period:g} s: resample it, because the motion would not have the demonstrated speed"
         )
 
 
@@ -146,14 +147,14 @@ class Signals:
         self._ports |= ports
 
     def get(self, name: str, user: str, size: int | None = None) -> OutputPort:
-        """Return the port of a signal. The error message names the `user`, the part of the task that needs it.
+        """Return the port of a signal; error messages name the `user`, the part of the task that needs the signal.
 
         Raises:
             InputError: If there is no signal of this name, or it has another `size`.
         """
-        held = name.removeprefix("last_")
-        if name not in self._ports and held != name and held in self._ports:
-            port = self._ports[held]
+        current = name.removeprefix("last_")
+        if name not in self._ports and current != name and current in self._ports:
+            port = self._ports[current]
             hold = add_system(self._builder, name, ZeroOrderHold(self._period, port.size()), port)
             self._ports[name] = hold.get_output_port()
         if name not in self._ports:
@@ -166,18 +167,18 @@ class Signals:
             raise InputError(f"{user} takes {numbers} as the signal {name!r}, which has {port.size()}")
         return port
 
-    def connect(self, system: Any, names: Mapping[str, int], user: str) -> None:
-        """Connect the signal of each name to the system's input `get_signal_input_port(name)` of the given size.
+    def connect(self, system: Any, terms: Sequence[RewardTerm | TerminationTerm], user: str) -> None:
+        """Connect each signal that a term names to the system's input `get_signal_input_port(name)`.
 
         Raises:
-            InputError: If a signal is missing or has another size.
+            InputError: If a signal is missing or does not have the size that the term declares.
         """
-        for name, size in names.items():
+        for name, size in {name: size for term in terms for name, size in term.inputs.items()}.items():
             self._builder.Connect(self.get(name, user, size), system.get_signal_input_port(name))
 
 
 class Loop:
-    """Station, guidance and observation, connected as a control loop without its policy.
+    """Control loop without the policy: station, guidance and observation, connected.
 
     Args:
         task: Task.
@@ -208,7 +209,7 @@ class Loop:
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
         if not station.HasOutputPort("exact_wrench"):
             self.signals.add({"exact_wrench": station.get_wrench_output_port()})
-        signals = ask(task, "signals", builder, station)
+        signals = call_checked(task, "signals", builder, station)
         self.signals.add(signals)
         self._connect_max_wrench(task, signals.get("max_wrench"))
         self.space, self.observation = self._add_observation(task)
@@ -219,8 +220,10 @@ class Loop:
         """Connect the station's `max_wrench` to the task's `bound`, lowered to the limits of the template's state."""
         limit = None
         if self.guidance.HasOutputPort("state") and "template" in task.provides():
-            impedance = ask(task, "impedance") if self.station.HasInputPort("max_wrench") else None
-            limit = make_phase_wrench_limit(ask(task, "template").template, impedance, self.station.control_period)
+            impedance = call_checked(task, "impedance") if self.station.HasInputPort("max_wrench") else None
+            limit = make_phase_wrench_limit(
+                call_checked(task, "template").template, impedance, self.station.control_period
+            )
         if limit is not None:
             add_system(self.builder, "phase_wrench_limit", limit, state=self.guidance.GetOutputPort("state"))
             if bound is not None:
@@ -249,7 +252,7 @@ class Loop:
         self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
     def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        observed = ask(task, "observation_terms")
+        observed = call_checked(task, "observation_terms")
         camera = observed if isinstance(observed, Camera) else task.observation_camera()
         if camera is None:
             return self.add_terms(task, observed, "observation")
@@ -259,9 +262,9 @@ class Loop:
         from guiderail.systems.image_observation import ImageObservation  # most environments have no image
 
         space, state = self.add_terms(task, observed, "state_observation")
-        both = ImageObservation(width, height, state.size())
-        add_system(self.builder, "observation", both, image=image, state=state)
-        return ImageAndStateSpace((height, width, 3), space), both.get_observation_output_port()
+        combined = ImageObservation(width, height, state.size())
+        add_system(self.builder, "observation", combined, image=image, state=state)
+        return ImageAndStateSpace((height, width, 3), space), combined.get_observation_output_port()
 
     def add_terms(
         self, task: Task, terms: Sequence[ObservationTerm], name: str
@@ -303,27 +306,24 @@ def build_task_diagram(
     builder.ExportInput(guidance.GetInputPort("action"), "action")
 
     violations = _add_violations(builder, task, station, guidance)
-    conditions = ask(task, "termination_terms")
-    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(conditions, period, task.name))
-    watched = {name: size for condition in conditions for name, size in condition.inputs.items()}
-    signals.connect(monitor, watched, f"the termination of {task.name}")
+    termination_terms = call_checked(task, "termination_terms")
+    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(termination_terms, period, task.name))
+    signals.connect(monitor, termination_terms, f"the termination of {task.name}")
     signals.add({"termination": monitor.get_termination_output_port()})
 
-    terms = ask(task, "reward_terms", guidance.GetInputPort("action").size())
-    reward = builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
-    rewarded = {name: size for term in terms for name, size in term.inputs.items()}
-    signals.connect(reward, rewarded, f"reward {task.config.reward!r} of {task.name}")
+    reward_terms = call_checked(task, "reward_terms", guidance.GetInputPort("action").size())
+    reward = builder.AddNamedSystem("reward", RewardSystem(reward_terms, task.name))
+    signals.connect(reward, reward_terms, f"reward {task.config.reward!r} of {task.name}")
 
     threshold = threshold_of(task)
-    watched_force = signals.get(threshold.signal, f"the collision threshold of {task.name}", 1)
-    collision = add_system(builder, "collision", affine(np.eye(1), [-threshold.above]), watched_force)
-    force = station.get_contact_force_output_port()
+    collision_signal = signals.get(threshold.signal, f"the collision threshold of {task.name}", 1)
+    collision = add_system(builder, "collision", affine(np.eye(1), [-threshold.above]), collision_signal)
     exported = {
         **violations,
         "observation": loop.observation,
         "reward": reward.get_reward_output_port(),
         "termination": monitor.get_termination_output_port(),
-        "contact_force": force,
+        "contact_force": station.get_contact_force_output_port(),
         "desired_pose": guidance.GetOutputPort("desired_pose"),
         "pose": station.get_pose_output_port(),
         "wrench": station.get_wrench_output_port(),
@@ -332,17 +332,17 @@ def build_task_diagram(
         "command_timed_out": station.get_command_timed_out_output_port(),
         "fallback": guidance.GetOutputPort("fallback"),
     }
-    taken = {*exported, *INFO_KEYS, *RECORDED_SIGNALS, "privileged", "rgb_image"}
+    reserved = {*exported, *INFO_KEYS, *RECORDED_SIGNALS, "privileged", "rgb_image"}
     for name in reward.term_names:
-        if name in taken:
+        if name in reserved:
             raise InputError(
                 f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
-    privileged = ask(task, "privileged_terms")
+    privileged = call_checked(task, "privileged_terms")
     if privileged and station.HasOutputPort("body_poses"):
         exported["privileged"] = loop.add_terms(task, privileged, "privileged")[1]
-    # Outputs that only this guidance has, such as the state of a template, are exported too.
+    # Outputs that only this kind of guidance has, such as the state of a template, are exported as well.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
@@ -399,8 +399,8 @@ def build_skill_diagram(
         render_mode: None, "human" (browser view) or "rgb_array" (exports the image of the task's camera).
 
     Raises:
-        InputError: As `build_task_diagram`, or if the policy is neither a function nor a system with these ports, or
-            the sizes of the ports do not match.
+        InputError: As `Loop`, or if there is no scene for "human" or no camera for "rgb_array", the policy is neither a
+            function nor a system with these ports, or the sizes of the ports do not match.
     """
     loop = Loop(task, station, guidance)
     builder, action = loop.builder, guidance.GetInputPort("action")
@@ -438,8 +438,11 @@ def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
 
 
 def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
-    """Return the ports of the constraint violations by name; without task constraints, guidance's ports are used."""
-    constraints = ask(task, "constraints")
+    """Add the checks of the task's constraints, and return the ports of the violations by name.
+
+    Without task constraints, ports of the guidance are returned instead, if it has them.
+    """
+    constraints = call_checked(task, "constraints")
     poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
     poses["measured_violation"] = station.get_pose_output_port()
     violations = {}
@@ -450,7 +453,7 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
             violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
     for name, port in poses.items():
         if name not in violations:
-            checked = ask(task, "motion_constraints") or constraints
+            checked = call_checked(task, "motion_constraints") or constraints
             violation = add_system(builder, name, ConstraintViolation(checked, station.control_period), pose=port)
             violations[name] = violation.get_violation_output_port()
     return violations
@@ -459,22 +462,24 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
 def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
     """Return the function `TaskDiagram.randomize`.
 
-    The function raises an InputError if a reset option is invalid, or if the task's `reset` does not return values by
-    name or returns a value with a reserved name. This function raises one if `reset` has other parameters.
+    The returned function raises an `InputError` if a reset option is invalid, or if the task's `reset` does not return
+    values by name or returns a value with a reserved name.
+
+    Raises:
+        InputError: If the task's `reset` has other parameters than `Task.reset`.
     """
     check_takes_arguments(task, "reset")
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-        sampled = task.reset(
-            station, guidance, context, rng, validate_options(task.Reset, options, f"a reset of {task.name}")
-        )
+        reset_options = validate_options(task.Reset, options, f"a reset of {task.name}")
+        sampled = task.reset(station, guidance, context, rng, reset_options)
         if not isinstance(sampled, Mapping):
             raise InputError(
                 f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(sampled)}"
             )
-        if taken := [name for name in sampled if name in INFO_KEYS]:
+        if reserved := [name for name in sampled if name in INFO_KEYS]:
             raise InputError(
-                f"reset of {task.name} returns a value named {taken[0]!r}, which is reserved: give it another name"
+                f"reset of {task.name} returns a value named {reserved[0]!r}, which is reserved: give it another name"
             )
         return {**sampled, **station.disturb(context, rng)}
 
@@ -482,7 +487,7 @@ def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
 
 
 def _push(station: Station) -> Any:
-    """Return a function that displaces the robot; it takes the root context and the displacement (O,)."""
+    """Return the function `TaskDiagram.push`."""
 
     def push(context: Context, displacement: np.ndarray) -> None:
         pose = station.get_pose_output_port().Eval(station.GetMyContextFromRoot(context))

@@ -33,7 +33,7 @@ from guiderail.models.common.registry import did_you_mean
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Configuration of an environment, every option validated and every default filled in."""
+    """Validated configuration of an environment, without missing options."""
 
     task: str  # name of the task
     guidance: str  # name of the guidance
@@ -166,7 +166,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
         raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
     merged = {
-        # The first of the package: a registration by another package must not change an environment.
+        # The default is a station of this package, so that another package's registration changes no environment.
         "station": min(stations, key=lambda station: not STATIONS.is_packaged(station)),
         "reward": task.rewards[0],
         "observation": task.observations[0],
@@ -203,11 +203,11 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
     for context, settings in {"defaults": task.defaults, **task.difficulties}.items():
         for option in set(settings) - known:
             anywhere = {
-                each
+                name
                 for guidance in possible_guidance(task.provides())
                 for station in task.stations()
                 for model in option_models(task, guidance, station).values()
-                for each in model.model_fields
+                for name in model.model_fields
             }
             if option not in anywhere:
                 raise InputError(
@@ -217,9 +217,10 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
 
 
 def _check_given_options(task: type[Task], stations: list[str], options: Mapping[str, Any], known: set[str]) -> None:
+    """Refuse given options that are not `known`; the error message names another station that has the option."""
     unknown = sorted(set(options) - known, key=str)
     if not unknown:
         return
     elsewhere = [name for name in stations if unknown[0] in (STATIONS.get(name).options or Options).model_fields]
-    remedy = f"it is one of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
+    remedy = f"it is an option of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
     raise InputError(f"{task.name} has no option {brief(unknown[0])} here: {remedy}")

@@ -48,8 +48,8 @@ INFO_KEYS = (
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 
-# Error messages of Drake, or of a system with another engine, that report failed physics and not wrong wiring. Drake's
-# own assertions arrive in Python as SystemExit.
+# Error messages of Drake, or of a system with another physics engine, that report failed physics and not wrong wiring.
+# A failed assertion of Drake is a SystemExit in Python.
 _SIMULATION_FAILURE = re.compile(
     r"failed to converge|\bnan\b|not finite|diverg|simulation failed|AllFinite|isfinite", re.IGNORECASE
 )
@@ -76,10 +76,11 @@ class DiagramEnv(DrakeGymEnv):
 
     An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
 
-    The simulation fails if Drake reports a solver that does not converge or NaN, while it advances the diagram or
+    The simulation fails if Drake reports NaN or a solver that does not converge while it advances the diagram or
     evaluates a port, or if a pose or a joint speed is implausible. The failed control step is dropped, the episode is
-    truncated with the last valid observation, and `info["simulation_failure"]` is the message. After a failed reset the
-    first step truncates the episode. A failure before the first valid observation and every other error propagate.
+    truncated with the last valid observation, and `info["simulation_failure"]` is the message. After a failed reset,
+    the first step truncates the episode. A failure before the first valid observation is raised, and so is every other
+    error.
 
     Attributes:
         task: The `TaskDiagram`.
@@ -119,11 +120,7 @@ class DiagramEnv(DrakeGymEnv):
         view = None if render_mode != "human" or task.query is None else View(task.query)
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
-        # The parent class writes into `metadata`, so each environment needs its own copy.
-        self.metadata = {
-            "render_modes": ["human", "rgb_array"],
-            "render_fps": max(round(1 / (action_repeat * task.control_period)), 1),  # a video needs at least 1
-        }
+        self.metadata = {}  # the parent class would write its render modes into the class attribute
         super().__init__(
             simulator=Simulator(diagram),
             time_step=action_repeat * task.control_period,
@@ -134,7 +131,8 @@ class DiagramEnv(DrakeGymEnv):
             observation_port_id="observation",
             render_rgb_port_id="rgb_image" if render_mode == "rgb_array" else None,
         )
-        self.metadata["render_modes"] = ["human", "rgb_array"]
+        frames_per_second = max(round(1 / (action_repeat * task.control_period)), 1)  # a video needs at least 1
+        self.metadata = {**type(self).metadata, "render_fps": frames_per_second}
         self.render_mode = render_mode
         if view is not None:
             self.simulator.set_target_realtime_rate(1.0)
@@ -184,7 +182,7 @@ class DiagramEnv(DrakeGymEnv):
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Raise an `InputError`, because a simulation cannot be pickled."""
         call = "gymnasium.make" if self.spec is None else f"gymnasium.make({self.spec.id!r}, ...)"
-        raise InputError(f"an environment holds a simulation and cannot be pickled: call {call} in the worker instead")
+        raise InputError(f"an environment runs a simulation and cannot be pickled: call {call} in the worker instead")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Start an episode; return its first observation and `info`.
@@ -251,7 +249,7 @@ class DiagramEnv(DrakeGymEnv):
             self._failure = str(error)
 
     def _check_start(self, pose: np.ndarray) -> None:
-        """Raise an `InputError` if the first reset puts the robot further away than a simulation may."""
+        """Raise an `InputError` if a coordinate of the first start position (3,) exceeds `MAX_POSITION`."""
         if np.abs(pose[:3]).max() > MAX_POSITION:
             of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
             raise InputError(
@@ -275,8 +273,8 @@ class DiagramEnv(DrakeGymEnv):
 
         Raises:
             ResetNeeded: If the episode is over, or none has begun.
-            InputError: If the action is not finite or has the wrong shape (a finite action outside [-1, 1] is clipped),
-                or if a reward term or the observation is not finite although the simulation did not fail.
+            InputError: If the action is not finite or has the wrong shape, or if a reward term or the observation is
+                not finite although the simulation did not fail. A finite action outside [-1, 1] is clipped.
         """
         action = self._check_action(action)
         if not self._running:
@@ -306,7 +304,7 @@ class DiagramEnv(DrakeGymEnv):
                 break  # this control step is dropped
             self._control_steps += 1
             total += reward
-            # Not the built-in max, which would ignore NaN: an unknown violation must not be reported as slack.
+            # The built-in max would ignore NaN, and an unknown violation would be reported as slack.
             peak_force = float(np.maximum(peak_force, force))
             commanded_violation = float(np.maximum(commanded_violation, now["commanded_violation"][0]))
             measured_violation = float(np.maximum(measured_violation, now["measured_violation"][0]))
@@ -331,7 +329,7 @@ class DiagramEnv(DrakeGymEnv):
         return self._observation, total, terminated, truncated, info
 
     def _advance(self) -> None:
-        """Advance to the end of the next control step, computed from the count because a sum of periods drifts."""
+        """Advance to the end of the next control step, at a multiple of the period: a sum of periods would drift."""
         end, time = (self._control_steps + 1) * self.task.control_period, self.simulator.get_context().get_time()
         if time > end:  # Drake would end the process
             raise InputError(f"the simulator was advanced by hand to {time:g} s: advance it by step() only")
@@ -383,7 +381,7 @@ class DiagramEnv(DrakeGymEnv):
         if self._image_observation:
             return self.observation_port.Eval(context).data[:, :, :3].copy()
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
-        # Without this check a learner would diverge, but only episodes later.
+        # Without this check a learner would diverge several episodes later.
         if not np.isfinite(observation).all():
             of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")

@@ -16,7 +16,6 @@ import numpy as np
 from pydrake.systems.framework import Diagram, System
 from threadpoolctl import threadpool_limits
 
-from guiderail.diagrams.envs.answers import ask, workcell_of
 from guiderail.diagrams.envs.assemble import (
     SkillDiagram,
     build_prior_knowledge,
@@ -26,6 +25,7 @@ from guiderail.diagrams.envs.assemble import (
 )
 from guiderail.diagrams.envs.config import EnvConfig, freeze
 from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
+from guiderail.diagrams.envs.task_checks import call_checked, workcell_of
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
@@ -47,8 +47,8 @@ def make_station(task: Task) -> Station:
     """Build the station that a task is configured with, including its workcell.
 
     Raises:
-        InputError: If the task has no workcell, or one of another kind, its `num_steps` is not a positive whole number,
-            or the station has a fixed control period other than the option `control_period`.
+        InputError: If the task has no workcell or the wrong kind of workcell, its `num_steps` is not a positive whole
+            number, or the station has a fixed control period other than the option `control_period`.
     """
     config, kind = task.config, task.config.station_kind
     check_num_steps(task.name, getattr(task, "num_steps", None))
@@ -60,19 +60,19 @@ def make_station(task: Task) -> Station:
     build, disturbances = _checked_builder(kind, workcell, arguments), config.parts["disturbances"]
     if task.workcell_kind == "insertion":
         assert isinstance(disturbances, Disturbances)
-        station = disturbed(build, disturbances, kind.is_simulated, kind.name, ask(task, "impedance"))
+        station = disturbed(build, disturbances, kind.is_simulated, kind.name, call_checked(task, "impedance"))
     else:
         station = build()
     if config.control_period is not None and station.nominal_period != task.control_period:
         if takes_period:
             raise InputError(
                 f"time_unit of {task.name} is {task.time_unit!r} s, and the period {station.nominal_period!r} s of "
-                f"station={kind.name!r} is no multiple of it: leave time_unit out, which has the station's time step "
-                "by default"
+                f"station={kind.name!r} is no multiple of it: leave time_unit out; its default is the station's time "
+                "step"
             )
         raise InputError(
             f"station={kind.name!r} has a control period of {station.nominal_period:g} s: leave control_period out, or "
-            "give the station's builder that parameter"
+            "let the station's builder take the parameter control_period"
         )
     return station
 
@@ -124,9 +124,9 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
 def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
     """Build the environment that `gymnasium.make("guiderail/<Task>-v0", ...)` returns without its wrappers.
 
-    From this call on, numerical libraries use one thread in this process. Matrices are small here: if other processes
-    use the cores, threads that wait for each other take eighty times as long. The number of threads also changes the
-    rounding of sums.
+    From this call on, numerical libraries use one thread in this process. The matrices are small: if other processes
+    use the cores, several threads that wait for each other take eighty times as long. The number of threads would also
+    change the rounding of sums.
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
@@ -149,11 +149,11 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     declared = config.make_task()
     key = _key(declared, exported)
     idle = [] if key is None else _IDLE[key]
-    # A diagram that a user has added to another diagram cannot be simulated alone any more.
-    idle[:] = [one for one in idle if one.diagram.diagram.GetSystemPathname().count("::") == 1]
+    # A diagram that a user has added to another diagram cannot be simulated alone.
+    idle[:] = [each for each in idle if each.diagram.diagram.GetSystemPathname().count("::") == 1]
     built = idle.pop() if idle else _build(declared, exported)
-    # A reset sets episode constants, which are systems of the diagram: the new task uses those of the task that built
-    # the diagram. The hidden values of a run belong to the new task alone.
+    # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
+    # task that built the diagram. The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
     declared.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(declared, built.station, built.guidance)
@@ -213,7 +213,7 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
         return EnvConfig.resolve(task, options)
     if options:
         raise InputError(
-            f"a configuration holds all options, so {', '.join(options)} must be given to EnvConfig.resolve"
+            f"a configuration contains all options: give {', '.join(options)} to EnvConfig.resolve instead"
         )
     return task
 
@@ -227,15 +227,16 @@ def _build(task: Task, render_mode: str | None) -> _Built:
 def _key(task: Task, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams; None if the diagram is not shared.
 
-    Tasks, guidance, stations, kernels and robots of other packages may read files at each construction (a robot's model
-    names meshes and further models), and no key has the content of these files. The files of this package's tasks are
-    in the key: those that options name, and a folder's.
+    Tasks, guidance, stations, kernels and robots of other packages may read files at each construction: a robot's
+    model, for example, names meshes and further models. Their diagrams are not shared, because the key does not contain
+    these files. For tasks of this package, the key contains the digests of the files that options name and of the files
+    in a task folder.
     """
     config, options = task.config, task.config.options
     builders = [type(task), config.guidance_kind.build, config.station_kind.build]
     if "kernel" in options:
         builders.append(KERNELS.get(options["kernel"]))
-    # Not sharing costs 20 to 230 ms and 1 to 15 MB at each construction, with the shipped stations.
+    # Each construction of a diagram that is not shared takes 20 to 230 ms and 1 to 15 MB, with the shipped stations.
     is_own_robot = "robot" in options and not ROBOTS.is_packaged(options["robot"])
     if is_own_robot or not all(map(_is_packaged, builders)):
         return None
@@ -263,7 +264,7 @@ def _folder_digest(task: Task) -> str | None:
 
 
 def _digest(option: Any) -> bytes | None:
-    """Return the digest of the file that an option's value names; None if it names none."""
+    """Return the digest of the file that an option's value names; None if the value is not the path of a file."""
     if not isinstance(option, str) or not Path(option).is_file():
         return None
     with Path(option).open("rb") as file:

@@ -26,7 +26,7 @@ END_TIMEOUT = 5.0  # longest wait for the gateway to exit before it is killed [s
 
 
 class MeshcatPage(Meshcat):
-    """Meshcat with its page at a secret address; everything else is as in the base class.
+    """Meshcat whose page has a secret address; everything else is as in the base class.
 
     The page and its websocket are at a path with a random token. A request without the token is refused, and so is a
     websocket whose origin is not this page. The gateway parses the messages of browsers: Meshcat receives only the
@@ -137,26 +137,26 @@ class _Gateway:
 
 
 def _close_port(port: int, keep: Sequence[int]) -> None:
-    """Replace this process's listening socket of a port by an unconnected one, and end the port's connections.
+    """Replace the socket that listens on a port by an unconnected socket, and end the port's connections.
 
-    Drake has no function to close the port. Connections to peers with the ports `keep` stay open. The descriptor keeps
-    its number, so that Drake can still close it.
+    Drake has no function to close the port. Connections to peers with the ports `keep` stay open. The number of the
+    socket's file descriptor does not change, so that Drake can still close it.
 
     Raises:
-        RuntimeError: If there is no such socket.
+        RuntimeError: If no socket of this process listens on the port.
     """
     is_closed = False
     for descriptor in map(int, os.listdir("/dev/fd")):
         with suppress(OSError):  # the descriptor or its connection was closed after it was listed
             if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
                 continue
-            with socket.socket(fileno=os.dup(descriptor)) as one, socket.socket() as unconnected:
-                if one.family not in (socket.AF_INET, socket.AF_INET6) or one.getsockname()[1] != port:
+            with socket.socket(fileno=os.dup(descriptor)) as duplicate, socket.socket() as unconnected:
+                if duplicate.family not in (socket.AF_INET, socket.AF_INET6) or duplicate.getsockname()[1] != port:
                     continue
-                if one.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
+                if duplicate.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN):
                     os.dup2(unconnected.fileno(), descriptor, inheritable=False)
                     is_closed = True
-                elif one.getpeername()[1] not in keep:
-                    one.shutdown(socket.SHUT_RDWR)
+                elif duplicate.getpeername()[1] not in keep:
+                    duplicate.shutdown(socket.SHUT_RDWR)
     if not is_closed:
         raise RuntimeError("Meshcat's own port cannot be closed on this system")

@@ -20,7 +20,7 @@ from guiderail.models.common.errors import InputError, brief
 CLOCKS = ("time", "phase")
 """Signals that every observation can have: time of the episode [s], and this time scaled to −1 … 1."""
 MOTION_TIME = "motion_time"
-"""Output of guidance whose motion waits for the robot: time of the motion [s], used for `CLOCKS`."""
+"""Output of guidance whose motion waits for the robot: time of the motion [s], from which `CLOCKS` are computed."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ObservationTerm:
         signal: Name of a port of station, guidance or task, or one of `CLOCKS`.
         center: Finite number, or one per entry (n,), in the signal's unit.
         scale: Finite number, or one per entry (n,), in the signal's unit; not 0.
-        entries: Indices of the observed entries of the signal; negative ones count from its end; default: all.
+        entries: Indices of the observed entries of the signal; negative indices count from its end; default: all.
     """
 
     signal: str
@@ -177,7 +177,7 @@ def _rows(term: ObservationTerm, size: int, of_task: str) -> tuple[np.ndarray, n
 
 
 def _numbers(term: ObservationTerm, name: str, number: int, of_task: str) -> np.ndarray:
-    """Return the center or the scale of each entry, (n,)."""
+    """Return a term's `center` or `scale`, selected by `name`, for each entry, (n,)."""
     given = getattr(term, name)
     try:
         numbers = np.broadcast_to(given, number).astype(float)

@@ -133,8 +133,8 @@ class PrimitiveOptions(Options):
     )
     max_speed: PositiveNumbers = Field(
         (),
-        description="largest speed of the command: one number for positions [m/s], a second one for angles [rad/s], or "
-        "one for each output",
+        description="largest speed of the command: one number for positions [m/s], two for positions and angles "
+        "[rad/s], or one for each output",
     )
     max_acceleration: PositiveNumbers = Field((), description="largest acceleration of the command, like max_speed")
     joint_margin: Number | None = Field(
@@ -148,7 +148,7 @@ class PrimitiveOptions(Options):
         0.0, ge=0, le=0.2, description="smallest singular value of the arm's scaled Jacobian [m], with joint_margin"
     )
     progress: Literal["clock", "state"] = Field(
-        "clock", description="clock: the motion advances with time; state: it waits for a robot that does not follow"
+        "clock", description="clock: the motion advances with time; state: the motion waits for a robot that lags"
     )
     progress_tolerance: Annotated[Pair, _positive] = Field(
         (0.0025, 0.1),
@@ -249,8 +249,8 @@ class ResetOptions(Options):
 
     held_out: bool = Field(
         False,
-        description="sample held-out conditions, by random numbers that training never uses; the task determines if "
-        "their range is that of training",
+        description="sample held-out conditions with random numbers that training never uses; their range is that of "
+        "training, unless the task defines another range",
     )
 
 
@@ -306,7 +306,7 @@ _NUMBER_ERRORS |= dict.fromkeys(("float_type", "float_parsing"), "number")
 
 
 def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any], subject: str) -> str:
-    """Return pydantic's error as a sentence that names the option and the remedy."""
+    """Return an error that pydantic reports as a sentence that names the option and the remedy."""
     kind, context = error["type"], error.get("ctx", {})
     if isinstance(context.get("error"), InputError):
         return str(context["error"])
@@ -337,10 +337,11 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any],
 def _locate(
     model: type[BaseModel], location: tuple[int | str, ...], values: Mapping[str, Any]
 ) -> tuple[str, FieldInfo | None, Any]:
-    """Return the path, field and value of the innermost option at pydantic's location of an error, as motion.push.
+    """Return the path, field and value of the innermost option at the location of an error that pydantic reports.
 
-    An entry of a list of options is part of the path, as in plug.pieces[0].friction, but not one of numbers. If the
-    error is that of the whole model, the path is empty and the field None.
+    A path is, for example, motion.push. An index into a list of option models is part of the path, as in
+    plug.pieces[0].friction; an index into a list of numbers is not. For an error of the whole model, the path is empty
+    and the field is None.
     """
     name, field, models = "", None, [model]
     value: Any = values
@@ -357,13 +358,13 @@ def _locate(
 
 
 def _models_of(field: FieldInfo) -> list[type[BaseModel]]:
-    """Return the option models that a field or its entries have; empty for any other field."""
+    """Return the option models that are the type of a field or of its entries; empty for any other field."""
     annotations = (field.annotation, *get_args(field.annotation))
-    return [one for one in annotations if isinstance(one, type) and issubclass(one, BaseModel)]
+    return [each for each in annotations if isinstance(each, type) and issubclass(each, BaseModel)]
 
 
 def _example(field: FieldInfo) -> str:
-    """Return a phrase with the number of entries of a tuple of numbers and an example; "" for any other field."""
+    """Describe the value of a tuple of numbers by its number of entries and an example; "" for any other field."""
     annotations = repr(field.annotation)
     if "tuple" not in annotations or ("float" not in annotations and "int" not in annotations):
         return ""

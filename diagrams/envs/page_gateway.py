@@ -1,11 +1,12 @@
-"""Gateway between Meshcat's server and browsers: a program of its own, started by `MeshcatPage`.
+"""Gateway between Meshcat's server and browsers: a separate program, started by `MeshcatPage`.
 
-Its first line of input is JSON: the port of Meshcat's server, the token, and the files of the page by name. It prints
-the local ports of its connections to that server, waits for a line, prints the port of the page, and from then on the
-number of browsers at each change. It exits when its input ends or Meshcat disconnects.
+Its first line of input is JSON: the port of Meshcat's server, the token, and the files of the page by name. The gateway
+prints the local ports of its connections to that server and waits for a second line of input. It then prints the port
+of the page, and afterwards the number of connected browsers at each change. It exits when its input ends or Meshcat
+disconnects.
 
-It imports nothing from guiderail. It is not a thread of the simulating program, because the garbage collector might
-delete Meshcat in that thread, which would crash the program.
+The gateway imports nothing from guiderail. It is not a thread of the simulating program, because the garbage collector
+might delete Meshcat in that thread, which would crash the program.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 HOST = "127.0.0.1"
-MAX_MESSAGE = 10_000  # largest message of a browser [bytes]; a gamepad message has a few hundred
-MAX_WAITING = 100_000  # longest queue of a slow browser [frames] before it is disconnected; it then connects again
+MAX_MESSAGE = 10_000  # largest message of a browser [bytes]; a gamepad message has a few hundred bytes
+MAX_WAITING = 100_000  # queue length [frames] above which a slow browser is disconnected; the browser then reconnects
 MAX_GAMEPAD = 64  # largest number of gamepads, and of axes and buttons of each
 ASSET_PERIOD = 3.0  # period of requests on the asset connection [s]; Meshcat closes a connection without requests
 
@@ -48,7 +49,7 @@ _QUIET.setLevel(logging.CRITICAL)
 
 
 class SceneCache:
-    """Cache of the frames that show a new browser the current scene, in the order in which they were sent.
+    """Cache of the frames from which a new browser builds the current scene, in the order in which they were sent.
 
     Attributes:
         controls: Range of each slider that exists; None for a button.
@@ -83,7 +84,7 @@ class SceneCache:
 
 
 def _key(frame: bytes) -> tuple[str, ...]:
-    """Return a frame's type, its path or name, and its property; a later frame with this key replaces it."""
+    """Return a frame's type, its path or name, and its property; a later frame with the same key replaces the frame."""
     unpacker = msgpack.Unpacker(max_buffer_size=0)
     unpacker.feed(frame)
     fields = {"type": "", "path": "", "name": "", "property": ""}
@@ -154,7 +155,7 @@ class Gateway:
     """Server of a page; it is the only client of Meshcat's server.
 
     Args:
-        port: Port of Meshcat's server. After this port has been closed, the page uses it if it is still free.
+        port: Port of Meshcat's server, which is also the port of the page if it is still free after Meshcat closed it.
         token: Secret part of the page's address.
         files: Paths of the page's files by name.
     """
@@ -244,14 +245,15 @@ class Gateway:
             self._gamepad_owner = browser
         elif event["type"] == "slider":
             value = {"name": event["name"], "value": event["value"], "invoke_callback": False}
-            self._publish(msgpack.packb({"type": "set_control_value", **value}), but=browser)
+            self._publish(msgpack.packb({"type": "set_control_value", **value}), sender=browser)
 
-    def _publish(self, frame: bytes, but: ServerConnection | None = None) -> None:
+    def _publish(self, frame: bytes, sender: ServerConnection | None = None) -> None:
+        """Send a frame to all browsers except its `sender`, and disconnect browsers that are too slow."""
         self._cache.add(frame)
         for browser, queue in self._queues.items():
             if queue.qsize() > MAX_WAITING:
                 browser.transport.abort()
-            elif browser is not but:
+            elif browser is not sender:
                 queue.put_nowait(frame)
 
 

@@ -1,4 +1,4 @@
-"""Station that is driven along a given motion and recorded, for demonstrations, benchmarks and tests of physics."""
+"""Recording of a station that follows a given motion, for demonstrations, benchmarks and tests of physics."""
 
 from __future__ import annotations
 
@@ -64,16 +64,16 @@ class DrivenStation:
         return self.station.plant.GetMyMutableContextFromRoot(self.context)
 
     def start(self, pose: np.ndarray) -> None:
-        """Put the tool center at rest at `pose`, (6,), and initialize the simulator; required before `run`."""
+        """Set the tool center at rest at `pose`, (6,), and initialize the simulator; call this before `run`."""
         self.station.set_pose(self.context, pose)
         self.simulator.Initialize()
 
     def run(self, num_steps: int | None = None) -> Recording:
         """Advance `num_steps` control periods, by default until the recorder is full, and return the recording."""
         recorder_context = self.recorder.GetMyContextFromRoot(self.context)
-        done = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
-        last = self._num_samples if num_steps is None else done + num_steps
-        self.simulator.AdvanceTo(last * CONTROL_PERIOD)
+        num_recorded = int(self.recorder.get_num_recorded_output_port().Eval(recorder_context)[0])
+        num_samples = self._num_samples if num_steps is None else num_recorded + num_steps
+        self.simulator.AdvanceTo(num_samples * CONTROL_PERIOD)
         self.simulator.AdvancePendingEvents()
         return self.recorder.recording(recorder_context)
 

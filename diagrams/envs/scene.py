@@ -1,4 +1,4 @@
-"""Drawing of a task: cameras, the browser view, viewpoints, and the lines that a picture shows next to the robot."""
+"""Drawing of a task: cameras, the browser view, viewpoints, and the lines that are drawn next to the robot."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> RigidTransform:
 
 
 def front_camera(target: np.ndarray, distance: float, height: float) -> Camera:
-    """Return a camera that looks slightly down at `target` (3,) from the side away from the arm; lengths in m."""
+    """Return a camera that looks slightly down at `target` (3,) from the side opposite the arm; lengths in m."""
     X_WC = look_at(target + np.array([0.8 * distance, -0.6 * distance, height]), target)
     return Camera((640, 480), np.deg2rad(30.0), X_WC)
 
@@ -195,7 +195,7 @@ def check_rendering() -> None:
 
 
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
-    """Open a browser view on this machine, by default on a new page; return its page and its visualizer.
+    """Open a browser view on this machine, on a new page if none is given; return the page and its visualizer.
 
     Raises:
         InputError: If a new page cannot be opened, for example because `DRAKE_ALLOW_NETWORK` forbids Meshcat.
@@ -275,7 +275,7 @@ class Scene:
     demonstrations: tuple[np.ndarray, ...] = ()  # poses (N, O) of each demonstration
     constraint: tuple[np.ndarray, ...] = ()  # corner points (k, 3) of each line that bounds the allowed region [m]
     viewpoint: Viewpoint | None = None  # viewpoint of a page
-    # Viewpoints of a page with a whole arm, by name; the page opens with the first and offers all.
+    # Viewpoints of a page with a whole arm, by name; the page opens with the first one, and a user can select any.
     arm_views: Mapping[str, Viewpoint] = field(default_factory=dict)
     line_radius: float = 0.0015  # radius of a drawn path [m]
 

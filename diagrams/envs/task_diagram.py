@@ -46,16 +46,18 @@ class Symmetry:
     def __post_init__(self) -> None:
         privileged = () if self.privileged is None else self.privileged
         if len(self.observations) != len(self.actions) or len(privileged) not in (0, len(self.actions)):
-            raise ValueError("a symmetry has as many matrices of the action as of the observation")
+            raise ValueError(
+                "a symmetry needs equally many matrices for observation, action and privileged observation"
+            )
         for matrix in (*self.observations, *self.actions, *privileged):
             magnitudes = np.abs(matrix)
             if not (
                 np.isin(matrix, (-1, 0, 1)).all() and (magnitudes.sum(0) == 1).all() and (magnitudes.sum(1) == 1).all()
             ):
-                raise ValueError("each matrix of a symmetry is a signed permutation")
+                raise ValueError("each matrix of a symmetry must be a signed permutation")
 
     def pad(self, count: int) -> Symmetry:
-        """Return the same symmetry for observations with `count` more entries at their end, which do not change."""
+        """Return the symmetry for observations with `count` additional entries at the end, which it does not change."""
         if count == 0:
             return self
         size = self.observations.shape[1]
@@ -78,16 +80,16 @@ class TaskDiagram:
 
     ======================= ================================================================================
     ``observation``         observation of the policy: a vector, or an abstract `ImageRgba8U`
-    ``reward``              (1,) reward of the control step that ends
+    ``reward``              (1,) reward of the control step that has just ended
     one per reward term     (1,) each, named as in `reward_terms`
     ``termination``         (1,) an index into `guiderail.systems.episode_monitor.TERMINATIONS`
-    ``commanded_violation`` (1,) max over the constraints of c - G y of the commanded output; negative is slack
-    ``measured_violation``  (1,) the same maximum for the measured pose
+    ``commanded_violation`` (1,) max(c - G y) over all constraints G y ≥ c for the commanded pose y; negative is slack
+    ``measured_violation``  (1,) max(c - G y) for the measured pose y
     ``contact_force``       (1,) magnitude of the contact force [N]
     ``desired_pose``        (O,) commanded pose
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
-    ``wrench``              (W,) wrench of the surroundings on the tool; this port and the next four are optional
+    ``wrench``              (W,) contact wrench on the tool; this port and all following ports are optional
     ``saturation``          nonzero while an actuator is at its limit; its size depends on the station
     ``collision``           (1,) positive during a collision
     ``privileged``          (m,) observation for a privileged critic; the policy does not receive it
@@ -95,10 +97,11 @@ class TaskDiagram:
     ``rgb_image``           an abstract `ImageRgba8U`; only if the diagram was built with a camera
     ======================= ================================================================================
 
-    The environment reads the outputs at the end of control steps, before the events of that instant. Build the
-    plant with ``use_sampled_output_ports=False``, so that systems that sample the plant at control steps read the same
-    numbers. With sampled output ports the plant's step is an unrestricted update, which Drake runs before the discrete
-    updates of the same instant: these would read the plant's state one plant step later.
+    The environment reads the outputs at the end of each control step, before the events of that instant. Build the
+    plant with ``use_sampled_output_ports=False``. Systems that sample the plant at control steps then read the same
+    numbers as the environment. With sampled output ports, the plant's step would be an unrestricted update, which Drake
+    runs before the discrete updates of the same instant. The sampling systems would then read the plant's state one
+    plant step later than the environment.
 
     Attributes:
         diagram: Root diagram.
@@ -106,11 +109,11 @@ class TaskDiagram:
         num_steps: Control steps after which an episode is truncated.
         observation_space: Space of observations, in the dtype that the environment returns.
         reward_terms: Names of the reward terms, which are ports of the diagram and keys of `info`.
-        randomize: Function of the root context (just restored to the default), the environment's random generator and
-            the options of a reset. It samples the episode's conditions, writes them into the context and
-            returns them for `info`. It raises an `InputError` for an unknown option.
-        push: Function of the root context and a displacement that moves the measured pose; None if the robot cannot be
-            pushed.
+        randomize: Function that samples the episode's conditions, writes them into the root context and returns them
+            for `info`. Its arguments are the root context (just restored to the default), the environment's random
+            generator and the options of the reset. It raises an `InputError` for an unknown option.
+        push: Function that displaces the measured pose; its arguments are the root context and the displacement (O,).
+            None if the robot cannot be pushed.
         query: Query port of the scene, for a browser view.
         view: Browser view of an environment made with `render_mode="human"`.
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
@@ -149,7 +152,7 @@ class TaskDiagram:
             raise InputError(f"the task's diagram {self.diagram.get_name()!r} exports no port {', '.join(missing)}")
         port, shape = self.diagram.GetOutputPort("observation"), self.observation_space.shape
         if port.get_data_type() == PortDataType.kVectorValued and shape != (port.size(),):
-            raise InputError(f"the observation has {port.size()} numbers, and observation_space the shape {shape}")
+            raise InputError(f"the observation has {port.size()} entries, but observation_space has the shape {shape}")
         if not is_whole(self.num_steps, 1) or not as_number(self.control_period, "control_period") > 0:
             raise InputError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
         for symmetry in (self.symmetry, self.near_symmetry):
@@ -157,4 +160,4 @@ class TaskDiagram:
                 symmetry.observations.shape[1:] != 2 * self.observation_space.shape
                 or symmetry.actions.shape[1:] != 2 * (self.diagram.GetInputPort("action").size(),)
             ):
-                raise InputError("a symmetry permutes every observed number and every action")
+                raise InputError("the matrices of a symmetry must have the sizes of the observation and the action")

@@ -25,7 +25,7 @@ class EpisodeTrace:
     The arrays are views of storage that the next episode overwrites: copy data that are needed after a reset.
     """
 
-    def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int] | None = None):
+    def __init__(self, num_steps: int, num_outputs: int, period: float, signals: Mapping[str, int]):
         """Construct an empty trace.
 
         Args:
@@ -40,7 +40,7 @@ class EpisodeTrace:
         self._measured = np.empty((num_steps, num_outputs))
         self._force = np.empty(num_steps)
         self._reward = np.empty(num_steps)
-        self._signals = {name: np.empty((num_steps, size)) for name, size in (signals or {}).items()}
+        self._signals = {name: np.empty((num_steps, size)) for name, size in signals.items()}
 
     def __len__(self) -> int:
         """Return the number of control steps recorded so far."""
@@ -81,11 +81,9 @@ class EpisodeTrace:
         measured: np.ndarray,
         force: float,
         reward: float,
-        signals: Mapping[str, np.ndarray] | None = None,
+        signals: Mapping[str, np.ndarray],
     ) -> None:
         """Record one control step: poses (O,), contact force [N], reward and signals.
-
-        NaN is recorded for every signal if `signals` is None.
 
         Raises:
             InputError: If a signal of the trace is missing.
@@ -97,25 +95,26 @@ class EpisodeTrace:
         self._reward[n] = reward
         try:
             for name, values in self._signals.items():
-                values[n] = signals[name] if signals is not None else np.nan
+                values[n] = signals[name]
         except KeyError as error:
-            has = sorted(signals or {})
-            raise InputError(f"a control step lacks the signal {error} of the trace: its signals are {has}") from None
+            raise InputError(
+                f"a control step lacks the signal {error} of the trace: its signals are {sorted(signals)}"
+            ) from None
         self._length = n + 1
 
     def statistics(self) -> dict[str, float]:
         """Return the safety statistics of the episode so far, by name.
 
         Before the first control step, the largest violations are −∞ and the peak force is 0. The maximum of values that
-        contain NaN is NaN. `collisions` counts uninterrupted sequences of control steps in collision, `collision_steps`
-        counts these control steps. If its signal is not recorded, a violation is −∞ and a count is 0.
+        contain NaN is NaN. `collision_steps` counts the control steps in collision, and `collisions` the uninterrupted
+        sequences of such steps. If its signal is not recorded, a violation is −∞ and a count is 0.
         """
         collision = self._is_positive("collision")
         return {
             "max_commanded_violation": self._largest("commanded_violation"),
             "max_measured_violation": self._largest("measured_violation"),
             "peak_force": float(self.force.max(initial=0.0)),
-            # Summed step by step: NumPy's mean adds in another order, which rounds differently.
+            # Forces are added in the order of the steps, because the order of NumPy's mean rounds differently.
             "mean_force": float(np.cumsum(self.force)[-1] / len(self)) if len(self) else 0.0,
             "collisions": float((collision & ~np.append(False, collision[:-1])).sum()),
             "collision_steps": float(collision.sum()),

@@ -19,7 +19,7 @@ def test_option_that_the_other_station_lacks_is_refused():
     assert changed_environment("BncConnector", learned, {}) == learned
     assert changed_environment("BncConnector", learned, {"station": "gantry"})["impedance_control"] == "cartesian"
     asked = changed_environment("BncConnector", learned, {"station": "arm", "impedance_control": "joint"})
-    with pytest.raises(InputError, match="it is one of station='gantry'"):
+    with pytest.raises(InputError, match="it is an option of station='gantry'"):
         check_environment("BncConnector", asked)
 
 

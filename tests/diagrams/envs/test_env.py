@@ -449,7 +449,7 @@ def test_step_refuses_a_simulator_that_was_advanced_past_it():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"observation_space": gymnasium.spaces.Box(-1, 1, (5,))}, "the observation has 4 numbers"),
+        ({"observation_space": gymnasium.spaces.Box(-1, 1, (5,))}, "the observation has 4 entries"),
         ({"num_steps": 2.5}, "a task can't last 2.5 steps"),
         ({"control_period": None}, "control_period must be a number, not None"),
     ],

@@ -186,7 +186,7 @@ def test_environment_selects_robot_by_name():
     assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
     with pytest.raises(InputError, match="did you mean ur5e"):
         make_env("GridClamp", station="arm", robot="ur5")
-    with pytest.raises(InputError, match="no option 'robot' here: it is one of station='arm'"):
+    with pytest.raises(InputError, match="no option 'robot' here: it is an option of station='arm'"):
         make_env("GridClamp", robot="panda")
 
 

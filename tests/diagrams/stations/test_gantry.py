@@ -129,7 +129,7 @@ def test_environment_selects_the_impedance_control():
         make_env("BncConnector", impedance_control="cartesan")
     with pytest.raises(InputError, match="is too long for impedance_control"):
         make_env("BncConnector", impedance_control="cartesian", time_step=0.02)
-    with pytest.raises(InputError, match="it is one of station='gantry'"):
+    with pytest.raises(InputError, match="it is an option of station='gantry'"):
         make_env("BncConnector", station="arm", impedance_control="cartesian")
 
 
