@@ -1,4 +1,4 @@
-"""Guidance around a base policy: its action chunks are a reference (KGRL, residual) or are executed with a guard."""
+"""Guidance around a base policy, whose action chunks are a reference (KGRL, residual) or are executed with a guard."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
 
     Args:
         config: Configuration with the demonstrations, for the default limits, and the speed limits.
-        max_jerk: One limit for positions, two limits for positions and angles, or O limits. Angles have the default if
-            only one limit is given; () gives all outputs the default.
+        max_jerk: One limit for positions, two limits for positions and angles, or O limits. Outputs without a given
+            limit have the default: angles if only one limit is given, and all outputs if it is ().
 
     Raises:
         InputError: If the motion has constraints other than linear bounds and speed limits, `max_jerk` has another
@@ -47,7 +47,7 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     for order in (1, 3):
         steps = np.abs(np.diff(config.reference.means, n=order, axis=0)).max(axis=0) / period**order
         groups = (steps[:3], steps[3:])
-        limits.append(LIMIT_FACTOR * np.concatenate([np.full(len(one), one.max(initial=0.0)) for one in groups]))
+        limits.append(LIMIT_FACTOR * np.concatenate([np.full(len(group), group.max(initial=0.0)) for group in groups]))
     velocity, jerk = limits
     if motion is not None:
         speed = np.asarray(motion.max_speed, dtype=float)
@@ -55,10 +55,10 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     if max_jerk:
         given = limits_per_output("max_jerk", max_jerk, outputs)
         jerk = np.where(np.isfinite(given), given, jerk)
-    if still := np.flatnonzero((velocity == 0.0) | (jerk == 0.0)).tolist():
+    if unmoved := np.flatnonzero((velocity == 0.0) | (jerk == 0.0)).tolist():
         raise InputError(
-            f"the demonstrations do not move the outputs {', '.join(map(str, still))} and so give no limits for them: "
-            "give max_speed and max_jerk for all outputs"
+            f"the demonstrations do not move the outputs {', '.join(map(str, unmoved))}, which therefore have no "
+            "default limits: give max_speed and max_jerk for all outputs"
         )
     return velocity, jerk
 
@@ -76,8 +76,8 @@ class ChunkExecutionGuidance(PrimitiveGuidance):
         Without this input, the chunks are parts of the demonstrations' mean.
 
         Raises:
-            InputError: If the motion waits for the robot (``progress=state``), or the guard does not support the limits
-                and constraints, or there is none but limits are given.
+            InputError: If the motion waits for the robot (``progress=state``), the guard does not support the limits
+                and constraints, or limits are given without a guard.
         """
         super().__init__()
         config, options, builder = primitive_config_of(prior), prior.options, DiagramBuilder()

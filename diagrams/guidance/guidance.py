@@ -17,7 +17,7 @@ output                  size   meaning
 `fallback`              1      1 if a safe pose is commanded instead of the requested one
 ======================  =====  =====================================================================================
 
-Guidance may export further ports; a task's reward can name such a port, for example a template's `progress`. Guidance
+Guidance may export further output ports, such as a template's `progress`; a task's reward can name them. Guidance
 around a base policy also has the input `reference_window`, which a system from `Guidance.make_reference` computes.
 """
 

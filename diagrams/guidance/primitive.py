@@ -40,8 +40,8 @@ def refuse_limits(config: PrimitiveConfig) -> None:
 class PrimitiveGuidance(Guidance):
     """Base class of guidance around a movement primitive.
 
-    ``action`` has one entry per explored output. ``constraint_violation`` is that of the command, whether or not this
-    kind of guidance enforces the constraints.
+    ``action`` has one entry per explored output. ``constraint_violation`` is the command's violation of the constraints,
+    even if this kind of guidance does not enforce them.
     """
 
     def _export_inputs(self, builder: DiagramBuilder, config: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:
@@ -72,14 +72,13 @@ class PrimitiveGuidance(Guidance):
 
             motion = CommandFilter(MotionConstraintFilter(config.motion, config.control_period), config.control_period)
             add_system(builder, "motion_constraints", motion, desired_pose=command, pose=pose)
-            either = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
-            flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), either.get_output_port())
+            count = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
+            flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), count.get_output_port())
             command, fallback = motion.get_safe_pose_output_port(), flag.get_output_port()
         if config.progress is not None:
             from guiderail.systems.progress_clock import ProgressClock
 
-            rule, period = config.progress, config.control_period
-            clock = ProgressClock(rule, config.num_outputs, period)
+            clock = ProgressClock(config.progress, config.num_outputs, config.control_period)
             add_system(builder, "progress", clock, command=command, pose=pose)
             builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
             builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
@@ -101,9 +100,9 @@ class PrimitiveGuidance(Guidance):
 def add_demonstration(
     builder: DiagramBuilder, config: PrimitiveConfig, action: OutputPort, *, takes_window: bool = False
 ) -> LcNsKmpSystem:
-    """Add the primitive without actions, constraints or history, which commands the mean of the reference.
+    """Add a primitive that commands the mean of the reference, without actions, constraints or history.
 
-    The reference is that of the demonstrations, or the input ``reference_window`` if `takes_window` is True.
+    The reference is fitted to the demonstrations, or is the input ``reference_window`` if `takes_window` is True.
     """
     primitive = config.primitive(history=False, constrained=False)
     kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
@@ -159,17 +158,17 @@ class KgrlGuidance(PrimitiveGuidance):
             InputError: If there are limits of speed, acceleration or joints, but `constrained` is False.
         """
         super().__init__()
-        task, builder = primitive_config_of(prior), DiagramBuilder()
-        config = task if constrained else replace(task, motion=None)
+        given_config, builder = primitive_config_of(prior), DiagramBuilder()
+        config = given_config if constrained else replace(given_config, motion=None)
         if not constrained:
-            refuse_limits(task)
+            refuse_limits(given_config)
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=False, constrained=constrained)
         kmp = LcNsKmpSystem(primitive, config.null_space_gains(primitive), config.control_period)
         add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if takes_window:
             builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-        self._finish(builder, task, *self._constrain(builder, config, kmp, pose))
+        self._finish(builder, given_config, *self._constrain(builder, config, kmp, pose))
 
 
 @register_guidance(
@@ -208,9 +207,8 @@ class SkgrlGuidance(PrimitiveGuidance):
         action, pose = self._export_inputs(builder, config)
         primitive = config.primitive(history=True)
         gains = config.null_space_gains(primitive)
-        shorter = [
-            (each, config.null_space_gains(each)) for each in map(config.primitive_of_length, config.shorter_histories)
-        ]
+        shorter_primitives = map(config.primitive_of_length, config.shorter_histories)
+        shorter = [(short, config.null_space_gains(short)) for short in shorter_primitives]
         kmp = LcNsKmpSystem(primitive, gains, config.control_period, shorter)
         add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if shorter:

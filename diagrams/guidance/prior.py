@@ -1,4 +1,4 @@
-"""Prior knowledge about a task, which guidance is built from."""
+"""Prior knowledge about a task, from which guidance is built."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ HISTORY_SOURCES = ("commanded", "measured")
 
 
 def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
-    """Return one limit for each output, (O,), from O limits, or from one for positions and a second one for angles.
+    """Return one limit for each output, (O,), from O limits, or from one limit for positions and one for angles.
 
-    Angles have no limit (infinity) if only one limit is given.
+    If only the limit for positions is given, angles have no limit (infinity).
 
     Raises:
         InputError: If there are no limits, or more than two but not O; `name` is their name in the message.
@@ -47,13 +47,12 @@ class PrimitiveConfig:
 
     Attributes:
         reference: Reference trajectory of the demonstrations, in steps of the control period.
-        constraints: G y ≥ c on every command.
-        motion: Further constraints of the commanded motion, enforced on the output of the primitive; None if there are
-            none.
+        constraints: Linear constraints G y ≥ c on every command y.
+        motion: Further constraints of the commanded motion, enforced on the output of the primitive, if there are any.
         control_period: Control period [s].
         history: P, number of past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
-        adaptive_history: True if sKGRL's history halves, down to a single output, during contact.
+        adaptive_history: True if sKGRL's history is shortened during contact: repeatedly halved, down to one output.
         history_source: "commanded" or "measured" poses. Use commanded poses under impedance control: with a long
             measured history at a high rate, commands would follow the robot, and the force would vanish. Use measured
             poses if an operator may push a robot that tracks well.
@@ -67,7 +66,7 @@ class PrimitiveConfig:
         isotropic_groups: Groups of indices of outputs with the same unit; residual guidance has the same gain for all
             outputs of a group. Default: one group.
         solver: Solver of the constrained primitive's QP: "daqp", "osqp" or "piqp".
-        keep_out: Walls that safe residual RL stops at, if the task provides any.
+        keep_out: Walls at which safe residual RL stops the robot, if the task provides any.
         progress: Rule by which the motion waits for the robot; None if the clock drives the motion.
         wrench_size: W, size of a measured wrench.
 
@@ -135,7 +134,7 @@ class PrimitiveConfig:
 
     @property
     def shorter_histories(self) -> tuple[int, ...]:
-        """Lengths of an adaptive history other than P: P/2, P/4, … 1."""
+        """Lengths of an adaptive history that are shorter than P: P/2, P/4, … 1."""
         lengths, length = [], self.history
         while self.adaptive_history and length > 1:
             length //= 2
@@ -147,7 +146,7 @@ class PrimitiveConfig:
         return replace(self, history=history).primitive(history=True)
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
-        """Return the movement primitive of sKGRL (with history), of KGRL (without) or of the mean (unconstrained)."""
+        """Return the movement primitive: with history for sKGRL, without for KGRL; unconstrained for the mean alone."""
         return get_shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
@@ -204,7 +203,7 @@ class PlacedTemplate:
         check_template(self.template, self.frames)
 
     def constrained(self, by_default: bool) -> bool:
-        """Return `active_constraints`; if that is None, the guidance's default, `by_default`."""
+        """Return `active_constraints`, or the guidance's default `by_default` if `active_constraints` is None."""
         return by_default if self.active_constraints is None else self.active_constraints
 
 

@@ -39,7 +39,8 @@ class GuidanceKind:
         displaces: True if each entry of an action displaces one explored output. Only then is a task's symmetry used
             for data augmentation.
         options: Model of further options of the environment, if there are any.
-        ignores_actions: True if actions have no effect. A task that declares no default has another one.
+        ignores_actions: True if actions have no effect. Such a kind is a task's default only if the task declares it or
+            no other kind is possible.
     """
 
     name: str
@@ -61,12 +62,12 @@ class GuidanceKind:
 
 
 def _missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collection[str]) -> tuple[str, ...]:
-    missing = [tuple(one for one in needed if one not in provided) for needed in needs]
+    missing = [tuple(name for name in alternative if name not in provided) for alternative in needs]
     return min(missing, key=len, default=())
 
 
 def _check(name: str, kind: object) -> None:
-    """Raise an InputError unless an entry is a `GuidanceKind` with a builder and an options class."""
+    """Raise an `InputError` unless `kind` is a `GuidanceKind` whose builder and options have the right types."""
     if not isinstance(kind, GuidanceKind):
         raise InputError(f"the guidance {name!r} is registered by @register_guidance, not as {brief(kind)}")
     check_callable(name, kind.build)
@@ -96,7 +97,7 @@ def register_guidance(
     options: type[Options] | None = None,
     ignores_actions: bool = False,
 ) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
-    """Return a decorator that registers a function or a class that takes a `PriorKnowledge`.
+    """Return a decorator that registers a function or a class; its argument is a `PriorKnowledge`.
 
     The decorator raises an `InputError` if another kind of guidance has this name, or an argument or the decorated
     object has the wrong type.
@@ -112,11 +113,11 @@ def register_guidance(
         ignores_actions: See `GuidanceKind`.
 
     Raises:
-        InputError: If the name is no word, or `needs` are not tuples of names in `REQUIREMENTS`.
+        InputError: If the name is not a word, or `needs` are not tuples of names in `REQUIREMENTS`.
     """
     GUIDANCE.check_name(name)
-    are_tuples = isinstance(needs, list | tuple) and all(isinstance(each, list | tuple) for each in needs)
-    if not are_tuples or not all(one in REQUIREMENTS for each in needs for one in each):
+    are_tuples = isinstance(needs, list | tuple) and all(isinstance(names, list | tuple) for names in needs)
+    if not are_tuples or not all(each in REQUIREMENTS for names in needs for each in names):
         raise InputError(
             f"needs of guidance {name!r} must be tuples of the names {', '.join(REQUIREMENTS)}, such as "
             f"(('template',),), not {brief(needs)}"
@@ -158,9 +159,9 @@ def check_guidance(name: str, provided: Collection[str], task: str = "this task"
     kind = GUIDANCE.get(name)
     missing = kind.missing_requirements(provided)
     if missing:
-        texts = " and ".join(REQUIREMENTS.get(one, one) for one in missing)
+        needed = " and ".join(REQUIREMENTS.get(requirement, requirement) for requirement in missing)
         raise InputError(
-            f"guidance '{name}' needs {texts}, which {task} doesn't have: use {', '.join(possible_guidance(provided))}"
+            f"guidance '{name}' needs {needed}, which {task} doesn't have: use {', '.join(possible_guidance(provided))}"
         )
     return kind
 
@@ -170,18 +171,18 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
 
     Args:
         name: Name of the kind.
-        prior: Prior knowledge; options that it lacks have their defaults.
-        task: Name of the task, for the message.
+        prior: Prior knowledge; missing options have their defaults.
+        task: Name of the task, for the error message.
 
     Raises:
         InputError: If there is no such kind, a requirement is missing, or its builder returns no diagram.
     """
     from pydrake.systems.framework import System
 
-    kind = check_guidance(name, [one for one in REQUIREMENTS if prior.has(one)], task)
+    kind = check_guidance(name, [requirement for requirement in REQUIREMENTS if prior.has(requirement)], task)
     if kind.options is not None:
-        declared = kind.options.model_fields.items()
-        defaults = {name: field.get_default() for name, field in declared if not field.is_required()}
+        fields = kind.options.model_fields.items()
+        defaults = {option: field.get_default() for option, field in fields if not field.is_required()}
         prior = replace(prior, options=defaults | dict(prior.options))
     guidance = kind.build(prior)
     if not isinstance(guidance, System):

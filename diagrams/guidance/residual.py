@@ -69,7 +69,7 @@ class ResidualDescent(Guidance):
 class ResidualGuidance(PrimitiveGuidance):
     """Residual RL with demonstrations: p̂_t = p_t^kmp + Δp_t.
 
-    Shapes among the motion constraints are not enforced; limits of speed, acceleration and joints are refused.
+    Shapes in the motion constraints are not enforced; limits of speed, acceleration and joints are refused.
     """
 
     def __init__(
@@ -83,13 +83,13 @@ class ResidualGuidance(PrimitiveGuidance):
 
         Args:
             prior: Prior knowledge.
-            make_filter: Function of the primitive's configuration and the keep-out walls. It returns a `SafetyFilter`
-                or `CommandFilter` for the sum; ``fallback`` is 1 while the filter changes the sum. None: no filter.
-            takes_window: True to take the motion from the input ``reference_window`` instead of the demonstrations.
+            make_filter: Function of the primitive's configuration and the keep-out walls that returns a `SafetyFilter`
+                or `CommandFilter` of the sum p̂_t; None: no filter. ``fallback`` is 1 while the filter changes the sum.
+            takes_window: True if the motion p_t^kmp is the input ``reference_window`` instead of the demonstrations.
 
         Raises:
-            InputError: If the motion waits for the robot (``progress=state``), or its speed, acceleration or joints are
-                limited.
+            InputError: If the motion waits for the robot (``progress=state``), or limits of its speed, acceleration or
+                joints are given.
         """
         super().__init__()
         config, builder = primitive_config_of(prior), DiagramBuilder()

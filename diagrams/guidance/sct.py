@@ -50,16 +50,16 @@ class ActiveConstraintFilter(Diagram):
         """Construct the diagram.
 
         `frames` are the poses X_WF of the template's objects by name; W is the frame of all poses. `period` is the
-        control period [s]. If the robot is farther than `max_tracking_error` [m] from its command, only commands closer
-        to the robot replace the last one.
+        control period [s]. If the robot is farther than `max_tracking_error` [m] from its command, the last command is
+        repeated, unless the new one is closer to the robot.
         """
         super().__init__()
         builder = DiagramBuilder()
         self._projector = ActiveConstraintProjector(template, frames, period, max_tracking_error)
         builder.AddNamedSystem("projector", self._projector)
         self._machine = SctStateMachine(template, frames, period)
-        # The state follows the command, not the measured pose. The command is then always inside the constraints of its
-        # state, and a transition does not depend on how well the robot tracks.
+        # The state depends on the command, not on the measured pose. The command is then always inside the constraints
+        # of the state, and a transition does not depend on the robot's tracking error.
         add_system(builder, "state_machine", self._machine, pose=self._projector.get_desired_pose_output_port())
         builder.Connect(self._machine.get_state_output_port(), self._projector.get_state_input_port())
         builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
@@ -97,9 +97,9 @@ class SctGuidance(Guidance):
     """Shared control: input mapping and active constraints of the template's current state.
 
     ``action`` is (n,), the n inputs of the template, from a policy or a user's input device. ``constraint_violation``
-    is the largest violation of an active constraint by the command, in meters or radians; 0 inside, or if the active
-    constraints are not enforced. In addition to the ports of all guidance there are ``state``,
-    ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
+    is the command's largest violation of an active constraint [m] or [rad]; it is 0 inside the constraints, or if they
+    are not enforced. In addition to the ports of all guidance there are ``state``, ``transition_distance``,
+    ``progress`` and ``measured_violation``, all (1,).
     """
 
     def __init__(
@@ -136,9 +136,8 @@ class SctGuidance(Guidance):
         if input_mapping is None:
             state = self._filter.GetOutputPort("state")
         else:
-            free = np.array([float(input_mapping.initial_state)])
-            source = builder.AddNamedSystem("state", ConstantVectorSource(free))
-            state = source.get_output_port()
+            initial_state = ConstantVectorSource([float(input_mapping.initial_state)])
+            state = builder.AddNamedSystem("state", initial_state).get_output_port()
         builder.Connect(state, self._mapping.get_state_input_port())
         builder.Connect(self._filter.GetOutputPort("last_desired_pose"), self._mapping.get_pose_input_port())
         self._filter.export_ports(builder, hold)
@@ -154,8 +153,8 @@ class SctGuidance(Guidance):
 def _build_sct(
     prior: PriorKnowledge, input_mapping: SharedControlTemplate | None, *, is_constrained_by_default: bool
 ) -> SctGuidance:
-    assert prior.template is not None
     placed = prior.template
+    assert placed is not None
     is_constrained = placed.constrained(is_constrained_by_default)
     return SctGuidance(
         placed.template,
