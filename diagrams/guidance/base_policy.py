@@ -57,8 +57,8 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
         jerk = np.where(np.isfinite(given), given, jerk)
     if unmoved := np.flatnonzero((velocity == 0.0) | (jerk == 0.0)).tolist():
         raise InputError(
-            f"the demonstrations do not move the outputs {', '.join(map(str, unmoved))}, which therefore have no "
-            "default limits: give max_speed and max_jerk for all outputs"
+            f"the demonstrations do not move the outputs {', '.join(map(str, unmoved))} and define no default limits "
+            "for them: give max_speed and max_jerk for all outputs"
         )
     return velocity, jerk
 

@@ -40,8 +40,8 @@ def refuse_limits(config: PrimitiveConfig) -> None:
 class PrimitiveGuidance(Guidance):
     """Base class of guidance around a movement primitive.
 
-    ``action`` has one entry per explored output. ``constraint_violation`` is the command's violation of the constraints,
-    even if this kind of guidance does not enforce them.
+    ``action`` has one entry per explored output. ``constraint_violation`` is the command's violation of the
+    constraints, even if this kind of guidance does not enforce them.
     """
 
     def _export_inputs(self, builder: DiagramBuilder, config: PrimitiveConfig) -> tuple[OutputPort, OutputPort]:

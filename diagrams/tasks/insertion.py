@@ -31,11 +31,11 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.reward_system import RewardTerm
 
-MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one was probably meant in millimeters
+MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 
 
-# Center and scale of an observed force limit [N]; they do not depend on `force_limit_range`, so that a policy can be
-# evaluated with another range.
+# Center and scale of an observed force limit [N]. They do not depend on `force_limit_range`, so that a policy can be
+# evaluated with a different range.
 LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
 
 
@@ -62,10 +62,10 @@ class InsertionReset(ResetOptions):
 
 @dataclass(frozen=True)
 class HoldTest:
-    """Push on an inserted workpiece that confirms a success on hardware, where the workpiece's pose is not measured."""
+    """Push on an inserted workpiece, to confirm a success on hardware, where the workpiece's pose is not measured."""
 
     displacement: tuple[float, float, float]  # displacement of the command, (3,) [m]
-    max_motion: float  # largest measured motion in its direction [m]
+    max_motion: float  # largest measured motion in the direction of the displacement [m]
 
 
 # Displacement of the command in a hold test, and largest motion of a workpiece that resists it [m].
@@ -75,14 +75,14 @@ HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 class InsertionTask(Task):
     """Insertion of a workpiece in the tool into a fixture, with sampled offsets of both and a force limit.
 
-    Held-out offsets are drawn from the same range as those of training, with other random numbers.
+    Held-out offsets are sampled from the same range as training offsets, with random numbers that training never uses.
 
     Attributes:
         workpiece: Name of the workpiece's body, and of the signal of its pose in the fixture.
         fixture: Name of the fixture's body.
-        simulated_rewards: Rewards that use components of the workpiece's pose that a robot cannot measure.
-        snaps_in: True if the bounded force cannot pull out an inserted workpiece, so that on hardware the operator
-            releases it after a success.
+        simulated_rewards: Rewards that use components of the workpiece's pose that cannot be measured on hardware.
+        snaps_in: True if the bounded force cannot pull out an inserted workpiece. On hardware, the operator releases
+            such a workpiece after a success.
         offsets: Sampler of the offsets; it stores the hidden values of a run. A subclass sets it.
         collision: Signal and limit of the contact force [N]. A subclass sets it.
     """
@@ -99,12 +99,13 @@ class InsertionTask(Task):
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position [m] and rotation vector [rad].
 
-        In simulation, the signal `hidden_offset` (3,) is the fixture's offset: x, y [m] and turn [rad]. On hardware the
-        workpiece's pose is estimated from the robot's own pose, if the task defines `observable_success`. If the force
-        limit is sampled, it is the signal `force_limit` [N], and the signal `max_wrench` limits the station's force.
+        In simulation, the signal `hidden_offset` (3,) is the fixture's offset: x, y [m] and turn [rad]. On hardware,
+        the workpiece's pose is estimated from the robot's pose, if the task defines `observable_success`. A sampled
+        force limit is the signal `force_limit` [N], and the signal `max_wrench` limits the station's force.
 
         Raises:
-            InputError: If the force limit is sampled, and a station with a bounded impedance has no `max_wrench`.
+            InputError: If the force limit is sampled, and the station has a bounded impedance without the input
+                `max_wrench`.
         """
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
@@ -155,12 +156,12 @@ class InsertionTask(Task):
     def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
         """Return D (6, 6) and y0 (6,) of the estimate D X_TP + y0 of the workpiece's pose from the robot's pose X_TP.
 
-        If it returns None, the default, the task cannot be learned on hardware.
+        The default is None: the task then cannot be learned on hardware.
         """
         return None
 
     def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
-        """Return the pushes that an inserted workpiece resists, for the pose X_TP (6,) of a success: a pull upwards."""
+        """Return pushes that an inserted workpiece resists, for the pose X_TP (6,) of a success; default: a pull."""
         return [HoldTest((0.0, 0.0, HOLD_DISTANCE), MAX_HOLD_MOTION)]
 
     def impedance(self) -> Impedance | None:
@@ -221,10 +222,10 @@ class InsertionTask(Task):
         The offsets of the fixture are (2,) or (3,), those of the workpiece (2,) or (4,), as in `part_poses`.
         """
         plant, workcell = station.plant, self.workcell()
-        own = plant.GetMyMutableContextFromRoot(context)
+        plant_context = plant.GetMyMutableContextFromRoot(context)
         X_TTactual, X_PWorkpiece = part_poses(fixture, workpiece)
-        workcell.set_fixture_offset(plant, own, X_TTactual)
-        workcell.set_grasp_offset(plant, own, X_PWorkpiece)
+        workcell.set_fixture_offset(plant, plant_context, X_TTactual)
+        workcell.set_grasp_offset(plant, plant_context, X_PWorkpiece)
 
     @abstractmethod
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
@@ -244,14 +245,14 @@ def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransfo
     return RigidTransform(turn, [*fixture[:2], 0.0]), RigidTransform(tilt, [*workpiece[:2], 0.0])
 
 
-# The thesis gives no units of the wrench f; here they are 10 N and 0.5 Nm.
+# The thesis does not state the units of the wrench f in the reward; here they are 10 N and 0.5 Nm.
 ACTION_WEIGHT = FORCE_WEIGHT = 0.01
 REWARD_WRENCH = np.array([10.0, 10.0, 10.0, 0.5, 0.5, 0.5])
 TERMINAL = {"success": 60.0, "collision": -50.0}
-# Reward per depth gained [1/mm]. The connector locks when the demonstrations end, however early the plug drops. With a
-# terminal reward alone, a success by random motion would therefore earn as much as a success by use of the contact,
-# although random motion succeeds less reliably. The path from start to lock is 15.6 mm long, with the last 10.5 mm in
-# the jack.
+# Reward per depth gained [1/mm]. The connector locks at the end of the demonstrations, even if the plug drops into the
+# jack early. With a terminal reward alone, a success by random motion would therefore earn as much as a success by use
+# of the contact, although random motion succeeds less reliably. The path from start to lock is 15.6 mm long, and its
+# last 10.5 mm are in the jack.
 DEPTH_REWARD = 5.0
 # Reward per distance gained towards the jack's axis [1/mm]; on the rim, the depth does not indicate the direction.
 ALIGNMENT_REWARD = 5.0
@@ -290,8 +291,8 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
         # In a pose, Ry comes before Rx.
         pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
-        further = () if observation == "state" else (across, across)
-        observations.append(block_diag(np.eye(1), pose, wrench, *further))
+        contact_terms = () if observation == "state" else (across, across)  # center of pressure, and commanded x and y
+        observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms))
         actions.append(pose[np.ix_(outputs, outputs)])
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
     if any((np.abs(action).sum(0) != 1).any() for action in actions):
@@ -308,13 +309,15 @@ class DemonstratedInsertion(InsertionTask):
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
     and y. "image" is the wrist camera's image alone; "image_and_state" adds it to the state.
 
-    Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28), with costs of actions and forces, and a terminal
-    reward. "shaped" adds the depth gained, and "aligned" also the distance gained towards the fixture's axis. This
-    distance is privileged: the policy does not observe this simulation state. Depth gained and distance gained are
-    differences of potentials. The name of the workpiece must be "plug".
+    Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28): costs of actions and forces, and a terminal reward.
+    "shaped" adds the depth gained. "aligned" adds the depth gained and the distance gained towards the fixture's axis.
+    This distance is privileged: it is computed from simulation state that the policy does not observe. Depth gained and
+    distance gained are differences of potentials.
+
+    The name of the workpiece must be "plug".
 
     Attributes:
-        insertion_length: Length of the insertion, which scales the distance of the wrist camera [m].
+        insertion_length: Length of the insertion [m]; the distance of the wrist camera is proportional to it.
     """
 
     isotropic_groups = ((0, 1, 2), (3, 4, 5))
@@ -326,7 +329,7 @@ class DemonstratedInsertion(InsertionTask):
         """Return the bounds of every commanded pose."""
 
     def keep_out(self) -> KeepOut:
-        """Return no walls: safe residual RL is limited by the constraints alone."""
+        """Return no walls: in safe residual RL, only the constraints limit commands."""
         return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:

@@ -26,16 +26,16 @@ def reference_of_file(
 
     Args:
         path: File .npz or .csv with poses (N, 6) in the target frame.
-        components: Number of components of the Gaussian mixture; None: chosen by the Bayesian information criterion.
+        components: Number of components of the Gaussian mixture; None: selected by the Bayesian information criterion.
         floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
-        count: Number of demonstrations that are used, from the first on; None: all.
+        count: Number of demonstrations to use, from the first on; None: all.
         fit: Further arguments of `ReferenceTrajectory.from_demonstrations`; see `ReferenceOptions.fit_arguments`.
 
     Raises:
         InputError: If there is no such file, or its demonstrations are not poses.
     """
     if not path.is_file():
-        raise InputError(f"there is no file {path}: give one, such as guiderail teleoperate --record writes")
+        raise InputError(f"there is no file {path}: give a file that guiderail teleoperate --record has written")
     with path.open("rb") as file:
         key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, *sorted(fit.items())
     if key in _REFERENCES:
@@ -61,17 +61,19 @@ def control_steps(demonstrations: Demonstrations) -> int:
     return round(duration / CONTROL_PERIOD) + 1
 
 
-# Cache, because a fit takes seconds. Keys have a file's digest, not its path, because `create-task` moves files.
+# Cache of fits, each of which takes seconds. A key contains a file's digest, not its path: `create-task` moves files.
 _REFERENCES: dict[tuple[Any, ...], ReferenceTrajectory] = {}
 
 
 class HiddenOffsets(ABC):
     """Sampler of the actual offsets of fixture and workpiece at every reset.
 
-    An offset is (x, y) [m], of the fixture in the target frame or of the workpiece in the tool. A subclass may append
-    angles [rad]; see `part_poses`. A run begins at the first reset, and at every reset with the option `new_run`. The
-    option `held_out` samples the episode from a random stream that training never uses; the run's hidden offset stays
-    the same. The option `offset` (x, y) [m] replaces the sample.
+    An offset is (x, y) [m]: that of the fixture is in the target frame, that of the workpiece in the tool frame. A
+    subclass may append angles [rad]; see `part_poses`.
+
+    A run begins at the first reset, and at every reset with the option `new_run`. With the option `held_out`, the
+    episode is sampled from a random stream that training never uses, and the run's hidden offset does not change. The
+    option `offset` (x, y) [m] replaces the sample.
     """
 
     def __init__(self, kind: str = "per_run"):
@@ -81,7 +83,8 @@ class HiddenOffsets(ABC):
 
     def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the offsets of fixture and workpiece, (2,) or longer; `options` is an instance of `InsertionReset`."""
-        # Every reset takes equally many numbers from `rng`, used or not: what it samples depends only on its seed.
+        # Every reset takes equally many numbers from `rng`, used or not, so that the options of a reset do not change
+        # the samples of later resets.
         hidden = self._draw_run(rng)
         episode = episode_stream(rng, options.held_out)
         if self._run is None or options.new_run:

@@ -15,7 +15,8 @@ COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
 MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]
 
 # Scales of the observed center of pressure and of the observed command. The center of pressure, unlike the torque, does
-# not grow with the push. The command shows the effect of an action; the measured pose of a plug on a rim does not.
+# not increase with the contact force. The command is observed because the measured pose of a plug on a rim does not
+# indicate the effect of an action.
 CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 
 # Variance ρ of the history [m², rad²]; the thesis's 1e-8, (0.1 mm)², is too large for demonstrations that vary by 1 mm.
@@ -54,7 +55,7 @@ ForceRange = Annotated[
 
 
 class FixtureOffsetOptions(Options):
-    """Options of a task with a fixture that is offset from its nominal position."""
+    """Options of a task whose fixture is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offset of the fixture: sampled per run or per episode; none: within 0.3 mm per episode"
@@ -74,7 +75,7 @@ class FixtureOffsetOptions(Options):
 
 
 class ReferenceOptions(Options):
-    """Options of a task with a reference trajectory that is fitted to demonstrations."""
+    """Options of a task whose reference trajectory is fitted to demonstrations."""
 
     reference_model: Literal["gmr", "promp"] = Field(
         "gmr",
@@ -83,7 +84,7 @@ class ReferenceOptions(Options):
     )
 
     def fit_arguments(self) -> dict[str, Any]:
-        """Return arguments of `ReferenceTrajectory.from_demonstrations`, without options that have their default."""
+        """Return arguments of `ReferenceTrajectory.from_demonstrations`, for options that differ from their default."""
         arguments = {"reference_model": "model", "gap_scale": "gap_scale", "prior_std": "prior_std"}
         fields = type(self).model_fields
         given = {name: getattr(self, name) for name in arguments if name in fields}
@@ -97,14 +98,13 @@ class PriorOptions(ReferenceOptions):
         1.0,
         ge=0.01,
         le=100,
-        description="factor of the standard deviation, and so of exploration, where all demonstrations have a gap: "
-        "below 1 it narrows exploration there, above 1 it widens it",
+        description="factor of the standard deviation where all demonstrations have a gap; below 1, exploration there "
+        "is narrower, above 1 wider",
     )
-
     prior_std: PriorStd | None = Field(
         None,
-        description="standard deviation x y z Rz Ry Rx [m], [rad] around a single demonstration, whose square is added "
-        "to its fitted variance; or rows of a phase from 0 to 1 and these six; required for one demonstration",
+        description="standard deviation x y z Rz Ry Rx [m], [rad] around a single demonstration, for which it is "
+        "required; its square is added to the fitted variance; or rows of a phase from 0 to 1 and these six numbers",
         examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
     )
 
@@ -120,8 +120,8 @@ class ForceOptions(Options):
     )
     force_limit_range: ForceRange | None = Field(
         None,
-        description="sample the force limit of every episode between these two [N]; the policy observes it, except "
-        "with observation=image; default: force_limit",
+        description="range from which the force limit of every episode is sampled [N]; the policy observes the limit, "
+        "except with observation=image; default: force_limit",
     )
     bounded_force: bool = Field(
         True, description="limit the impedance so that its force stays below force_limit; if false: 40 N per axis"

@@ -35,11 +35,11 @@ def register_task(name: str) -> Callable[[TaskClass], TaskClass]:
     """Return a decorator that registers a task, and its environment with Gymnasium.
 
     Args:
-        name: Name of the task; it may have a namespace of its own, as in "lab/Peg".
+        name: Name of the task; it may have a namespace, as in "lab/Peg".
 
     Raises:
-        InputError: If the name is no word. When the decorator is applied, if another task has that name, a required
-            method is missing, or a declaration has the wrong type.
+        InputError: If the name is not a word. The decorator raises it if another task has this name, a required method
+            is missing, or a declaration has the wrong type.
     """
     TASKS.check_name(name)
 
@@ -71,7 +71,7 @@ def check_task_name(name: object) -> None:
 
 
 def _check(name: str, task: type[Task]) -> None:
-    """Raise an InputError if a task class lacks a method or declares something of the wrong type."""
+    """Raise an `InputError` if a task class lacks a method, or an attribute has the wrong type."""
     from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions, check_options_class
     from guiderail.diagrams.tasks.task import Task
 
@@ -114,14 +114,14 @@ def is_task_folder(name: str | Path) -> bool:
     """Return True if `name` is the path of a folder that `guiderail create-task` made."""
     try:
         return (Path(name) / "task.yaml").is_file()
-    except (OSError, TypeError):  # no path, or the file system refuses it, as a name that is too long
+    except (OSError, TypeError):  # not a path, or refused by the file system, for example because it is too long
         return False
 
 
 def register_task_folder(folder: str | Path) -> str:
-    """Register the task of a folder and return its name; calling it again reads the folder again.
+    """Register the task of a folder and return its name; each call reads the folder.
 
-    If a folder with the same content is registered already, that one is used.
+    If a task folder with the same name and content is already registered, it is used instead.
 
     Raises:
         InputError: If the folder's task is not valid, or another task has its name.
@@ -131,13 +131,15 @@ def register_task_folder(folder: str | Path) -> str:
 
     task = load_task_folder(Path(folder))
     registered = TASKS.get(task.file.name) if task.file.name in TASKS.names() else task
-    other = getattr(registered, "folder", task.folder)
-    if other != task.folder:
-        if is_task_folder(other) and task_folder_digest(other) == task_folder_digest(task.folder):
-            return register_task_folder(other)
+    registered_folder = getattr(registered, "folder", task.folder)
+    if registered_folder != task.folder:
+        if is_task_folder(registered_folder) and task_folder_digest(registered_folder) == task_folder_digest(
+            task.folder
+        ):
+            return register_task_folder(registered_folder)
         raise InputError(
-            f"the tasks in {task.folder} and {other} are both called {task.file.name}: change 'name:' in the task.yaml "
-            "of one of them"
+            f"the tasks in {task.folder} and {registered_folder} are both called {task.file.name}: change 'name:' in "
+            "the task.yaml of one of them"
         )
     register_task(task.file.name)(task)
     return task.name

@@ -70,7 +70,7 @@ class Threshold:
 
 
 def terminal_reward(rewards: Mapping[str, float], name: str = "terminal_reward") -> RewardTerm:
-    """Return the term `name`, the reward of an episode's end; `rewards` maps terminations to rewards, others earn 0."""
+    """Return the reward term `name` for the end of an episode; `rewards` maps terminations to rewards, by default 0."""
     return RewardTerm(name, {"termination": 1}, lambda termination: rewards.get(TERMINATIONS[int(termination[0])], 0.0))
 
 
@@ -97,27 +97,28 @@ class Task(ABC):
         rewards: Values of the option `reward`; the first is the default.
         observations: Values of the option `observation`; the first is the default.
         defaults: Default values of environment options by name, such as the guidance; they replace the usual defaults.
-        difficulties: Options by name for each value of the option `difficulty`, one of which is "standard". They
-            override `defaults`, and given options override them.
+        difficulties: Options by name for each value of the option `difficulty`; "standard" must be a value. These
+            options override `defaults`, and given options override both.
         learner: Default algorithm and preset of `guiderail train`.
         num_steps: Control steps of an episode; set in the class or in `__init__`.
         clip: Largest absolute value in an observation.
         collision: Signal and limit of the statistic `collisions`; default: any contact force. An evaluation omits the
-            statistic if the task declares no signal. An episode that a `TerminationTerm` ends as a collision is counted
-            only if the signal is above its limit too.
+            statistic if the task does not declare this attribute. An episode that a `TerminationTerm` ends as a
+            collision is counted only if the signal is also above its limit.
         statistics: Statistics of a table of episodes that only this task has; a study may name them.
-        isotropic_groups: Groups of outputs with the same unit, as indices; in residual RL, an action of 1
-            displaces each output of a group by the same amount. None: one group of all outputs.
+        isotropic_groups: Groups of outputs with the same unit, as indices. In residual RL, an action of 1 displaces all
+            outputs of a group by the same amount. None: one group of all outputs.
         pushable: True if `DiagramEnv.push` may displace the robot.
-        time_unit: Time of which every control period is a whole multiple [s]; default: that of the station.
+        time_unit: Time unit [s]; every control period is a whole multiple of it; default: that of the station.
         default_control_period: Control period without the option `control_period` [s]; default: that of the station.
         config: Configuration of the environment.
         options: The task's own options, an instance of `Options`.
         control_period: Control period [s].
         has_held_out_distribution: True if `reset` can sample from a held-out distribution, with `options.held_out`.
             Otherwise an evaluation repeats conditions of training, and its report states this.
-        episode_constants: Constants that `signals` adds to a diagram and a reset sets, by name. A later environment
-            with the same options reuses the diagram together with them, so no other attribute may hold systems.
+        episode_constants: Constants by name; `signals` adds them to a diagram, and a reset sets them. A later
+            environment with the same options reuses the diagram and these constants. No other attribute may therefore
+            refer to systems.
     """
 
     name: ClassVar[str] = ""
@@ -191,7 +192,7 @@ class Task(ABC):
         """Return the impedance of the station, with limits that the task needs; None: the station's own."""
         return None
 
-    # Prior knowledge. Guidance can be built from the methods that a task overrides here (see `provides`).
+    # Prior knowledge. A task provides the prior knowledge whose methods it overrides (see `provides`).
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of demonstrations, in steps of the control period."""
@@ -214,7 +215,7 @@ class Task(ABC):
         return None
 
     def motion_constraints(self) -> MotionConstraints | None:
-        """Return constraints of the commanded motion that are not linear, such as shapes to stay outside of.
+        """Return nonlinear constraints of the commanded motion, such as shapes to stay outside of.
 
         Guidance by a primitive enforces them. Their linear part is `constraints`.
         """
@@ -244,7 +245,7 @@ class Task(ABC):
 
     @abstractmethod
     def termination_terms(self) -> Sequence[TerminationTerm]:
-        """Return the terms that end an episode; the first true one is the reason."""
+        """Return the terms that end an episode; the reason is the first term that is true."""
 
     def symmetry(self) -> Symmetry | None:
         """Return rotations and reflections under which the task is invariant, for actions that displace outputs.
@@ -266,7 +267,7 @@ class Task(ABC):
         """Sample an episode's conditions, write them into the root context and return them by name for `info`.
 
         Rewards and terminations must read the conditions as signals, because an earlier environment with the same
-        options may have built their diagram. Attributes of the task may only hold what its next reset needs.
+        options may have built their diagram. Attributes of the task may contain only values for its next reset.
 
         Args:
             station: Station.
@@ -290,7 +291,7 @@ class Task(ABC):
 
         A scripted policy takes the observation, (n,), centered, scaled and clipped as `observation_terms` declares it,
         and returns an action, (A,), in [−1, 1]. `guiderail evaluate` runs the default one as a baseline, unless the
-        observation is an image. This is a class method or a static method.
+        observation is an image. An override must be a class method or a static method.
 
         Args:
             difficulty: Value of the option `difficulty`.

@@ -30,7 +30,7 @@ OFFSET_RANGES = {
     "none": (0.0, KNOWN_OFFSET),
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
-LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a faulty grasp
+LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a failed grasp
 
 
 class BncUncertainty(HiddenOffsets):
@@ -38,13 +38,13 @@ class BncUncertainty(HiddenOffsets):
 
     - "per_run": the jack is offset by 1.0 to 1.5 mm in a random direction, sampled once per run; the plug is within
       0.3 mm of its nominal position in the tool, sampled each episode. The thesis uses this setting.
-    - "per_episode": the jack is anywhere within 1.5 mm, sampled each episode.
-    - "none": the jack is within 0.3 mm, sampled each episode.
+    - "per_episode": the jack is within 1.5 mm of its nominal position, sampled each episode.
+    - "none": the jack is within 0.3 mm of its nominal position, sampled each episode.
 
-    With `grasp_angle` the plug is also tilted in the tool, sampled each episode; its offset is then [x, y, angle about
-    x, angle about y] in m and rad. With `jack_turn` the jack is also rotated about its axis; its offset is then
-    [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and the plug
-    neither tilted nor offset.
+    With `grasp_angle`, the plug is also tilted in the tool, sampled each episode; the plug's offset is then [x, y,
+    angle about x, angle about y] in m and rad. With `jack_turn`, the jack is also rotated about its axis; the jack's
+    offset is then [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and
+    the plug neither tilted nor offset.
     """
 
     def __init__(
@@ -57,8 +57,8 @@ class BncUncertainty(HiddenOffsets):
     ):
         """Construct the sampler.
 
-        `grasp_angle` and `jack_turn` are the largest tilt of the plug and turn of the jack [degrees]. `offset_range`
-        is the smallest and largest offset of the jack [m]; by default that of the kind.
+        `grasp_angle` is the largest tilt of the plug [degrees], and `jack_turn` the largest turn of the jack [degrees].
+        `offset_range` is the smallest and largest offset of the jack [m]; default: that of the kind.
         """
         super().__init__(kind)
         self.grasp_angle = grasp_angle * DEGREE
@@ -66,25 +66,25 @@ class BncUncertainty(HiddenOffsets):
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
 
     def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
-        # Every kind samples this offset, so that the random streams of all kinds agree.
-        return self._turned(in_ring(rng, *self.offset_range), rng)
+        # Every kind samples this offset, so that all kinds take the same random numbers.
+        return self._append_turn(in_ring(rng, *self.offset_range), rng)
 
     def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self.kind == "per_run":
             jack, plug = run, in_ring(rng, 0.0, GRASP_RADIUS)
         else:
             jack, plug = in_ring(rng, *self.offset_range), np.zeros(2)
-        plug = self._tilted(plug, in_ring(rng, 0.0, self.grasp_angle))
-        return (jack if self.kind == "per_run" else self._turned(jack, rng)), plug
+        plug = self._append_tilt(plug, in_ring(rng, 0.0, self.grasp_angle))
+        return (jack if self.kind == "per_run" else self._append_turn(jack, rng)), plug
 
     def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         jack = np.append(offset, 0.0) if self.jack_turn > 0.0 else offset
-        return jack, self._tilted(np.zeros(2), np.zeros(2))
+        return jack, self._append_tilt(np.zeros(2), np.zeros(2))
 
-    def _turned(self, jack: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def _append_turn(self, jack: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return np.append(jack, rng.uniform(-self.jack_turn, self.jack_turn)) if self.jack_turn > 0.0 else jack
 
-    def _tilted(self, plug: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    def _append_tilt(self, plug: np.ndarray, angles: np.ndarray) -> np.ndarray:
         return np.concatenate([plug, angles]) if self.grasp_angle > 0.0 else plug
 
 
@@ -136,7 +136,7 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         1.0,
         ge=0.5,
         le=10,
-        description="factor of the demonstrations' duration; 5 with control_period=0.1 keeps their 400 steps",
+        description="factor of the demonstrations' duration; 5 with control_period=0.1 preserves their 400 steps",
     )
 
     @field_validator("demonstrations")
@@ -163,8 +163,8 @@ HARD: dict[str, Any] = {
 """Options of difficulty="hard": the jack's offset is sampled in every episode and is larger than the chamfer can
 correct. Without `bounded_force`, pressing on the rim exceeds the force limit.
 
-The search is short, and the jack's offset is close to the largest displacement by an action. Random actions mostly
-displace the plug less and miss the jack; a policy that observes on which side of the rim the contact is can reach it.
-The demonstrations' covariance in x and y, and so the effect of an action, is constant during the search; otherwise a
-constant action would sweep the plug across the rim.
+The search is short, and the jack's offset is close to the largest displacement by an action. Most random actions
+displace the plug less and miss the jack. A policy can reach the jack if it observes the side of the rim on which the
+contact is. The demonstrations' covariance in x and y, and so the displacement per action, is constant during the
+search; otherwise a constant action would sweep the plug across the rim.
 """

@@ -55,8 +55,8 @@ if TYPE_CHECKING:
     from guiderail.diagrams.envs.config import EnvConfig
 
 
-# The task board has no collision geometry, because the locked plug's mouth reaches slightly below the jack's bottom.
-# Size of the board, and its distance below the jack [m].
+# Size of the task board [m], its distance below the jack [m], and its color. The board has no collision geometry,
+# because the locked plug's mouth reaches slightly below the jack's bottom.
 BOARD, BOARD_CLEARANCE, BOARD_COLOR = (0.16, 0.20, 0.012), 0.001, [0.90, 0.89, 0.86, 1.0]
 LOCKED_HEIGHT = 0.6e-3  # [m] largest deviation of a locked plug along the jack's axis
 LOCKED_ANGLE = np.deg2rad(4.0)  # [rad] largest deviation of a locked plug about the jack's axis
@@ -73,7 +73,7 @@ class BncWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "jack"
     workpiece: ClassVar[str] = "plug"
-    # Surfaces that cannot touch in a connector of these dimensions, or whose contact another pair carries.
+    # Pairs of surfaces that cannot touch in a connector of these dimensions, or whose contact another pair models.
     filtered_pairs = (
         (("lug_0", "lug_1", "pad"), ("bore",)),
         (("barrel", "pad"), ("slots",)),
@@ -141,7 +141,7 @@ class BncWorkcell(MovableWorkcell):
         return bool(abs(X_LockedPlug.translation()[2]) < LOCKED_HEIGHT and abs(yaw) < LOCKED_ANGLE)
 
 
-# The scale of torques is small, because 0.02 Nm at 4 N indicate on which side of the rim the plug stands.
+# The scale of torques is small, because 0.02 Nm at 4 N indicate the side of the rim on which the plug stands.
 POSE_CENTER = np.array([0.0, 0.0, 5.0 * MM, 45.0 * DEGREE, 0.0, 0.0])
 POSE_SCALE = np.array([2.0 * MM, 2.0 * MM, 8.0 * MM, 45.0 * DEGREE, 1.5 * DEGREE, 1.5 * DEGREE])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.02, 0.02, 0.2])
@@ -158,7 +158,7 @@ def reference_trajectory(demonstrations: str, count: int | None = None, **fit: A
 
     Args:
         demonstrations: Name in `DEMONSTRATIONS`, or path of a file .npz or .csv.
-        count: Number of demonstrations that are used, from the first on; None: all.
+        count: Number of demonstrations to use, from the first on; None: all.
         fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
     """
     if demonstrations not in DEMONSTRATIONS:
@@ -189,9 +189,9 @@ MAY_PRESS = SEARCH[0] - 0.2  # earliest time at which the plug may stand on the 
 
 
 def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) in x and y along (−τ_y, τ_x), with the contact torque τ, while the plug is on the rim.
+    """Return an action (2,) in x and y along (−τ_y, τ_x), for the contact torque τ, while the plug is on the rim.
 
-    On the rim this direction points towards the jack's axis. Elsewhere the action is zero.
+    On the rim, this direction points towards the jack's axis. If the plug is not on the rim, the action is zero.
     """
     step = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS
     is_on_rim = observation[Z] > SCALED_RIM and observation[FORCE_Z] > CONTACT_FORCE
@@ -201,10 +201,10 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
-    """Return an action (2,) that moves the command at most `STEP` towards the center of pressure, and so to the jack.
+    """Return an action (2,) that moves the command by at most `STEP` towards the center of pressure, and so the jack.
 
-    Once the plug has dropped into the jack, the command is constant until the search ends. Outside the time of the
-    search the action is zero. The last command is read from the observation, so that the policy has no state.
+    Once the plug has dropped into the jack, the command is constant until the search ends. Before and after the search,
+    the action is zero. The last command is read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
@@ -254,17 +254,18 @@ class BncConnector(DemonstratedInsertion):
         dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
         dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer, slot_clearance=o.slot_clearance)
         self._workcell = BncWorkcell(dimensions, friction=o.friction, margin=o.contact_margin, equal_area=o.equal_area)
-        # The duration of the shipped demonstrations is known, so they are not fitted here, which would take seconds.
-        is_shipped, period = o.demonstrations in DEMONSTRATIONS, self.control_period
-        duration = NUM_STEPS * CONTROL_PERIOD * o.time_scale
-        self.num_steps = round(duration / period) if is_shipped else self.reference().num_steps
+        if o.demonstrations in DEMONSTRATIONS:
+            # The duration of the shipped demonstrations is known without a fit, which would take seconds.
+            self.num_steps = round(NUM_STEPS * CONTROL_PERIOD * o.time_scale / self.control_period)
+        else:
+            self.num_steps = self.reference().num_steps
 
     def workcell(self) -> BncWorkcell:
         """Return the jack in the world and the plug in the tool."""
         return self._workcell
 
     def reference(self) -> ReferenceTrajectory:
-        """Return the reference trajectory of the chosen demonstrations."""
+        """Return the reference trajectory of the demonstrations in the options."""
         o = self.options
         return self.on_clock(
             reference_trajectory(o.demonstrations, o.num_demonstrations, **o.fit_arguments()), o.time_scale
@@ -276,7 +277,7 @@ class BncConnector(DemonstratedInsertion):
         return LinearConstraints.box(-bound, bound)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return D and y0 that estimate height and turn; no lateral offset is estimated, so a pull confirms a lock."""
+        """Return D and y0 that estimate height and turn; a pull confirms the lock instead of the lateral offset."""
         size = self._workcell.dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0
@@ -284,11 +285,11 @@ class BncConnector(DemonstratedInsertion):
         return D, y0
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
-        """Return time, pose and wrench, and the center of pressure and force limit if observed; or the wrist camera."""
+        """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
         return self.scaled_terms(POSE_CENTER, POSE_SCALE, WRENCH_SCALE)
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return success when locked, and collision above the force limit."""
+        """Return success of a locked plug, and collision above the force limit."""
         return [
             TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=self.steps_of(LOCKED_STEPS)),
             self.force_limit(),
@@ -315,7 +316,7 @@ class BncConnector(DemonstratedInsertion):
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
         default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
-        return {one.__name__: one for one in (default, scripted_torque_search, scripted_center_of_pressure)}
+        return {policy.__name__: policy for policy in (default, scripted_torque_search, scripted_center_of_pressure)}
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the jack."""

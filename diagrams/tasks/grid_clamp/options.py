@@ -12,8 +12,8 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION
 
-# Force of a collision [N]. An unbounded impedance of 1500 N/m does not reach it: the template's cuboid is 8 mm wide and
-# ends 6 mm below the target, which is 18 mm below a clamp on the table.
+# Contact force above which an episode ends [N]. An unbounded impedance of 1500 N/m does not reach this force: the
+# template's cuboid is 8 mm wide, and ends 6 mm below the target and 18 mm below a clamp on the table.
 COLLISION_FORCE = 35.0
 START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
@@ -49,9 +49,9 @@ class GridClampOptions(ForceOptions):
 
 
 HARD: dict[str, Any] = {"force_limit": 10.0, "seconds": 6.0}
-"""Options of difficulty="hard": little time, and a force limit of 10 N; snapping in takes 6 N.
+"""Options of difficulty="hard": a short time limit, and a force limit of 10 N; snapping in needs 6 N.
 
-The impedance's force is bounded below the limit, so that an untrained policy fails by running out of time and not by a
+The impedance's force is bounded below the limit, so that an untrained policy fails by the time limit and not by a
 collision. On the gantry with exact sensors, random actions succeed in half of the episodes, and the scripted search in
 98 % (docs/results/grid_clamp.md).
 """

@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
 
-A clamp next to its holes is pressed with 27 N and pushed sideways with 2 N, a third of the friction limit. It drifts at
-0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. Over an episode of 10 s this drift decides
-whether the clamp slides into the holes or stands still.
+Example: a clamp next to its holes is pressed down with 27 N and sideways with 2 N, a third of the friction limit. It
+drifts at 0.18 mm/s with Drake's default of 1e-3, and at 0.004 mm/s with this value. During an episode of 10 s, the
+drift determines whether the clamp slides into the holes or stands still.
 """
 SEATED_HEIGHT = 0.5e-3  # [m] largest deviation of a seated clamp along z
 SEATED_OFFSET = 1.0e-3  # [m] largest lateral offset of a seated clamp
@@ -53,7 +53,7 @@ class GridClampWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "table"
     workpiece: ClassVar[str] = "clamp"
-    # All pairs of surfaces except each peg with its own hole, bead with lip, and pad with slab.
+    # All pairs of surfaces except each peg and its own hole, bead and lip, and pad and slab.
     filtered_pairs = (
         *(((hole,), tuple(peg for peg in PEGS if peg[-1] != hole[-1])) for hole in HOLES),
         (HOLES, ("bead", "pad")),
@@ -92,7 +92,7 @@ class GridClampWorkcell(MovableWorkcell):
         return clamp_surfaces(self.dimensions, self.friction)
 
     def is_seated(self, clamp: np.ndarray) -> bool:
-        """Return True if a clamp with X_GClamp, as position and rotation vector (6,), has snapped in."""
+        """Return True if a clamp has snapped in, given X_GClamp as position and rotation vector (6,)."""
         return bool(
             abs(clamp[2] - self.X_FT.translation()[2]) < SEATED_HEIGHT and np.hypot(clamp[0], clamp[1]) < SEATED_OFFSET
         )
@@ -101,7 +101,7 @@ class GridClampWorkcell(MovableWorkcell):
 SUCCESS_REWARD = 50.0
 SHAPING, FORCE_WEIGHT = 300.0, 1.0 / 12.0  # reward per distance descended [1/m], cost per squared force [1/N²]
 ALIGNMENT = 3000.0  # reward per distance gained towards the holes' axis [1/m]; steps are fractions of a millimeter
-COLLISION_REWARD = -25.0  # terminal reward; an early collision costs more than a long episode of gentle pressing
+COLLISION_REWARD = -25.0  # terminal reward; an early collision costs more than an episode of gentle pressing
 
 
 def _force_cost(wrench: np.ndarray) -> float:
@@ -118,19 +118,19 @@ def _alignment_gained(clamp: np.ndarray, last_clamp: np.ndarray) -> float:
 
 NUM_PLACES = 6  # pick-up places of clamps
 # Parallel jaws center the clamp across the jaws (y), and not along them (x).
-ALONG_JAWS = 1.0 * MM  # largest grasp offset of a place along the jaws
-ACROSS_JAWS = 0.2 * MM  # largest grasp offset of a place across the jaws
-CALIBRATION = (1.8 * MM, 2.2 * MM)  # smallest and largest offset of the table
-REPEATABILITY = 0.1 * MM  # largest change of the offset from one pick-up at a place to the next
-KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with fixture_offset "none"
+ALONG_JAWS = 1.0 * MM  # largest grasp offset of a place along the jaws [m]
+ACROSS_JAWS = 0.2 * MM  # largest grasp offset of a place across the jaws [m]
+CALIBRATION = (1.8 * MM, 2.2 * MM)  # smallest and largest offset of the table [m]
+REPEATABILITY = 0.1 * MM  # largest deviation of a pick-up from the grasp offset of its place [m]
+KNOWN_RADIUS = 0.15 * MM  # largest offset of the clamp with fixture_offset "none" [m]
 
 
 class GridClampUncertainty(HiddenOffsets):
     """Sampler of the offsets of table and clamp; see `HiddenOffsets` for the options of a reset.
 
-    - "per_run": the table is off by 1.8 to 2.2 mm in one direction, and each of six pick-up places has a grasp offset,
-      all hidden and the same for a whole run. In an episode the clamp is picked up at one sampled place, with a
-      repeatability of 0.1 mm. The thesis uses this setting.
+    - "per_run": the table is offset by 1.8 to 2.2 mm in a random direction, and each of six pick-up places has a grasp
+      offset. All these offsets are hidden and constant during a run. In each episode, the clamp is picked up at a
+      sampled place, with a repeatability of 0.1 mm. The thesis uses this setting.
     - "per_episode": the offsets of the table and of the six places are sampled each episode.
     - "none": the clamp is within 0.15 mm of its nominal position in the tool.
 
@@ -162,28 +162,27 @@ SEATED_STEPS = 3  # consecutive steps with a seated clamp that count as success,
 # snapping in needs.
 MAX_TRACKING_ERROR = 8.0 * MM
 
-START_OFFSET = 0.2 * MM  # largest offset of the start along x and y
-
+START_OFFSET = 0.2 * MM  # largest offset of the start along x and y [m]
 
 # Center and scale of the observation [position [m], force [N]].
 CENTER = np.array([0.0, 0.0, 12.0 * MM, 0.0, 0.0, 0.0])
 SCALE = np.array([2.0 * MM, 2.0 * MM, 10.0 * MM, 2.0, 2.0, 5.0])
 
 ON_TABLE = GridClampDimensions().peg_length  # height of the clamp while the pegs stand on the table [m]
-NEAR = 1.5 * MM  # height above the table below which the clamp descends slowly and searches
-IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole
-LANES = np.array([-1.1, 0.0, 1.1]) * MM  # y of the search lanes, so close that the pegs drop in from at least one
-LANE_ENDS = 3.7 * MM  # |x| of the ends of a lane, beyond the largest offset
-PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane; a clamp beyond the last lane starts again
+NEAR = 1.5 * MM  # height above the table below which the clamp descends slowly and searches [m]
+IN_HOLE = 0.5 * MM  # depth below the table at which a peg is in its hole [m]
+LANES = np.array([-1.1, 0.0, 1.1]) * MM  # y of the search lanes [m]; the pegs drop in from at least one lane
+LANE_ENDS = 3.7 * MM  # |x| of the ends of a lane [m], larger than the largest offset
+PAST_LANES = 0.3 * MM  # overshoot along y from lane to lane [m]; a clamp beyond the last lane starts again
 PRESS, SEARCH_SPEED = 4.0, 8.0 * MM  # force [N] and speed [m/s] of the search
 SNAP_FORCE = 12.0  # largest force while the clamp snaps in [N]
 GENTLE_SNAP_FORCE = 8.5  # largest force while the clamp snaps in, for a force limit of 10 N [N]
 # Vertical speed per force error and lateral speed per force [m/s/N], and speed per distance from a lane [1/s].
 HEIGHT_GAIN, YIELD_GAIN, LANE_GAIN = 1.2 * MM, 2.0 * MM, 4.0
 TEMPLATE = load_template("grid_clamp")  # template of the thesis, section 3.4.2
-SPEED = TEMPLATE.parameters["speed_m_per_s"]  # speed at an input of 1
+SPEED = TEMPLATE.parameters["speed_m_per_s"]  # speed at an input of 1 [m/s]
 LIFT = TEMPLATE.parameters["lift"]  # fraction of `SPEED` at an upward input of 1
-STIFFNESS = Impedance().stiffness[0]
+STIFFNESS = Impedance().stiffness[0]  # translational stiffness [N/m]
 
 
 def scripted_search(observation: np.ndarray, snap_force: float = SNAP_FORCE) -> np.ndarray:
@@ -225,7 +224,7 @@ def scripted_gentle_search(observation: np.ndarray) -> np.ndarray:
 
 
 def straight_descent(observation: np.ndarray) -> np.ndarray:
-    """Return the inputs (3,) with the largest downward one."""
+    """Return the inputs (3,) of the fastest straight descent."""
     return np.array([0.0, 0.0, -1.0])
 
 
@@ -233,10 +232,11 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 class GridClamp(InsertionTask):
     """Insert the clamp.
 
-    Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" omits its cost of force, and "sparse" omits its
-    reward for descending. "aligned" adds to "shaped" a cost of collisions and the distance gained towards the holes'
-    axis, a privileged value that the policy does not observe.
-    Without `active_constraints`, only the impedance limits the forces of a policy.
+    Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" omits the cost of force from it, and "sparse" the
+    reward for descending. "aligned" adds a cost of collisions and the distance gained towards the holes' axis to it;
+    this distance is privileged: the policy does not observe it.
+
+    Without `active_constraints`, only the impedance limits the forces.
     """
 
     Options = GridClampOptions
@@ -274,7 +274,7 @@ class GridClamp(InsertionTask):
         return ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return D (6, 6) and y0 (6,), which estimate the height; a pull checks the unmeasured lateral offset."""
+        """Return D (6, 6) and y0 (6,) of an estimate of the height; a pull checks the lateral offset instead."""
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = 1.0
         y0[2] = self._workcell.X_FT.translation()[2]
@@ -282,10 +282,9 @@ class GridClamp(InsertionTask):
 
     def observation_terms(self) -> Sequence[ObservationTerm]:
         """Return the terms of the tool's position (3,) in the target frame, the force (3,) and a sampled limit."""
-        first_three = (0, 1, 2)
         return (
-            ObservationTerm("pose", CENTER[:3], SCALE[:3], first_three),
-            ObservationTerm("wrench", 0.0, SCALE[3:], first_three),
+            ObservationTerm("pose", CENTER[:3], SCALE[:3], (0, 1, 2)),
+            ObservationTerm("wrench", 0.0, SCALE[3:], (0, 1, 2)),
             *self.force_limit_terms(),
         )
 
@@ -318,7 +317,7 @@ class GridClamp(InsertionTask):
         return [seated, self.force_limit()]
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
-        """Return a sampled pose (6,) [m, rad] at which the preceding skill ends and an episode starts."""
+        """Return a sampled start pose (6,) [m, rad], at which the preceding skill ends."""
         start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
@@ -327,7 +326,8 @@ class GridClamp(InsertionTask):
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
         default = scripted_gentle_search if difficulty == "hard" else scripted_search
-        return {one.__name__: one for one in (default, scripted_search, scripted_gentle_search, straight_descent)}
+        policies = (default, scripted_search, scripted_gentle_search, straight_descent)
+        return {policy.__name__: policy for policy in policies}
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the holes."""

@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.options import ReferenceOptions
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
-SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, on the mean demonstration half way from the gap to the goal
+SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, on the mean demonstration, midway between the gap and the goal
 HARD: Mapping[str, Any] = {
     "gap_width": 0.03,
     "obstacle_radius": 0.08,
@@ -45,8 +45,8 @@ class NarrowPassageOptions(ReferenceOptions):
     )
     obstacles_constrain: bool = Field(
         False,
-        description="keep every command of a primitive outside of the one fixed obstacle; not with second_obstacle, "
-        "obstacle_beside or obstacles_end",
+        description="keep every command of a primitive outside of the fixed obstacle; not supported with "
+        "second_obstacle, obstacle_beside or obstacles_end",
     )
     obstacles_end: bool = Field(False, description="end the episode as a collision when an obstacle is touched")
     start_deviation: Number = Field(
@@ -58,16 +58,16 @@ class NarrowPassageOptions(ReferenceOptions):
 
     @property
     def has_sampled_obstacles(self) -> bool:
-        """True if a reset sets the obstacles; otherwise there is one fixed obstacle, which ends no episode."""
+        """True if a reset sets the obstacles; otherwise there is one fixed obstacle, which does not end the episode."""
         return self.obstacle_beside > 0 or self.obstacles_end or self.second_obstacle
 
     def workcell(self) -> PassageGeometry:
         """Return the nominal geometry with these options."""
         middle = 0.5 * (DEFAULT_GEOMETRY.gap_x[0] + DEFAULT_GEOMETRY.gap_x[1])
-        default = self.gap_width == type(self).model_fields["gap_width"].default
+        is_default = self.gap_width == type(self).model_fields["gap_width"].default
         half = 0.5 * self.gap_width
         return PassageGeometry(
-            gap_x=DEFAULT_GEOMETRY.gap_x if default else (middle - half, middle + half),
+            gap_x=DEFAULT_GEOMETRY.gap_x if is_default else (middle - half, middle + half),
             obstacle_radius=self.obstacle_radius,
             second_obstacle=SECOND_OBSTACLE if self.second_obstacle else None,
             obstacles_move=self.has_sampled_obstacles,

@@ -54,15 +54,14 @@ class NarrowPassageReset(ResetOptions):
 SUCCESS_REWARD = 200.0
 PROGRESS = 100.0  # shaped reward for progress [1/m]
 
-
 BLOCKED_STEPS = 20  # control steps at a wall without progress after which the robot is blocked
 BLOCKED_PROGRESS = 1e-4  # [m] smallest increase of y that counts as progress
-
 
 # Phases, from −1 to 1, in which the demonstrations pass the first and the second obstacle.
 PASSING = ((-0.8, -0.25), (0.1, 0.7))
 SLALOM_ACTION = 1.0
-# Indices into the observation [phase, x and y of the first obstacle, x and y of the second]; x is the side, −1 or 1.
+# Indices into the observation [phase, x and y of the first obstacle, x and y of the second obstacle]. The observed x is
+# −1 or 1, the side of the obstacle.
 PHASE, SIDES = 0, (1, 3)
 
 
@@ -94,7 +93,7 @@ def reference_trajectory(model: Literal["gmr", "promp"] = "gmr") -> ReferenceTra
 class NarrowPassage(Task):
     """Pass the gap to the goal.
 
-    Rewards: "sparse" is the thesis's (4.22 to 4.25), "shaped" adds the distance gained towards the goal in centimeters.
+    Rewards: "sparse" is the thesis's reward (4.22 to 4.25). "shaped" adds the distance gained towards the goal [cm].
     Observations: "state" is the time in [−1, 1] (the thesis's policy state), followed by the obstacles' positions if
     `obstacle_beside` is positive; "image" is 110 × 144 × 3.
     """
@@ -122,7 +121,7 @@ class NarrowPassage(Task):
         super().__init__(config)
         if self.options.obstacles_constrain and self.options.has_sampled_obstacles:
             raise InputError(
-                "obstacles_constrain needs the one fixed obstacle: leave out second_obstacle, obstacle_beside and "
+                "obstacles_constrain needs a single fixed obstacle: leave out second_obstacle, obstacle_beside and "
                 "obstacles_end"
             )
         self._geometry = self.options.workcell()
@@ -170,7 +169,7 @@ class NarrowPassage(Task):
         return Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5]))
 
     def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return costs of motion and obstacles, the terminal reward, and progress with the shaped reward."""
+        """Return costs of motion and obstacles and the terminal reward; "shaped" adds the reward for progress."""
         geometry, poses = self._geometry, {"pose": 2, "last_pose": 2}
 
         def costs(pose: np.ndarray, obstacles: np.ndarray) -> float:
@@ -190,16 +189,16 @@ class NarrowPassage(Task):
         return [*terms, RewardTerm("progress", poses, progress)] if self.config.reward == "shaped" else terms
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return success at the goal, blocked at a wall without progress, and collision if obstacles end the episode.
+        """Return success at the goal, "blocked" at a wall without progress, and collision if obstacles end episodes.
 
-        A collision means that the robot's center is inside an obstacle; this term takes precedence.
+        In a collision, the robot's center is inside an obstacle; this term takes precedence.
         """
         geometry = self._geometry
 
-        def blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
+        def is_blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
             return (contact_force[0] > 0 or fallback[0] > 0) and geometry.in_passage(pose)
 
-        def touched(pose: np.ndarray, obstacles: np.ndarray) -> bool:
+        def is_touching(pose: np.ndarray, obstacles: np.ndarray) -> bool:
             return any(geometry.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
 
         terms = [
@@ -207,22 +206,22 @@ class NarrowPassage(Task):
             TerminationTerm(
                 "blocked",
                 {"pose": 2, "contact_force": 1, "fallback": 1},
-                blocked,
+                is_blocked,
                 steps=BLOCKED_STEPS,
                 progress=lambda pose, contact_force, fallback: pose[1],
                 min_progress=BLOCKED_PROGRESS,
             ),
         ]
-        collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, touched)
+        collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, is_touching)
         return [collision, *terms] if self.options.obstacles_end else terms
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
     ) -> dict[str, Any]:
-        """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles at sampled sides.
+        """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles on sampled sides.
 
         Raises:
-            InputError: If a coordinate of the start is larger than `MAX_START`.
+            InputError: If the absolute value of a coordinate of the start is larger than `MAX_START`.
         """
         start, obstacles = reference_trajectory().means[0].copy(), self._geometry.obstacles
         deviation = self._start_deviation(options.held_out)

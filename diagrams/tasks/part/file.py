@@ -1,4 +1,4 @@
-"""File `task.yaml` of a task folder: all numbers of a task with two parts, which users can read and edit."""
+"""File `task.yaml` of a task folder: all parameters of a task with two parts, which users can read and edit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ HARD: dict[str, Any] = {
     "observation": "center_of_pressure",
     "action_repeat": 5,
 }
-"""Options of difficulty="hard" if task.yaml has none; few lead-in chamfers are as wide as the socket's offset."""
+"""Options of difficulty="hard" if task.yaml has none; the socket's offset exceeds most lead-in chamfers."""
 
 AUTOMATE: dict[str, Any] = {
     "fixture_offset": "per_episode",
@@ -52,8 +52,8 @@ AUTOMATE: dict[str, Any] = {
 """Options of difficulty="automate": AutoMate's uncertainty, ±2 mm along x and y and ±5° about the axis."""
 _LARGEST = float(np.finfo(float).max)
 MAX_CLEARANCE = 500.0  # largest measured clearance [mm], the largest size of a part
-# Largest bound of a command [m], [rad]: larger ones are probably in millimeters or degrees. A command may approach from
-# the side, start at the largest `travel`, and turn by 180° and a `search_turn`.
+# Largest bound of a command [m], [rad]: larger bounds are probably in millimeters or degrees. A command may approach
+# from the side, start at the largest `travel`, and turn by 180° plus a `search_turn`.
 MAX_BOUND = np.array([0.1, 0.1, 0.6, 4.0, 1.0, 1.0])
 
 
@@ -68,8 +68,8 @@ class Piece(Options):
         None, gt=0, description="hydroelastic modulus of a compliant mesh [Pa]; default: rigid"
     )
     friction: Number = Field(0.2, ge=0, le=2, description="friction coefficient of the surface, static and dynamic")
-    # With 100 s/m no part leaves a contact faster than 10 mm/s. Otherwise a contact that is a micrometer too deep after
-    # a step would eject the plug.
+    # With 100 s/m, no part leaves a contact faster than 10 mm/s. With less dissipation, a contact that is a micrometer
+    # too deep after a step would eject the plug.
     dissipation: Number = Field(100.0, ge=0, description="Hunt-Crossley dissipation [s/m]")
 
 
@@ -191,12 +191,12 @@ class Bounds(Options):
         return _filled(self.lower, -np.inf), _filled(self.upper, np.inf)
 
     def nearest(self, pose: np.ndarray, phase: int) -> np.ndarray:
-        """Return the pose (6,) within the bounds of a phase, 0 or -1 for the last, that is nearest to a pose (6,)."""
+        """Return the pose (6,) nearest to `pose` (6,) within the bounds of the phase with the index `phase`."""
         lower, upper = (np.atleast_2d(rows)[phase] for rows in self.arrays())
         return np.clip(pose, lower, upper)
 
     def constraints(self, num_steps: int) -> LinearConstraints:
-        """Return the bounds as G y ≥ c: constant, or those of the phase of each of `num_steps` steps."""
+        """Return the bounds as G y ≥ c: constant, or for each of `num_steps` steps the bounds of its phase."""
         lower, upper = self.arrays()
         if self.phases is None:
             return LinearConstraints.box(lower, upper)
@@ -209,7 +209,7 @@ def _is_row(row: Any) -> bool:
     return (
         isinstance(row, list | tuple)
         and len(row) == POSE_SIZE
-        and all(one is None or (type(one) in (int, float) and abs(one) <= _LARGEST) for one in row)
+        and all(entry is None or (type(entry) in (int, float) and abs(entry) <= _LARGEST) for entry in row)
     )
 
 
@@ -232,7 +232,7 @@ class DemonstrationFile(PriorOptions):
         REPEATABILITY_STD,
         min_length=6,
         max_length=6,
-        description="standard deviation of a hand's repeatability, added to the covariance as its square [m], [rad]",
+        description="standard deviation of a hand's repeatability [m], [rad]; its square is added to the covariance",
     )
 
     def reference(self, folder: Path) -> ReferenceTrajectory:
@@ -383,7 +383,7 @@ class PartTaskFile(Options):
 
 
 def is_plain_path(name: str) -> bool:
-    """Return True if a task file may name this path of a file in its folder."""
+    """Return True if `name` is a path that a task file may use for a file in its folder."""
     return bool(_FILE_NAME.fullmatch(name)) and ".." not in name.split("/")
 
 
@@ -415,9 +415,7 @@ def read_task_file(folder: Path) -> PartTaskFile:
 
 
 def task_folder_digest(folder: Path) -> str:
-    """Return a digest of `task.yaml` and of all files that it names.
-
-    Of the measurements in `task.yaml`, only the clearance is part of the digest.
+    """Return a digest of `task.yaml`, with the clearance as the only measurement, and of all files that it names.
 
     Raises:
         InputError: As `read_task_file`.
@@ -445,7 +443,7 @@ def write_task_file(folder: Path, file: PartTaskFile) -> Path:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _plain(entry) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_plain(entry) for entry in value]
     return float(f"{value:.9g}") if isinstance(value, float) else value

@@ -1,4 +1,4 @@
-"""Insertion task of two meshes, with all of its numbers declared in `task.yaml`."""
+"""Insertion task of two meshes, with all parameters declared in `task.yaml`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ PLUG, SOCKET = "plug", "socket"
 
 @dataclass(frozen=True)
 class PartWorkcell(MovableWorkcell):
-    """Socket in the world and plug in the tool; both meshes have the coordinates of the assembled parts, in T."""
+    """Socket in the world and plug in the tool; the coordinates of both meshes are those of the assembly, in T."""
 
     fixture: ClassVar[str] = SOCKET
     workpiece: ClassVar[str] = PLUG
@@ -133,8 +133,8 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
 IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
-MIN_PUSH = 1.5 * MM  # smallest displacement of the command of a seated plug by a push, in addition to the play [m]
-FOLLOWING = 3.0  # rate of change of the action per distance of 2 mm between the command and a plug in the socket [1/s]
+MIN_PUSH = 1.5 * MM  # smallest displacement of the command by a push on a seated plug, in addition to the play [m]
+FOLLOWING = 3.0  # rate of change of the action per 2 mm of distance between the command and a plug in the socket [1/s]
 # Largest distance from the demonstrations' start to the bounds, inside which an episode starts [m], [rad].
 MAX_START_SHIFT = np.array([*[1.0 * MM] * 3, *[2.0 * DEGREE] * 3])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
@@ -146,7 +146,7 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
     offset_shape: Literal["ring", "square"] = Field(
         "ring",
         description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
-        "and |y| are at most the greater of these radii, which needs fixture_offset=per_episode",
+        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
     )
     fixture_turn: Number = Field(
         0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
@@ -155,16 +155,15 @@ class PartOptions(FixtureOffsetOptions, ForceOptions):
         None,
         ge=0.5 * MM,
         le=6.0 * MM,
-        description="bound of a command's |x| and |y| [m]; it replaces those of task.yaml, which must be constant",
+        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
     )
-
     start_offset_max: Number = Field(
         0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
     )
 
 
 class PartUncertainty(BncUncertainty):
-    """Sampler of the socket's offset: as for BncConnector, or uniform in a square in each episode."""
+    """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square."""
 
     def __init__(self, options: PartOptions):
         super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
@@ -174,19 +173,19 @@ class PartUncertainty(BncUncertainty):
         if not self.is_square:
             return super()._draw_episode(rng, run)
         side = self.offset_range[1]
-        return self._turned(rng.uniform(-side, side, 2), rng), np.zeros(2)
+        return self._append_turn(rng.uniform(-side, side, 2), rng), np.zeros(2)
 
 
 class ScriptedSearch:
     """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
 
-    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows its sideways position,
-    so that the plug is not pushed against a wall. If the task has a `search_turn`, a third action turns a blocked plug
-    back and forth.
+    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows the plug's lateral
+    position, so that the plug is not pushed against a wall. If the task has a `search_turn`, a third entry of the
+    action turns a blocked plug back and forth.
 
-    An observed time that does not increase starts a new episode with a zero action. The search integrates the
-    action and not the displacement, because the displacement per action depends on the guidance and changes during the
-    motion.
+    If the observed time does not increase, a new episode has begun, and the search starts from an action of zero. The
+    search integrates the action and not the displacement, because the displacement per action depends on the guidance
+    and changes during the motion.
     """
 
     def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
@@ -198,7 +197,7 @@ class ScriptedSearch:
         """
         self._file, self._duration = file, duration
         self._times, poses = file.motion.plan_search()
-        # The thread of a task with an `advance` holds the plug above the command, by `push`.
+        # If the task has an `advance`, the thread keeps the plug above the command by `push`.
         self._heights = poses[:, 2] + (file.motion.push if file.motion.advance else 0.0)
         self._time, self._size, self._direction = np.inf, 3 if file.motion.search_turn else 2, 1.0
         self._action = np.zeros(self._size)
@@ -234,8 +233,7 @@ class ScriptedSearch:
 class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
-    Rewards: "sparse" has costs of action and force and a terminal reward, "shaped" adds the depth gained, and "aligned"
-    also the distance gained towards the socket's axis.
+    Rewards: see `DemonstratedInsertion`.
     """
 
     Options = PartOptions
@@ -302,11 +300,12 @@ class PartInsertion(DemonstratedInsertion):
             return bounds
         if bounds.phases is not None:
             difficulty = self.config.difficulty
-            is_set = self.difficulties[difficulty].get("bound") == limit
-            remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
+            is_preset = self.difficulties[difficulty].get("bound") == limit
+            remedy = (
+                f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_preset else "leave it out"
+            )
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
-        both = (-limit, -limit, *bounds.lower[2:]), (limit, limit, *bounds.upper[2:])
-        return Bounds(lower=both[0], upper=both[1], phases=None)
+        return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]))
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
@@ -315,10 +314,10 @@ class PartInsertion(DemonstratedInsertion):
         return D, np.zeros(POSE_SIZE)
 
     def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
-        """Return pushes along ±x and ±y, as far as the bounds allow, which the walls of the socket stop.
+        """Return pushes along ±x and ±y, as far as the bounds allow; the walls of the socket stop a seated plug.
 
-        A direction is omitted if the bounds allow less than the sum of `MIN_PUSH` and the play, which is twice the
-        clearance. A plug that was turned is locked and is pulled upwards instead.
+        A direction is omitted if the bounds allow less than `MIN_PUSH` plus the play, which is twice the clearance. A
+        plug that was turned at the bottom is locked, and is pulled upwards instead.
         """
         if self.file.turn:
             return super().hold_tests(pose)
@@ -340,8 +339,8 @@ class PartInsertion(DemonstratedInsertion):
     @classmethod
     def provides(cls) -> tuple[str, ...]:
         """Return the kinds of prior knowledge, without walls ("keep_out") if the bounds change between phases."""
-        changes = cls.file.bounds.phases is not None
-        return tuple(one for one in super().provides() if not (one == "keep_out" and changes))
+        has_phases = cls.file.bounds.phases is not None
+        return tuple(kind for kind in super().provides() if not (kind == "keep_out" and has_phases))
 
     def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
@@ -366,11 +365,11 @@ class PartInsertion(DemonstratedInsertion):
         return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
-        every = sides_of_the_rim(self.config.observation, self.action_dims())
-        chosen = [number for number, name in enumerate(SYMMETRIES) if name in names]
-        if every is None or not chosen or self.has_image:
+        symmetries = sides_of_the_rim(self.config.observation, self.action_dims())
+        selected = [index for index, name in enumerate(SYMMETRIES) if name in names]
+        if symmetries is None or not selected or self.has_image:
             return None
-        return Symmetry(*(matrices[chosen] for matrices in every)).pad(len(self.force_limit_terms()))
+        return Symmetry(*(matrices[selected] for matrices in symmetries)).pad(len(self.force_limit_terms()))
 
     def camera(self) -> Camera:
         """Return a camera that looks slightly down at the socket."""
@@ -413,7 +412,7 @@ def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
         )
         path, content = folder / f"{name}.sdf", text.encode()
         if not path.is_file() or path.read_bytes() != content:
-            write_atomically(path, content)  # other processes may read it meanwhile
+            write_atomically(path, content)  # another process may read the file at the same time
     return PartWorkcell(
         folder,
         cast(tuple[float, float, float], file.place),
@@ -436,7 +435,7 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
 
 @cache
 def _task_class(folder: Path, content: str) -> type[PartInsertion]:
-    """Return one class for each folder and content, so that its environments can share diagrams."""
+    """Return the task class of a folder with a digest `content`; cached, so that environments can share diagrams."""
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",
@@ -448,14 +447,12 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "time_step": file.time_step,
         **file.recommended.environment,
     }
-    learner = file.recommended.learner
-    difficulties = {STANDARD: {}, "hard": file.hard, "automate": AUTOMATE}
     members = {
-        "difficulties": difficulties,
+        "difficulties": {STANDARD: {}, "hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
         "file": file,
         "defaults": defaults,
-        "learner": learner,
+        "learner": file.recommended.learner,
         "excluded_stations": () if file.is_convex else ("mujoco",),
         "__module__": __name__,
     }

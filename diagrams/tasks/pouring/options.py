@@ -18,13 +18,15 @@ from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]
 FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
-SPARSE_INPUT_SPEED = 1.7  # default input_speed of "sct" with the sparse reward: random inputs must succeed sometimes
+# Default input_speed of "sct" with the sparse reward, at which random inputs sometimes succeed.
+SPARSE_INPUT_SPEED = 1.7
 
 
 def make_template(config: PouringConfig, input_speed: float = 1.0, **aiming: float) -> SharedControlTemplate:
     """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`.
 
-    If `aim_speed` and `pour_speed`, fractions of the full speeds, are given, inputs can aim the tip in the state Pour.
+    `aiming` is empty, or `aim_speed` and `pour_speed`, fractions of the full speeds. If they are given, inputs can aim
+    the tip in the state Pour.
     """
     return load_template(
         "pouring_aimed" if aiming else "pouring",
@@ -37,14 +39,14 @@ def make_template(config: PouringConfig, input_speed: float = 1.0, **aiming: flo
 
 
 def frames_of(template: SharedControlTemplate, X_TMug: RigidTransform) -> dict[str, RigidTransform]:
-    """Return the poses of a template's objects for a mug at X_TMug, its actual or estimated pose."""
+    """Return the poses of a template's objects for an actual or estimated pose X_TMug of the mug."""
     if "behind_mug" in template.frames:
         return {"behind_mug": X_TMug @ RigidTransform([0.0, template.parameters["behind_m"], 0.0])}
     return {"mug_tip": X_TMug}
 
 
 MAX_MUG_OFFSET = 0.04  # [m] largest mug offset along x and y; beyond it the arm reaches few of the starts
-POSITION_SCALE = 5.0  # [1/m] scale with which observed positions near the mug are as large as observed angles
+POSITION_SCALE = 5.0  # [1/m] scale of observed positions, which are then as large as observed angles near the mug
 MAX_MUG_ERROR = 0.06  # [m] largest distance from the estimated mug position that aiming can reach
 
 HARD: Mapping[str, Any] = {
@@ -55,7 +57,6 @@ HARD: Mapping[str, Any] = {
     "time_limit": 6.0,
 }
 """Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed."""
-
 
 MOST_BALLS = 8  # largest number of balls
 
@@ -115,7 +116,7 @@ class PouringOptions(Options):
         """Check that the options are compatible.
 
         Raises:
-            InputError: If the least error is larger than the largest one, more balls are needed than there are, or the
+            InputError: If `mug_error_least` is larger than `mug_error_most`, `balls_in` is larger than `balls`, or the
                 balls do not fit into the thermos.
         """
         if self.needed > self.balls:
@@ -123,8 +124,8 @@ class PouringOptions(Options):
         top = PouringConfig(ball=self.ball, num_balls=self.balls).stack()[-1, 2] + 0.5 * self.ball_diameter
         if top > 0.0:
             raise InputError(
-                f"{self.balls} balls of {self.ball_diameter:g} m don't go into the thermos: take fewer, or smaller "
-                "ones such as ball_diameter=0.026"
+                f"{self.balls} balls of {self.ball_diameter:g} m do not fit into the thermos: choose fewer balls, or "
+                "smaller balls, such as ball_diameter=0.026"
             )
         if self.mug_error_least > self.mug_error_most:
             raise InputError(

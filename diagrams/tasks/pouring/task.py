@@ -45,7 +45,7 @@ SHAPING = 200.0  # reward per progress of the template, equation 3.7
 APPROACH = 15.0  # reward per distance gained [1/m], equation 3.9
 NEAR_BONUS = 0.2  # bonus per action within `NEAR`
 TILT = 20.0  # reward per tilt [1/rad], equation 3.10
-NEAR = 0.07  # [m] distance of the tips at which pouring begins; the rims prevent the 0.04 m of the thesis
+NEAR = 0.07  # [m] distance of the tips at which pouring begins; the rims prevent the thesis's distance of 0.04 m
 POUR = 2  # index of the template's state Pour
 AIM = np.array([0.0, -0.045])  # [m] position of the tip in the mug's frame from which both balls fall into the mug
 AIMING = 2000.0  # reward per distance gained towards `AIM` [1/m]: 50 mm earn half as much as the whole tilt
@@ -66,7 +66,7 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
 def _tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
     """Return a quarter of the reward of equation 3.10, as in equation 3.8.
 
-    The thermos is on the mug's −y side, so that a negative roll pours.
+    The thermos is on the mug's −y side, so that a change of the roll angle in the negative direction pours.
     """
     change = _euler(tip_in_mug) - _euler(last_tip_in_mug)
     change -= 2 * np.pi * np.round(change / (2 * np.pi))
@@ -76,7 +76,7 @@ def _tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
 
 
 def _euler(tip: np.ndarray) -> np.ndarray:
-    """Return roll, pitch and yaw [rad]."""
+    """Return roll, pitch and yaw (3,) [rad] of a pose (6,) with a rotation vector."""
     return Rotation.from_rotvec(tip[3:]).as_euler("xyz")
 
 
@@ -95,13 +95,13 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
 
 
 MAX_TRACKING_ERROR = 0.05  # largest distance between robot and command [m]
-POURED_STEPS = 10  # consecutive steps of the default control period that count as poured
-# Start of the thermos in the frame of the mug's tip, inside the template's workspace.
+POURED_STEPS = 10  # consecutive steps with the balls in the mug that count as success, at the default control period
+# Range of the thermos's start in the frame of the mug's tip, inside the template's workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
 START_HEIGHT = (0.08, 0.19)  # [m]
 START_TOLERANCE = 1e-6  # largest distance of a given start from the workspace, along an axis [m]
-MAX_START_SAMPLES = 20  # number of samples, all unreachable, after which the reset fails
+MAX_START_SAMPLES = 20  # number of unreachable samples after which the reset fails
 
 
 # Indices into the observation [tip in the mug's frame, error of the estimated mug pose, template's state].
@@ -119,23 +119,23 @@ POURING_TILT = 95.0  # [degrees] tilt above which the policy always tilts furthe
 
 
 def scripted_pour(observation: np.ndarray) -> np.ndarray:
-    """Return inputs (3,) that move the thermos's tip over the mug's rim and on towards its axis."""
+    """Return inputs (3,) that move the thermos's tip over the mug's rim and then towards the mug's axis."""
     p_MP = observation[:3] / POSITION_SCALE
     horizontal = np.hypot(p_MP[0], p_MP[1])
-    towards = -p_MP[:2] / max(horizontal, 1e-9)
+    to_axis = -p_MP[:2] / max(horizontal, 1e-9)
     if np.linalg.norm(p_MP) < POURING_DISTANCE:
-        return np.array([*towards, 0.0])
-    before, above = OVER_THE_RIM
-    return np.clip((np.array([*(-before * towards), above]) - p_MP) / SOFTNESS, -1.0, 1.0)
+        return np.array([*to_axis, 0.0])
+    distance, height = OVER_THE_RIM
+    return np.clip((np.array([*(-distance * to_axis), height]) - p_MP) / SOFTNESS, -1.0, 1.0)
 
 
 def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
-    """Return inputs (3,) that move to where state Pour begins, then aim at the actual mug, then tilt the thermos."""
+    """Return inputs (3,) that move the tip until the state Pour begins, then aim at the mug, then tilt the thermos."""
     p_MP = observation[:3] / POSITION_SCALE
     if observation[STATE] < 0.5:
         p_BP = p_MP - np.array([*(MAX_MUG_ERROR * observation[ERROR]), 0.0])
-        before, above = AIM_OVER_THE_RIM
-        goal = np.array([*(before * p_BP[:2] / max(np.hypot(p_BP[0], p_BP[1]), 1e-9)), above])
+        distance, height = AIM_OVER_THE_RIM
+        goal = np.array([*(distance * p_BP[:2] / max(np.hypot(p_BP[0], p_BP[1]), 1e-9)), height])
         return np.clip((goal - p_BP) / SOFTNESS, -1.0, 1.0)
     to_aim = AIM - p_MP[:2]
     is_tilting = np.linalg.norm(to_aim) < AIM_TOLERANCE or _tilt(observation) > POURING_TILT
@@ -143,7 +143,7 @@ def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
 
 
 def scripted_pour_blind(observation: np.ndarray) -> np.ndarray:
-    """Return the inputs (3,) of `scripted_pour_aimed` for the estimated mug pose instead of the actual one."""
+    """Return the inputs (3,) of `scripted_pour_aimed` for the estimated instead of the actual mug position."""
     estimated = np.array(observation, dtype=float)
     estimated[:2] -= POSITION_SCALE * MAX_MUG_ERROR * estimated[ERROR]
     estimated[ERROR] = 0.0
@@ -161,8 +161,8 @@ class Pouring(Task):
     """Pour both balls into the mug.
 
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
-    "hand_shaped" follows 3.8 to 3.10. With the standard template a constant action pours. With difficulty="hard" the
-    mug is not where the template assumes.
+    "hand_shaped" follows 3.8 to 3.10. With the standard template, a constant action pours the balls into the mug. With
+    difficulty="hard", the mug is not at the position that the template assumes.
     """
 
     workcell_kind = "pouring"
@@ -177,7 +177,7 @@ class Pouring(Task):
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
     collision = Threshold("touched")
-    pushable = False  # the balls in the thermos would not move along
+    pushable = False  # the balls in the thermos would not move with the robot
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
@@ -234,8 +234,8 @@ class Pouring(Task):
         therefore divided by `action_repeat`. With the option `aim`, "shaped" includes the distance gained towards `AIM`
         in the state Pour.
         """
-        reward, action_repeat, poses = self.config.reward, self.config.action_repeat, ("tip_in_mug", "last_tip_in_mug")
-        sizes = dict.fromkeys(poses, 6)
+        reward, action_repeat = self.config.reward, self.config.action_repeat
+        poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
         terms = [
             terminal_reward(TERMINAL),
             RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
@@ -243,7 +243,7 @@ class Pouring(Task):
         if reward == "shaped":
             terms.append(RewardTerm("shaping", {"progress": 1, "last_progress": 1}, _progress_gained))
             if self.options.aim:
-                terms.append(RewardTerm("aiming", {**sizes, "state": 1}, _aiming))
+                terms.append(RewardTerm("aiming", {**poses, "state": 1}, _aiming))
         if reward == "hand_shaped":
 
             def approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
@@ -252,11 +252,11 @@ class Pouring(Task):
                 bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
                 return float(APPROACH * (np.linalg.norm(last_tip_in_mug[:3]) - distance) + bonus)
 
-            terms += [RewardTerm("approach", sizes, approach), RewardTerm("tilting", sizes, _tilting)]
+            terms += [RewardTerm("approach", poses, approach), RewardTerm("tilting", poses, _tilting)]
         return terms
 
     def termination_terms(self) -> list[TerminationTerm]:
-        """Return collision, success and spill; an episode that touched the mug is no success.
+        """Return collision, success and spill; a collision takes precedence over a success.
 
         An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is
         a success after `needed` balls have been in the mug for `POURED_STEPS`, because a ball can bounce out again.
@@ -268,10 +268,10 @@ class Pouring(Task):
         def positions(balls: np.ndarray) -> np.ndarray:
             return balls.reshape(-1, 6)[:, :3]
 
-        def poured(balls_in_mug: np.ndarray) -> bool:
+        def is_poured(balls_in_mug: np.ndarray) -> bool:
             return sum(mug.contains(p_MB) for p_MB in positions(balls_in_mug)) >= needed
 
-        def spilled(balls_in_mug: np.ndarray, balls_in_thermos: np.ndarray) -> bool:
+        def is_spilled(balls_in_mug: np.ndarray, balls_in_thermos: np.ndarray) -> bool:
             # A ball has fallen if it is in neither vessel, and as low as a ball on the table or lower.
             fallen = sum(
                 p_MB[2] < radius - fall + 0.01 and not mug.contains(p_MB) and not thermos.contains(p_PB, 0.01)
@@ -282,8 +282,8 @@ class Pouring(Task):
         size, steps = 6 * config.num_balls, self.steps_of(POURED_STEPS)
         return [
             TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
-            TerminationTerm("success", {"balls_in_mug": size}, poured, steps=steps),
-            TerminationTerm("spill", {"balls_in_mug": size, "balls_in_thermos": size}, spilled),
+            TerminationTerm("success", {"balls_in_mug": size}, is_poured, steps=steps),
+            TerminationTerm("spill", {"balls_in_mug": size, "balls_in_thermos": size}, is_spilled),
         ]
 
     def reset(
@@ -291,9 +291,9 @@ class Pouring(Task):
     ) -> dict[str, Any]:
         """Place the mug, the upright thermos and the balls at sampled poses; an unreachable start is sampled again.
 
-        Values that a reset option replaces are sampled nevertheless. The start is inside the constraints of the
-        template's first state. The returned `mug_position` is that of the actual mug, unlike the reset option of this
-        name.
+        Values that a reset option replaces are also sampled. The start is inside the constraints of the template's
+        first state. The returned `mug_position` is the actual position of the mug; the reset option of this name is
+        the estimated position.
 
         Raises:
             InputError: If a reset option is too large, the option `start` is outside the constraints, or the arm
@@ -314,7 +314,7 @@ class Pouring(Task):
             # The error moves the actual mug, so that the estimated mug position stays within reach.
             estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
             frames = frames_of(self._template, estimated)
-            # The thermos is turned as in the template's first state, so that all kinds of guidance start at one pose.
+            # The thermos is oriented as in the template's first state, so that all guidance has the same start pose.
             X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
             nearest = estimated.inverse() @ X_TP.translation()
             if np.abs(nearest - p_MP).max() > START_TOLERANCE:
@@ -340,7 +340,8 @@ class Pouring(Task):
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
         default = scripted_pour_aimed if difficulty == "hard" else scripted_pour
-        return {one.__name__: one for one in (default, scripted_pour, scripted_pour_aimed, scripted_pour_blind)}
+        policies = (default, scripted_pour, scripted_pour_aimed, scripted_pour_blind)
+        return {policy.__name__: policy for policy in policies}
 
     def camera(self) -> Camera:
         """Return a camera in front of the mug, slightly above it."""

@@ -416,7 +416,7 @@ def test_guidance_without_constraints_reports_the_violation_of_a_shape():
 @pytest.mark.parametrize(
     ("options", "match"),
     [
-        ({"obstacles_constrain": True, "difficulty": "hard"}, "one fixed obstacle"),
+        ({"obstacles_constrain": True, "difficulty": "hard"}, "single fixed obstacle"),
         ({"max_speed": (0.1, 0.0)}, "positive"),
         ({"max_acceleration": (0.1, 0.1, 0.1)}, "2 outputs"),
     ],

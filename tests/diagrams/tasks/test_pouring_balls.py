@@ -58,7 +58,7 @@ def test_balls_stay_in_the_mug_for_a_tenth_of_a_second(control_period):
 def test_options_that_do_not_go_together_are_refused():
     with pytest.raises(InputError, match="balls_in must be at most balls, which is 2, not 3"):
         EnvConfig.resolve("Pouring", {"balls_in": 3})
-    with pytest.raises(InputError, match="6 balls of 0\\.04 m don't go into the thermos"):
+    with pytest.raises(InputError, match="6 balls of 0\\.04 m do not fit into the thermos"):
         EnvConfig.resolve("Pouring", {"balls": 6})
 
 
