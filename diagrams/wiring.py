@@ -12,7 +12,7 @@ AnySystem = TypeVar("AnySystem", bound=System)
 def add_system(
     builder: DiagramBuilder, name: str, system: AnySystem, /, *ports: OutputPort, **named_ports: OutputPort
 ) -> AnySystem:
-    """Add a named system, connect ports to its inputs by their order or by their names, and return the system."""
+    """Add a named system, connect output ports to its inputs by order or by name, and return the system."""
     builder.AddNamedSystem(name, system)
     for index, port in enumerate(ports):
         builder.Connect(port, system.get_input_port(index))

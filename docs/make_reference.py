@@ -686,6 +686,7 @@ def wiring() -> str:
     from pydrake.math import RigidTransform
 
     from guiderail.diagrams.guidance import GUIDANCE, PlacedTemplate, PrimitiveConfig, PriorKnowledge, build_guidance
+    from guiderail.diagrams.guidance.registry import missing_requirements
     from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
     from guiderail.models.templates import load_template
@@ -705,7 +706,7 @@ def wiring() -> str:
     for name in GUIDANCE.names():
         if not GUIDANCE.get(name).build.__module__.startswith("guiderail."):
             continue
-        prior = template if not GUIDANCE.get(name).missing_requirements({"template"}) else demonstrated
+        prior = template if not missing_requirements(GUIDANCE.get(name).needs, {"template"}) else demonstrated
         diagram = build_guidance(name, prior)
         page += f"## {name}\n\n{prose(inspect.getdoc(GUIDANCE.get(name).build) or '').split(chr(10) * 2)[0]}\n\n"
         page += table(["from", "to"], [(code(one), code(other)) for one, other in connections(diagram)])

@@ -139,11 +139,11 @@ class Signals:
     """Collection of ports by name while a diagram is built; "last_x" is the value of x one control step earlier."""
 
     def __init__(self, builder: DiagramBuilder, period: float, ports: Mapping[str, OutputPort]):
-        """Construct the collection; holds for "last_x" are added to the builder, with the control `period` [s]."""
+        """Construct the collection; zero-order holds for "last_x", with the control `period` [s], go into `builder`."""
         self._builder, self._period, self._ports = builder, period, dict(ports)
 
     def add(self, ports: Mapping[str, OutputPort]) -> None:
-        """Add signals; a later one replaces an earlier one of the same name."""
+        """Add signals; they replace earlier signals of the same names."""
         self._ports |= ports
 
     def get(self, name: str, user: str, size: int | None = None) -> OutputPort:

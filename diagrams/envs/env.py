@@ -44,7 +44,7 @@ INFO_KEYS = (
     "control_steps",
     "simulation_failure",
 )
-"""Reserved keys of `info`: no reward term and no value that a task's reset samples can have one of these names."""
+"""Reserved keys of `info`; reward terms and the values that a task's reset samples must have other names."""
 
 _TIME_LIMIT = TERMINATIONS.index("time_limit")
 

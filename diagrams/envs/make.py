@@ -117,8 +117,8 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
     Raises:
         InputError: If a name is unknown, a value is out of range, or options are incompatible.
     """
-    declared = _config(task, options).make_task()
-    return build_prior_knowledge(declared, make_station(declared))
+    new_task = _config(task, options).make_task()
+    return build_prior_knowledge(new_task, make_station(new_task))
 
 
 def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
@@ -146,18 +146,18 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
         )
     threadpool_limits(1)
     exported = render_mode if render_mode == "rgb_array" else None
-    declared = config.make_task()
-    key = _key(declared, exported)
+    new_task = config.make_task()
+    key = _key(new_task, exported)
     idle = [] if key is None else _IDLE[key]
     # A diagram that a user has added to another diagram cannot be simulated alone.
     idle[:] = [each for each in idle if each.diagram.diagram.GetSystemPathname().count("::") == 1]
-    built = idle.pop() if idle else _build(declared, exported)
+    built = idle.pop() if idle else _build(new_task, exported)
     # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
     # task that built the diagram. The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
-    declared.episode_constants = built.diagram.declaration.episode_constants
-    randomize = make_randomize(declared, built.station, built.guidance)
-    diagram = replace(built.diagram, randomize=randomize, declaration=declared)
+    new_task.episode_constants = built.diagram.declaration.episode_constants
+    randomize = make_randomize(new_task, built.station, built.guidance)
+    diagram = replace(built.diagram, randomize=randomize, declaration=new_task)
     release = partial(idle.append, built)
     try:
         return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
@@ -186,10 +186,10 @@ def make_skill(
             policy's ports do not match the environment.
     """
     check_render_mode(render_mode)
-    declared = _config(task, options).make_task()
+    new_task = _config(task, options).make_task()
     threadpool_limits(1)
-    station = make_station(declared)
-    return build_skill_diagram(declared, station, make_guidance(declared, station), policy, render_mode=render_mode)
+    station = make_station(new_task)
+    return build_skill_diagram(new_task, station, make_guidance(new_task, station), policy, render_mode=render_mode)
 
 
 @dataclass(frozen=True)
@@ -248,9 +248,9 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
         return None  # an option is not comparable, or a file of the base policy or the task folder cannot be read
 
 
-def _is_packaged(declared: Any) -> bool:
+def _is_packaged(definition: Any) -> bool:
     """Return True if a class or a function is defined in this package."""
-    return str(getattr(declared, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
+    return str(getattr(definition, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
 
 
 def _folder_digest(task: Task) -> str | None:

@@ -129,7 +129,7 @@ class PrimitiveOptions(Options):
         {}, validate_default=True, description="further parameters of a kernel that has more than a length scale"
     )
     via_points: Numbers = Field(
-        (), description="via-points of the mean: control step and all outputs of each, one via-point after another"
+        (), description="via-points of the mean, one after another: control step and all outputs of each via-point"
     )
     max_speed: PositiveNumbers = Field(
         (),

@@ -309,9 +309,8 @@ def _response(status: HTTPStatus, kind: str, content: bytes) -> Response:
 
 def main() -> None:
     """Run the gateway."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the simulating program, which closes this one's input
-    given = json.loads(sys.stdin.readline())
-    asyncio.run(Gateway(**given).run())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends the simulating program, which closes the gateway's input
+    asyncio.run(Gateway(**json.loads(sys.stdin.readline())).run())
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def add_camera(
 ) -> OutputPort:
     """Add a camera and return the port of its color image, an `ImageRgba8U`.
 
-    `plant` is only needed for a camera that is fixed in one of its frames. With `is_picture` the scene is lit for a
+    `plant` is only needed for a camera that is fixed in a frame of the plant. With `is_picture`, the scene is lit for a
     picture instead of an observation. An image is rendered only when the port is evaluated.
 
     Raises:

@@ -27,7 +27,7 @@ PORTS = (
     "pose",
     "fallback",
 )
-"""Output ports of every task diagram, in addition to one per reward term."""
+"""Output ports of every task diagram, in addition to one port per reward term."""
 
 
 @dataclass(frozen=True)

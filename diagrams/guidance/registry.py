@@ -53,15 +53,9 @@ class GuidanceKind:
     options: type[Options] | None = None
     ignores_actions: bool = False
 
-    def missing_requirements(self, provided: Collection[str]) -> tuple[str, ...]:
-        """Return the missing requirements of the most complete alternative; empty if an alternative is complete.
 
-        `provided` are the requirements that the task provides.
-        """
-        return _missing_requirements(self.needs, provided)
-
-
-def _missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collection[str]) -> tuple[str, ...]:
+def missing_requirements(needs: tuple[tuple[str, ...], ...], provided: Collection[str]) -> tuple[str, ...]:
+    """Return the missing requirements of the most complete alternative in `needs`; empty if one is complete."""
     missing = [tuple(name for name in alternative if name not in provided) for alternative in needs]
     return min(missing, key=len, default=())
 
@@ -138,7 +132,7 @@ def is_demonstrated(guidance: str | None) -> bool:
 
 def possible_guidance(provided: Collection[str]) -> list[str]:
     """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
-    return [name for name in GUIDANCE.usable() if not _missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
+    return [name for name in GUIDANCE.usable() if not missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
 
 
 def default_guidance(possible: Collection[str]) -> str:
@@ -157,8 +151,7 @@ def check_guidance(name: str, provided: Collection[str], task: str = "this task"
         InputError: If there is no such kind, or a requirement is missing; the message names it.
     """
     kind = GUIDANCE.get(name)
-    missing = kind.missing_requirements(provided)
-    if missing:
+    if missing := missing_requirements(kind.needs, provided):
         needed = " and ".join(REQUIREMENTS.get(requirement, requirement) for requirement in missing)
         raise InputError(
             f"guidance '{name}' needs {needed}, which {task} doesn't have: use {', '.join(possible_guidance(provided))}"

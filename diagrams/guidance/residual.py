@@ -55,10 +55,10 @@ class ResidualDescent(Guidance):
         corners[2] = approach.heights
         line = builder.AddNamedSystem("descent", TrajectorySource(PiecewisePolynomial.FirstOrderHold(times, corners)))
         # Without this hold, all systems after it would be computed again at every step of the plant.
-        held = add_system(builder, "descent_hold", ZeroOrderHold(period, POSE_SIZE), line.get_output_port())
+        descent = add_system(builder, "descent_hold", ZeroOrderHold(period, POSE_SIZE), line.get_output_port())
         spread = add_system(builder, "spread", MatrixGain(D=np.eye(POSE_SIZE, 3)), hold.get_output_port())
         residual = Residual(np.array([approach.reach] * 3 + [0.0] * 3))
-        add_system(builder, "residual", residual, reference=held.get_output_port(), action=spread.get_output_port())
+        add_system(builder, "residual", residual, reference=descent.get_output_port(), action=spread.get_output_port())
         constraints = ActiveConstraintFilter(template, placed.frames, period)
         requested_pose = residual.get_desired_pose_output_port()
         add_system(builder, "active_constraints", constraints, requested_pose=requested_pose)

@@ -88,7 +88,7 @@ class ActiveConstraintFilter(Diagram):
         builder.ExportOutput(self.GetOutputPort("commanded_violation"), "constraint_violation")
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of the named objects in the root context; other objects keep theirs."""
+        """Set the poses of the named objects in the root context; other poses do not change."""
         for system in (self._projector, self._machine):
             system.frames.set(system.GetMyMutableContextFromRoot(root_context), frames)
 
@@ -144,7 +144,7 @@ class SctGuidance(Guidance):
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:
-        """Set the poses of the named objects in the root context; other objects keep theirs."""
+        """Set the poses of the named objects in the root context; other poses do not change."""
         self._filter.set_frames(root_context, frames)
         mapped = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), mapped)

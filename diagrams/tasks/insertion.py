@@ -233,7 +233,7 @@ class InsertionTask(Task):
 
 
 def part_poses(fixture: np.ndarray, workpiece: np.ndarray) -> tuple[RigidTransform, RigidTransform]:
-    """Convert offsets to the poses of the actual target frame in the nominal one and of the workpiece in the tool.
+    """Convert offsets to two poses: actual target frame in the nominal target frame, and workpiece in the tool.
 
     Args:
         fixture: Offset of the fixture, (2,) or (3,): x, y [m], and optionally its turn about z [rad].

@@ -152,10 +152,10 @@ class Task(ABC):
         """
         self.config = config
         self.options = config.parts["task"]
-        given, kind, declared = config.control_period, config.station_kind, type(self)
-        self.time_unit = getattr(declared, "time_unit", kind.time_unit or TIME_UNIT)
+        given, kind, task_class = config.control_period, config.station_kind, type(self)
+        self.time_unit = getattr(task_class, "time_unit", kind.time_unit or TIME_UNIT)
         period = kind.control_period or CONTROL_PERIOD
-        self.default_control_period = getattr(declared, "default_control_period", period)
+        self.default_control_period = getattr(task_class, "default_control_period", period)
         self.control_period = self.default_control_period if given is None else whole_multiple(given, self.time_unit)
         self.episode_constants: dict[str, EpisodeConstant] = {}
 
@@ -255,7 +255,7 @@ class Task(ABC):
         return None
 
     def near_symmetry(self) -> Symmetry | None:
-        """Return symmetries that hold only for most of an episode; default: the exact ones."""
+        """Return symmetries that hold only for most of an episode; default: `symmetry`."""
         return self.symmetry()
 
     # Start of an episode.

@@ -1,9 +1,10 @@
 """Constrained reinforcement learning for contact-rich manipulation: RL-SCT, KGRL and sKGRL as Drake systems diagrams.
 
 The four folders of the repository are the four parts of this package: `models` (numerics without Drake systems),
-`systems` (one LeafSystem a file), `diagrams` (wiring) and `tools` (the command and the Python API). Importing it
-registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use. Movement
-primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and `learn` install.
+`systems` (one LeafSystem per file), `diagrams` (wiring) and `tools` (the command and the Python API). Importing the
+package registers the environments of all tasks with Gymnasium. The names in `__init__.pyi` are imported on first use.
+Movement primitives, templates and `GuidedEnv` need neither Drake nor PyTorch, which the extras `sim` and `learn`
+install.
 """
 
 from importlib.metadata import version
@@ -21,7 +22,7 @@ def __getattr__(name: str) -> object:
     """Import a public name.
 
     Raises:
-        MissingExtraError: If it needs an extra that is not installed.
+        MissingExtraError: If the name needs an extra that is not installed.
     """
     try:
         return _load(name)

@@ -1,4 +1,4 @@
-"""Entry point of `guiderail` and `python -m guiderail`, which also starts if optional dependencies are missing."""
+"""Entry point of `guiderail` and `python -m guiderail`; it also starts if optional dependencies are missing."""
 
 import sys
 
@@ -6,7 +6,7 @@ from guiderail.models.common.errors import explain_missing
 
 
 def main() -> None:
-    """Run the command; exit with 2 and one sentence if one of its dependencies is not installed."""
+    """Run the command; if one of its dependencies is not installed, print one sentence and exit with code 2."""
     try:
         from guiderail.tools.cli import main as command
     except ModuleNotFoundError as error:
