@@ -131,14 +131,12 @@ def register_task_folder(folder: str | Path) -> str:
 
     task = load_task_folder(Path(folder))
     registered = TASKS.get(task.file.name) if task.file.name in TASKS.names() else task
-    registered_folder = getattr(registered, "folder", task.folder)
-    if registered_folder != task.folder:
-        if is_task_folder(registered_folder) and task_folder_digest(registered_folder) == task_folder_digest(
-            task.folder
-        ):
-            return register_task_folder(registered_folder)
+    existing_folder = getattr(registered, "folder", task.folder)
+    if existing_folder != task.folder:
+        if is_task_folder(existing_folder) and task_folder_digest(existing_folder) == task_folder_digest(task.folder):
+            return register_task_folder(existing_folder)
         raise InputError(
-            f"the tasks in {task.folder} and {registered_folder} are both called {task.file.name}: change 'name:' in "
+            f"the tasks in {task.folder} and {existing_folder} are both called {task.file.name}: change 'name:' in "
             "the task.yaml of one of them"
         )
     register_task(task.file.name)(task)

@@ -232,9 +232,9 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 class GridClamp(InsertionTask):
     """Insert the clamp.
 
-    Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" omits the cost of force from it, and "sparse" the
-    reward for descending. "aligned" adds a cost of collisions and the distance gained towards the holes' axis to it;
-    this distance is privileged: the policy does not observe it.
+    Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" is "shaped" without the cost of force, and
+    "sparse" is "shaped" without the reward for descending. "aligned" is "shaped" with a cost of collisions and a reward
+    for the distance gained towards the holes' axis. This distance is privileged: the policy does not observe it.
 
     Without `active_constraints`, only the impedance limits the forces.
     """

@@ -300,10 +300,8 @@ class PartInsertion(DemonstratedInsertion):
             return bounds
         if bounds.phases is not None:
             difficulty = self.config.difficulty
-            is_preset = self.difficulties[difficulty].get("bound") == limit
-            remedy = (
-                f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_preset else "leave it out"
-            )
+            is_set = self.difficulties[difficulty].get("bound") == limit
+            remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
         return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]))
 
