@@ -303,7 +303,7 @@ class PartInsertion(DemonstratedInsertion):
             is_set = self.difficulties[difficulty].get("bound") == limit
             remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
-        return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]))
+        return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]), phases=None)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
