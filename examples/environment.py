@@ -1,4 +1,4 @@
-"""Use an environment with your own learner: tasks are Gymnasium environments, with violations in `info`."""
+"""Use a task with your own learner: a task is a Gymnasium environment with constraint violations in `info`."""
 
 import gymnasium
 import numpy as np
@@ -17,9 +17,9 @@ for _ in range(20):
     if terminated or truncated:
         break
 
-print(f"a return of {total:.2f} after {info['control_steps']} control steps, ended by {info['termination'] or 'us'}")
-print(f"worst violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
-print(f"contact force now: {info['contact_force']:.1f} N")
+print(f"return {total:.2f} after {info['control_steps']} control steps, termination: {info['termination'] or 'none'}")
+print(f"largest violation, commanded: {info['constraint_violation']:.2g}, measured: {info['measured_violation']:.2g}")
+print(f"contact force: {info['contact_force']:.1f} N")
 
 observation, info = env.reset(seed=1, options={"held_out": True})  # a start that training does not sample
 env.close()

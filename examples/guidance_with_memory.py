@@ -1,4 +1,4 @@
-"""Write guidance with memory: a reset restores the discrete state of a system.
+"""Write guidance with memory, as discrete state of a system, which a reset of the environment initializes.
 
 This guidance adds each action to its last command, not to the measured pose.
 """
@@ -13,14 +13,14 @@ from guiderail.systems import ConstraintViolation
 STEP = 0.01  # displacement by an action of 1 [m]
 
 
-class Creep(LeafSystem):
+class CommandIntegrator(LeafSystem):
     """Command command[k] = command[k − 1] + STEP action[k], with the measured pose as the first command."""
 
     def __init__(self, known: PriorKnowledge):
         super().__init__()
         self.action = self.DeclareVectorInputPort("action", known.pose_size)
         self.pose = self.DeclareVectorInputPort("pose", known.pose_size)
-        # Depends on the state only: direct feedthrough would close an algebraic loop with the station.
+        # The output depends only on the state: direct feedthrough would close an algebraic loop with the station.
         self.DeclareStateOutputPort("desired_pose", self.DeclareDiscreteState(known.pose_size))
         self.DeclareInitializationDiscreteUpdateEvent(self.start)
         self.DeclarePeriodicDiscreteUpdateEvent(known.period, 0.0, self.step)
@@ -33,10 +33,10 @@ class Creep(LeafSystem):
         state.set_value(context.get_discrete_state_vector().value() + STEP * self.action.Eval(context))
 
 
-@register_guidance("creep")
-def creep(known: PriorKnowledge) -> Guidance:
+@register_guidance("command_integrator")
+def command_integrator(known: PriorKnowledge) -> Guidance:
     guidance, builder = Guidance(), DiagramBuilder()
-    command = builder.AddNamedSystem("creep", Creep(known))
+    command = builder.AddNamedSystem("command", CommandIntegrator(known))
     held = builder.AddNamedSystem("held_action", ZeroOrderHold(known.period, known.pose_size))
     check = builder.AddNamedSystem("violation", ConstraintViolation(known.constraints, known.period))
     builder.Connect(command.get_output_port(), check.get_pose_input_port())
@@ -52,9 +52,9 @@ def creep(known: PriorKnowledge) -> Guidance:
     return guidance
 
 
-env = make_env("NarrowPassage", guidance="creep", action_repeat=5)
+env = make_env("NarrowPassage", guidance="command_integrator", action_repeat=5)
 for episode in range(2):
     env.reset(seed=0)
     for _ in range(4):
         env.step(np.array([0.0, 0.5]))
-    print("episode", episode, "commands", env.trace.commanded[-1].round(3), "m at last: after a reset")
+    print("last command of episode", episode, env.trace.commanded[-1].round(3), "m")

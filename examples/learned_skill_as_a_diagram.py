@@ -1,6 +1,6 @@
 """Run a learned skill without Gymnasium: observation, policy, guidance and station are one Drake diagram.
 
-The argument is the folder of a run, whose policy acts. Without an argument, the action is zero.
+The argument is the folder of a run with a policy. Without an argument, the action is zero.
 """
 
 import sys

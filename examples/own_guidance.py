@@ -1,4 +1,4 @@
-"""Compose your own guidance: connect systems in a diagram with the ports of guidance.
+"""Compose your own guidance: connect systems in a diagram that has the ports of guidance.
 
 This guidance is KGRL with a single action, which displaces the motion along one direction.
 """
@@ -21,7 +21,7 @@ class AlongOptions(Options):
 
 @register_guidance("kgrl_along", needs=(("demonstrations",),), label="KGRL along a line", options=AlongOptions)
 class KgrlAlong(Guidance):
-    """KGRL whose action (2,) is a direction times the action (1,) of this guidance."""
+    """Guidance with an action (1,); its product with a direction (2,) is the action of KGRL."""
 
     def __init__(self, known: PriorKnowledge):
         super().__init__()
@@ -48,4 +48,4 @@ env = make_env("NarrowPassage", guidance="kgrl_along", angle=30.0)
 env.reset(seed=0)
 for _ in range(10):
     info = env.step(np.array([1.0]))[-1]
-print("after", info["control_steps"], "control steps the worst commanded violation is", info["constraint_violation"])
+print("largest commanded violation of", info["control_steps"], "control steps:", info["constraint_violation"])

@@ -1,4 +1,4 @@
-"""Change the reward of a task: override `reward_terms` in a subclass; each term is a column of the results."""
+"""Change the reward of a task: override `reward_terms` in a subclass. Each term is a column of the results."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ import guiderail as gr
 from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
 
 
-@gr.register_task("examples/Hurry")
-class Hurry(GridClamp):
-    """Grid clamp with costs of time and of jumps of the command."""
+@gr.register_task("examples/TimeCost")
+class TimeCost(GridClamp):
+    """Grid clamp with a cost of time and a cost of jumps of the command."""
 
     def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
         def jump(desired_pose: np.ndarray, last_desired_pose: np.ndarray) -> float:
@@ -21,10 +21,11 @@ class Hurry(GridClamp):
         ]
 
 
-env = gr.make_env("examples/Hurry", guidance="sct", action_repeat=10)
+env = gr.make_env("examples/TimeCost", guidance="sct", action_repeat=10)
 env.reset(seed=0)
 sums = dict.fromkeys(("time_cost", "jump_cost"), 0.0)
 for _ in range(10):
     info = env.step(np.array([0.0, 0.0, -1.0]))[-1]
     sums = {name: value + info[name] for name, value in sums.items()}
-print({name: round(value, 3) for name, value in sums.items()}, "of", sorted(name for name in info if "_cost" in name))
+print("sums of the added terms:", {name: round(value, 3) for name, value in sums.items()})
+print("costs in info:", sorted(name for name in info if "_cost" in name))

@@ -1,4 +1,4 @@
-"""Replace the controller of a task: write a station, the diagram of plant and controller."""
+"""Replace the controller of a task: write a station, which is the diagram of plant and controller."""
 
 import numpy as np
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
@@ -23,7 +23,7 @@ class SoftPlane(gr.Station):
         super().__init__()
         builder = DiagramBuilder()
         self.plant, self.scene_graph = plant, _ = AddMultibodyPlantSceneGraph(builder, PERIOD / 10)
-        plant.SetUseSampledOutputPorts(False)  # systems of the control period read the state at its end
+        plant.SetUseSampledOutputPorts(False)  # output ports have the state after the step, not the sampled state
         body = plant.world_body()
         for name, axis in (("x", [1.0, 0.0, 0.0]), ("y", [0.0, 1.0, 0.0])):
             child = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(0.05, passage.robot_radius))

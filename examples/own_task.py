@@ -1,4 +1,4 @@
-"""Make your own task: this one is a narrow passage with another gap and another goal."""
+"""Define your own task, here a narrow passage with another gap and another goal."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -49,9 +49,9 @@ class WideGap(gr.Task):
 
 
 env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", action_repeat=5)
-print("starts at", env.reset(seed=1)[1]["start"].round(3), "and ends as", end="")
-over = False
-while not over:
+print("start:", env.reset(seed=1)[1]["start"].round(3))
+is_over = False
+while not is_over:
     _, _, terminated, truncated, info = env.step(np.array([0.8, 0.0], np.float32))
-    over = terminated or truncated
-print(f" '{info['termination']}', worst commanded violation {info['constraint_violation']:.3f} m")
+    is_over = terminated or truncated
+print(f"termination: {info['termination']}, largest commanded violation: {info['constraint_violation']:.3f} m")

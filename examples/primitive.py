@@ -1,4 +1,4 @@
-"""Use the primitive alone: demonstrations become a constrained motion that actions displace, with NumPy."""
+"""Use the primitive alone, with NumPy: learn a motion from demonstrations, constrain it and displace it by actions."""
 
 import numpy as np
 
@@ -20,10 +20,10 @@ primitive = LcNsKmp(
     history_variance=1e-6,
     constraints=LinearConstraints.box([-np.inf, -1.0], [np.inf, 0.9]),
 )
-gains = authority_gains(primitive)  # null-space action of an action of 1
+gains = authority_gains(primitive)  # factors from an action in ±1 to a null-space action
 history = np.tile(reference.means[0], (10, 1))
 for step in range(reference.num_steps):
     output = primitive.predict(step, gains * np.array([0.0, 1.0]), history).output
     history = np.vstack([history[1:], output])
     assert output[1] <= 0.9 + 1e-9
-print("ends at", output.round(3), "where the demonstrations end at", reference.means[-1].round(3))
+print("last output:", output.round(3), "last mean of the demonstrations:", reference.means[-1].round(3))

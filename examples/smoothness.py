@@ -1,4 +1,4 @@
-"""Compare the smoothness of exploration methods: at the same RMS, because smaller motions have less jerk."""
+"""Compare the smoothness of exploration methods at the same RMS, because smaller motions have less jerk."""
 
 import numpy as np
 
@@ -9,8 +9,8 @@ from guiderail.models.primitives.gains import exploration_rms, rms_gains
 ACTION_REPEAT, STEPS, PERIOD = 5, 150, 0.02
 times = PERIOD * np.arange(STEPS)
 means = np.column_stack([times / 3, np.sin(np.pi * times / 3)])
-wide = 0.01 + 0.1 * np.sin(np.pi * times / 3)
-reference = ReferenceTrajectory(times, means, wide[:, None, None] ** 2 * np.eye(2))
+deviation = 0.01 + 0.1 * np.sin(np.pi * times / 3)
+reference = ReferenceTrajectory(times, means, deviation[:, None, None] ** 2 * np.eye(2))
 
 for name, history, variance in (("no history (KGRL)", 0, 1.0), ("rho = 1e-4", 10, 1e-4), ("rho = 1e-8", 10, 1e-8)):
     primitive = LcNsKmp(reference, history=history, history_variance=variance)

@@ -1,4 +1,4 @@
-"""Make a motion pass through a point: add a via-point, which can be moved and removed."""
+"""Make a motion pass through a point: add, move and remove a via-point."""
 
 import numpy as np
 
@@ -10,10 +10,10 @@ reference = ReferenceTrajectory(times, means, np.tile(0.05**2 * np.eye(2), (80, 
 motion = Kmp(reference.times, reference.means, reference.covariances)
 
 instant, point = np.array([1.0]), np.array([0.5, 0.7])
-print("before   ", motion.mean(instant)[0].round(3), "±", np.sqrt(motion.covariance(instant)[0].diagonal()).round(3))
+print("original ", motion.mean(instant)[0].round(3), "±", np.sqrt(motion.covariance(instant)[0].diagonal()).round(3))
 name = motion.add_via_point(instant, point, 1e-6 * np.eye(2))
 print("through  ", motion.mean(instant)[0].round(3), "±", np.sqrt(motion.covariance(instant)[0].diagonal()).round(3))
 motion.move_via_point(name, instant, point + np.array([0.0, 0.1]), 1e-6 * np.eye(2))
 print("moved    ", motion.mean(instant)[0].round(3))
 motion.remove_via_point(name)
-print("forgotten", motion.mean(instant)[0].round(3))
+print("removed  ", motion.mean(instant)[0].round(3))

@@ -38,7 +38,7 @@ def import_recording(
     Args:
         source: File or folder.
         out: File to write, .npz or .csv; it must not exist.
-        signal: ROS topic or LeRobot feature; by default as `choose_signal` chooses. Not for CSV files.
+        signal: ROS topic or LeRobot feature, by default the choice of `choose_signal`; refused for CSV files.
         target: Pose of the task's target in the recording's frame, [x y z] in meters and [rx ry rz] in degrees.
         rate: Sampling rate of the result [1/s]; the recording's by default.
         csv_options: Units and conventions that a CSV file does not state, see `read_csv_files`.
@@ -113,7 +113,7 @@ def export_demonstrations(source: Path, out: Path, kind: str, rate: float | None
 
 
 def _at_rate(demonstrations: Demonstrations, rate: float) -> Demonstrations:
-    """Return the demonstrations resampled at a rate [1/s]; each begins at time zero."""
+    """Resample demonstrations at a rate [1/s], and shift each of them to begin at time zero."""
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"--rate is in samples per second and must be positive, not {rate}")
     samples = sum(float(t[-1] - t[0]) * rate for t in demonstrations.times)

@@ -25,9 +25,9 @@ from guiderail.tools.files import (
     write_atomically,
 )
 
-JUMP_RATIO = 150.0  # larger ratios of an output's largest and median speed indicate a jump
-GAP_RATIO = 10.0  # larger ratios of the longest and the median period indicate missing samples
-UNIT_RATIO = 20.0  # larger ratios of two motions' sizes indicate another unit: mm instead of m gives 1000, cm gives 100
+JUMP_RATIO = 150.0  # ratio of an output's largest to its median speed above which a jump is reported
+GAP_RATIO = 10.0  # ratio of the longest to the median sampling period above which missing samples are reported
+UNIT_RATIO = 20.0  # ratio of two motions' extents above which units are suspected to differ; m and mm differ by 1000
 
 
 def fit_bounds(
@@ -122,9 +122,10 @@ _MAX_COMPONENTS = 8  # largest number of mixture components in the comparison wi
 
 
 def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
-    """Return a warning if too few steps without actions stay within a standard deviation of the demonstrations.
+    """Return a warning if a task's motion without actions deviates from the demonstrations, otherwise None.
 
-    The result is None if at least `MIN_SHARE` of the steps do, or if the task has no demonstrations.
+    The motion deviates if less than the fraction `MIN_SHARE` of its steps lies within a standard deviation of the
+    demonstrations. A task without demonstrations has no warning.
 
     Raises:
         InputError: For an unknown task or option.
@@ -150,7 +151,8 @@ def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
 def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
     """Read demonstrations and return their number, durations, ranges and spread, with the fit of a primitive.
 
-    The latter is the deviation of a primitive with default parameters, or with `fit` the result of `fit_primitive`.
+    The fit is the deviation of a primitive with default parameters. If `fit` is True, it is the result of
+    `fit_primitive`.
 
     Args:
         file: File of demonstrations, or a folder of files.
@@ -188,7 +190,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         draw_demonstrations(common, draw)
         summary["picture"] = str(draw)
     summary |= fitted
-    remarks = [*other_units(demonstrations), *_irregularities(demonstrations), *_unended(file)]
+    remarks = [*other_units(demonstrations), *_irregularities(demonstrations), *_truncated_files(file)]
     remarks = [*remarks, *([summary["remark"]] if "remark" in summary else [])]
     return summary | ({"remark": "; ".join(remarks)} if remarks else {})
 
@@ -215,7 +217,7 @@ def _irregularities(demonstrations: Demonstrations) -> list[str]:
                 f"demonstration {index} has a gap of {periods[k]:.3g} after the time {times[k]:.4g}, and a median "
                 f"period of {np.median(periods):.3g}: check that no samples are missing"
             )
-        speeds = np.abs(np.diff(outputs, axis=0)) / periods[:, None]  # so a gap is no jump
+        speeds = np.abs(np.diff(outputs, axis=0)) / periods[:, None]  # a gap in time alone does not raise the speed
         for name, speed, values in zip(demonstrations.names, speeds.T, outputs.T, strict=True):
             k = int(speed.argmax())
             if speed.any() and speed[k] > JUMP_RATIO * np.median(speed[speed > 0.0]):
@@ -226,14 +228,13 @@ def _irregularities(demonstrations: Demonstrations) -> list[str]:
     return remarks
 
 
-def _unended(file: Path) -> list[str]:
-    """Return a sentence for each file whose last line has no line end, and which may therefore be cut."""
+def _truncated_files(file: Path) -> list[str]:
+    """Return a sentence for each CSV file that does not end with a line break and may therefore be truncated."""
     files = visible_files(file, (".csv",)) if file.is_dir() else [file] if file.suffix == ".csv" else []
-    ends = ((one, one.read_bytes()[-1:]) for one in files)
     return [
-        f"the last line of {one} has no line end: check that the file is whole"
-        for one, end in ends
-        if end not in (b"\n", b"\r")
+        f"the last line of {path} has no line end: check that the file is whole"
+        for path in files
+        if path.read_bytes()[-1:] not in (b"\n", b"\r")
     ]
 
 
@@ -251,7 +252,7 @@ def _default_deviation(common: Demonstrations) -> dict[str, Any]:
 
 
 def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceTrajectory:
-    """Return the reference of demonstrations; a single demonstration has the standard deviation `_variance_floor`."""
+    """Fit a reference; for a single demonstration, its standard deviation is `_variance_floor`."""
     floor = _variance_floor(common)
     if common.num_demonstrations == 1:
         return ReferenceTrajectory.from_demonstrations(common, components, prior_std=floor)
@@ -259,7 +260,7 @@ def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceT
 
 
 def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
-    """Return the parameters of a primitive that reproduces the demonstrations, and how well the defaults do.
+    """Return the parameters of a primitive that reproduces the demonstrations, and the deviation with the defaults.
 
     Raises:
         InputError: If there are fewer than three demonstrations, or too few steps.
@@ -291,8 +292,8 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))
     for o, (axis, name) in enumerate(zip(axes[:, 0], common.names, strict=True)):
         axis.plot(common.times[0], outputs[..., o].T, color="0.6", linewidth=0.8)
-        mean, wide = reference.means[:, o], 2 * reference.standard_deviations[:, o]
-        axis.fill_between(reference.times, mean - wide, mean + wide, color="tab:blue", alpha=0.25, linewidth=0)
+        mean, width = reference.means[:, o], 2 * reference.standard_deviations[:, o]
+        axis.fill_between(reference.times, mean - width, mean + width, color="tab:blue", alpha=0.25, linewidth=0)
         axis.plot(reference.times, mean, color="tab:blue")
         for bound in (outputs[..., o].min(), outputs[..., o].max()):
             axis.axhline(bound, color="firebrick", linewidth=0.8, linestyle="--")
@@ -302,12 +303,12 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
 
 
 def _variance_floor(demonstrations: Demonstrations) -> np.ndarray:
-    """Return a floor (O,) of the standard deviation, because demonstrations that agree have a singular covariance."""
+    """Return the smallest standard deviations (O,): identical demonstrations would have a singular covariance."""
     return 1e-3 * np.maximum(np.ptp(np.concatenate(demonstrations.outputs), axis=0), 1e-9)
 
 
 TEMPLATE_ENDINGS = (".yaml", ".yml")
-SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a transition distance that was read, by the unit in the file
+SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a loaded transition distance, by the unit in the template file
 
 
 def validate_template(file: Path, draw: Path | None = None) -> dict[str, Any]:

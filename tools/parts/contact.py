@@ -22,7 +22,8 @@ from guiderail.models.parts.solids import join_surfaces
 MODULUS = 2e9  # first modulus of the compliant part [Pa]
 MAX_MODULUS = 5e10  # largest modulus [Pa]
 SNAP_MODULI = (2e7, 5e7, 5e6)  # moduli of snapping bodies, in the order of the trials [Pa]
-# Commanded depths below the target [m]: tried in turn if bodies snap, until one seats the plug; otherwise the first.
+# Commanded depths below the target [m]. If bodies snap, they are tried in turn until the plug is seated. Otherwise the
+# first depth is used.
 PUSHES = (4.0 * MM, 8.0 * MM, 14.0 * MM)
 MISALIGNMENTS = ((1.5 * MM, 0.0), (0.0, 1.5 * MM))  # offsets (x, y) at which the socket must block the plug [m]
 MIN_SPEED = 2.0  # smallest desired real-time factor
@@ -165,10 +166,10 @@ def choose_contact(
 
 
 def rank(choice: Choice, allowed: float) -> tuple[bool, bool, bool, float]:
-    """Return a sort key, larger is better: seated plug, allowed penetration, and at least `MIN_SPEED`, in this order.
+    """Return a sort key; a better choice has a larger key.
 
-    Ties are broken by the larger speed if the penetration is allowed, otherwise by the smaller penetration.
-    `allowed` is the largest allowed penetration [m].
+    The criteria are a seated plug, a penetration of at most `allowed` [m], and a speed of at least `MIN_SPEED`, in this
+    order. Ties are broken by the larger speed if the penetration is allowed, otherwise by the smaller penetration.
     """
     seats = bool(choice.aligned.success)
     is_shallow = seats and choice.deepest <= allowed
@@ -186,11 +187,11 @@ def _make_station(folder: Path, file: Any) -> None:
 def _adapt_settings(
     folder: Path, contact: Contact, make_file: MakeFile, allowed: float, log: Callable[[str], None]
 ) -> list[Choice]:
-    """Return the choices tried; the settings of each follow from the penetration of the previous one.
+    """Return the choices in the order of the trials; each follows from the penetration of the previous choice.
 
-    Penetration that remains while the resting plug is pushed requires a larger modulus. Transient penetration is an
-    overshoot proportional to the time step and requires a smaller one. The dissipation stays at its default, because
-    less would eject the plug.
+    If the resting plug penetrates the socket while it is pushed, the modulus is increased. If the penetration is
+    transient, it is an overshoot proportional to the time step, and the time step is decreased. The dissipation stays
+    at its default, because a smaller dissipation would eject the plug.
     """
     choices: list[Choice] = []
     start = cpu_time()
@@ -200,7 +201,7 @@ def _adapt_settings(
         except RuntimeError:
             if not choices:
                 raise
-            break  # the previous settings work
+            break  # the previous settings could be simulated
         choices.append(choice)
         resting = max(trial.resting_penetration for trial in choice.trials)
         log(
@@ -232,13 +233,13 @@ def _try_contact(folder: Path, contact: Contact, make_file: MakeFile) -> Choice:
     """Return the trials with the first snap modulus and push depth that seat the plug, or the last ones tried."""
     from guiderail.tools.parts.trial import insert
 
-    for soft in SNAP_MODULI if contact.snapping else (contact.modulus,):
-        contact = replace(contact, snap_modulus=soft)
+    for modulus in SNAP_MODULI if contact.snapping else (contact.modulus,):
+        contact = replace(contact, snap_modulus=modulus)
         for push in PUSHES if contact.snapping else PUSHES[:1]:
             file = make_file(contact, push)
             aligned = insert(folder, file, snapping=contact.snapping_pieces)
             if aligned.success and aligned.lowest < -file.tolerance.height:
-                # Nothing stops the plug at the target: a push would move it past the target. `create_task` reports it.
+                # Nothing stops the plug at the target, so a push would move it past. `create_task` logs this case.
                 alternative = make_file(contact, 0.0)
                 unpushed = insert(folder, alternative, snapping=contact.snapping_pieces)
                 if unpushed.success:

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a gantry has no gravity
-CLEAR = 3.0 * MM  # height of the start above the rim [m]
+START_HEIGHT = 3.0 * MM  # height of the plug above the rim at the start [m]
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 180.0  # largest rotation at the bottom, either way [degrees]
 MAX_PITCH = 0.1  # largest advance per turn, either way [m]
@@ -89,27 +89,26 @@ def read_parts(
         raise InputError(
             f"{(plug, socket)[units.index(None)].name} does not say its unit: give --unit {', '.join(UNITS)}"
         )
-    first, second = (load_part(path, str(known)) for path, known in zip((plug, socket), units, strict=True))
+    plug_part, socket_part = (load_part(path, str(known)) for path, known in zip((plug, socket), units, strict=True))
     scale = UNITS[str(units[1])]
-    turned = Rotation.from_euler("xyz", pose[3:] * DEGREE).as_matrix()
-    first = first.transform(turned, pose[:3] * scale)
+    plug_part = plug_part.transform(Rotation.from_euler("xyz", pose[3:] * DEGREE).as_matrix(), pose[:3] * scale)
     z = np.array(AXES[axis], dtype=float)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.5 else np.array([0.0, 1.0, 0.0])
     to_target = np.stack([x, np.cross(z, x), z])
-    first, second = (part.transform(to_target, np.zeros(3)) for part in (first, second))
-    gaps = np.maximum(first.bounds[0] - second.bounds[1], second.bounds[0] - first.bounds[1])
+    plug_part, socket_part = (part.transform(to_target, np.zeros(3)) for part in (plug_part, socket_part))
+    gaps = np.maximum(plug_part.bounds[0] - socket_part.bounds[1], socket_part.bounds[0] - plug_part.bounds[1])
     if not gaps.max() <= MAX_GAP:
         raise InputError(
             f"the parts are {1e3 * gaps.max():.4g} mm apart: draw them assembled in one frame, or place the plug with "
             "--plug-pose"
         )
-    origin = np.array([*compute_center_of_mass(first)[:2], first.bounds[0, 2]])
+    origin = np.array([*compute_center_of_mass(plug_part)[:2], plug_part.bounds[0, 2]])
     if point is not None:
         on_axis = (to_target @ (point * scale))[:2]
         if not np.linalg.norm(on_axis - origin[:2]) <= MAX_CENTER:
             raise InputError(f"--center {point.tolist()} is not near the plug: give a point on the axis of insertion")
         origin[:2] = on_axis
-    return first.transform(np.eye(3), -origin), second.transform(np.eye(3), -origin)
+    return plug_part.transform(np.eye(3), -origin), socket_part.transform(np.eye(3), -origin)
 
 
 def create_task(
@@ -142,8 +141,8 @@ def create_task(
         axis: See `read_parts`.
         center: See `read_parts`.
         out: Folder; it must not exist.
-        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside; the mesh files
-            show the plug after this rotation.
+        turn: Rotation of the plug at the bottom [degrees], counterclockwise seen from outside. The mesh files have the
+            pose of the plug after this rotation.
         pitch: Advance of a screw per full turn during `turn` [m], positive if it is right-handed.
         search_turn: Largest unknown turn of the socket [degrees]; if positive, actions also turn the plug, for example
             to find the teeth of gears.
@@ -153,12 +152,12 @@ def create_task(
         scenario: Files of Drake model directives (.dmd.yaml) of the surroundings.
         hard_episodes: Largest number of episodes of each baseline policy for each setting in the calibration of
             `difficulty=hard`; 0: no calibration.
-        only_insert: Stop after the scripted insertions and leave no folder; for benchmarks.
+        only_insert: True to stop after the scripted insertions and to delete the folder, for benchmarks.
         log: Function called with a sentence on each intermediate result.
 
     Raises:
         InputError: If `out` exists, an argument is invalid, the parts cannot be used, or none of the demonstrations
-            that are checked in time seats the plug; no new folder is left then.
+            that are checked in time seats the plug. After an error, no new folder is left.
     """
     plug, socket, out = _as_path(plug, "the plug"), _as_path(socket, "the socket"), _as_path(out, "--out")
     scenarios = [_as_path(file, "--scenario") for file in scenario]
@@ -174,15 +173,17 @@ def create_task(
         parts = shrink_part(parts[0], shrink), parts[1]
         log(f"{plug.name}: its surface is moved inwards by {1e3 * shrink:g} mm (--shrink)")
     check_target(*parts)
-    path = plan_motion(*parts, turn * DEGREE, CLEAR, advance=abs(pitch * turn) / 360.0)
+    path = plan_motion(*parts, turn * DEGREE, START_HEIGHT, advance=abs(pitch * turn) / 360.0)
     clearance = measure_side_clearance(*parts, MAX_FLANK_SLOPE if pitch else MAX_WALL_SLOPE)
     log(f"{plug.name}: {_size(parts[0])}, {socket.name}: {_size(parts[1])}; the plug enters {1e3 * path.rim:.1f} mm")
     log(f"clearance between walls: {1e3 * clearance:.3f} mm" if np.isfinite(clearance) else "no walls face each other")
     tolerance = choose_tolerance(clearance)
-    (lean_plug, first), (lean_socket, second) = (decimate(part, tolerance) for part in parts)
-    snapping = _snapping(lean_plug, lean_socket, path, first + second)
+    (lean_plug, plug_deviation), (lean_socket, socket_deviation) = (decimate(part, tolerance) for part in parts)
+    overlap = plug_deviation + socket_deviation
+    snapping = _snapping(lean_plug, lean_socket, path, overlap)
     yaw = max(MIN_YAW, (1.0 + COMMANDED_TURN) * search_turn * DEGREE)
-    both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, max(first, second), snapping, yaw)
+    largest = max(plug_deviation, socket_deviation)
+    both = prepare_surfaces(lean_plug, lean_socket, path, tolerance, largest, snapping, yaw)
     surfaces = dict(zip(("plug", "socket"), both, strict=True))
     deviation = max(part.repair.moved + surface.deviation for part, surface in zip(parts, both, strict=True))
     counts = ", ".join(
@@ -191,7 +192,7 @@ def create_task(
     )
     log(f"triangles: {counts}; {_describe_deviation(1e3 * deviation, 1e3 * clearance)}")
     # Symmetry augmentation leaves turns unchanged, but a reflection reverses the turn that the policy searches for.
-    sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path, first + second)
+    sides = ((), ()) if search_turn else find_symmetries(lean_plug, lean_socket, path, overlap)
     log(f"symmetry: {len(sides[0])} of 7 candidate rotations and reflections, {len(sides[1])} more on the rim")
     prepared = {
         "clearance_mm": round(1e3 * clearance, 4) if np.isfinite(clearance) else None,
@@ -225,7 +226,7 @@ def create_task(
 
 
 def _seconds_since(start: float) -> float:
-    """Return the CPU time since `start`, a result of `cpu_time`, for a table [s]."""
+    """Return the CPU time since `start`, a result of `cpu_time`, rounded to 0.01 s [s]."""
     return round(cpu_time() - start, 2)
 
 
@@ -253,7 +254,7 @@ def _check_arguments(
     scenario: Sequence[Path],
     hard_episodes: int,
 ) -> None:
-    """Raise InputError for arguments that would otherwise be refused only after minutes."""
+    """Refuse invalid arguments at once; later steps would refuse them only after minutes."""
     values = {"turn": turn, "pitch": pitch, "search-turn": search_turn, "shrink": shrink, "force-limit": force_limit}
     for name, value in values.items():
         as_number(value, f"--{name}")
@@ -297,15 +298,17 @@ def _check_arguments(
 
 
 def _snapping(plug: Part, socket: Part, path: InsertionMotion, deviation: float) -> frozenset[int]:
-    """Return the indices of the plug's bodies that overlap the socket during the motion.
+    """Return the indices of the plug's snapping bodies, which overlap the socket during the motion.
 
-    `deviation` is the largest overlap caused by the decimation of both parts [m]. If all bodies overlap, the plug is a
-    rigid part that does not fit, and an InputError is raised.
+    `deviation` is the largest overlap caused by the decimation of both parts [m].
+
+    Raises:
+        InputError: If all bodies overlap: such a plug is a rigid part that does not fit.
     """
-    ways = find_obstructions(plug, socket, path)
-    blocked = frozenset(i for i, (depth, _) in enumerate(ways) if depth > MAX_RESTING_OVERLAP + deviation)
-    if blocked and len(blocked) == len(ways):
-        depth, height = max(ways)
+    overlaps = find_obstructions(plug, socket, path)
+    blocked = frozenset(i for i, (depth, _) in enumerate(overlaps) if depth > MAX_RESTING_OVERLAP + deviation)
+    if blocked and len(blocked) == len(overlaps):
+        depth, height = max(overlaps)
         raise InputError(
             f"the plug does not pass the socket: {1e3 * height:.1f} mm above the target they overlap by about "
             f"{1e3 * depth:.2g} mm; give its rotation with --turn and --center, or draw the part that deflects as a "
@@ -322,7 +325,7 @@ def _measure(
     start: float,
     log: Callable[[str], None],
 ) -> tuple[dict[str, Any], SearchNumbers]:
-    """Return the measurements of the chosen contact, and those that the scripted search uses."""
+    """Return the measurements of the chosen contact, and the numbers that the scripted search uses."""
     from guiderail.diagrams.tasks.part.file import SearchNumbers
     from guiderail.tools.parts.trial import insert, measure_lever_sign
 
@@ -400,7 +403,7 @@ def _write_task(
         log(f"{unchecked} of {NUM_DEMONSTRATIONS} demonstrations are not checked: the others took too much CPU time")
     measured["demonstrations_seated"] = f"{succeeded} of {checked}" + (f", {unchecked} unchecked" if unchecked else "")
     measured["total_s"] = _seconds_since(start)
-    # With the number in the file, no training has to search for it again, which takes seconds.
+    # Stored, because finding the number of components again takes every training some seconds.
     fitted = file.demonstrations.model_copy(update={"components": num_components(folder, file)})
     file = file.model_copy(update={"measured": measured, "demonstrations": fitted})
     write_task_file(folder, file)
@@ -452,7 +455,7 @@ def _task_file(
             },
             "a motion",
         ),
-        # Without a turn at the bottom, a wide limit suffices: the walls fix a seated plug's turn, or any turn fits.
+        # Without a rotation at the bottom, the limit is wide: either the walls fix the plug's turn, or any turn fits.
         tolerance=Tolerance.model_validate({} if path.turn else {"turn": MAX_SEATED_TURN}),
         force_limit=values["force_limit"],
         time_step=contact.time_step,
@@ -485,7 +488,7 @@ def ask_unit(paths: Sequence[Path], given: str | None) -> str | None:
     if any(not path.is_file() for path in paths):
         return given  # reading the files raises a clearer error later
     try:
-        # The prompt goes to standard error: standard output may be read by a program.
+        # The prompt is written to standard error, because a program may parse standard output.
         print(f"What is one unit of {paths[0].name}? ({', '.join(UNITS)}) [mm] ", end="", file=sys.stderr, flush=True)
         return input().strip() or "mm"
     except EOFError:

@@ -30,7 +30,7 @@ MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # smallest force limit [N]; ratio of force l
 MAX_TURN = 3.0  # largest turn of the socket [degrees]
 MAX_SECONDS = 300  # CPU time after which a calibration is stopped [s]
 SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
-PATIENCE = 1.0  # time after the search in which the push may still seat a plug [s]
+SEATING_TIME = 1.0  # time after the search in which the push may still seat the plug [s]
 NAME = "create-task/calibration"  # name of the task in the process that calibrates it
 
 
@@ -62,7 +62,7 @@ SETTINGS = (
     Setting(4.0 * MM, 2),
 )
 """Settings, the easiest for random actions first."""
-FIRST = 4  # index of the setting that is tried first
+FIRST = 4  # index of the first setting that is tried
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Score:
     """Successes of the baseline policies with one setting."""
 
     random: int  # number of successes of uniform random actions
-    random_episodes: int  # number of episodes of random actions; fewer than requested if the result was clear earlier
+    random_episodes: int  # number of episodes of random actions; fewer than requested if fewer decide the result
     scripted: int  # number of successes of the scripted search
     scripted_episodes: int  # number of episodes of the search; 0 if random actions succeed too often
 
@@ -83,6 +83,11 @@ class Score:
     def is_too_hard(self) -> bool:
         """True if the scripted search succeeds too seldom; False if it was not run."""
         return self.scripted < MIN_SCRIPTED * self.scripted_episodes
+
+    @property
+    def is_suitable(self) -> bool:
+        """True if both success rates are as required."""
+        return not (self.is_too_easy or self.is_too_hard)
 
     @property
     def margin(self) -> float:
@@ -100,9 +105,10 @@ class Score:
 def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, bool]:
     """Return one of `SETTINGS`, its score, and True if it has the required success rates.
 
-    The first setting has the index `FIRST`. After a setting that is too easy the next harder one is tried, and after
-    one that is too hard the next easier one, until one has the required rates or was already tried, or none is left.
-    If none has the required rates, the setting with the largest `margin` is returned; of several, the easiest.
+    The search begins at the index `FIRST`. If a setting is too easy, the next harder setting is tried; if it is too
+    hard, the next easier one. The search ends at a setting with the required rates, at a setting that was already
+    tried, or at the end of the list. Without a setting with the required rates, the setting with the largest `margin`
+    is returned, and the easiest of several with the same margin.
     """
     tried: dict[int, Score] = {}
     number = FIRST
@@ -111,18 +117,16 @@ def choose_setting(score: Callable[[Setting], Score]) -> tuple[Setting, Score, b
         if result.is_too_easy == result.is_too_hard:
             break
         number += 1 if result.is_too_easy else -1
-    best = max(
-        sorted(tried), key=lambda one: (not (tried[one].is_too_easy or tried[one].is_too_hard), tried[one].margin)
-    )
-    return SETTINGS[best], tried[best], not (tried[best].is_too_easy or tried[best].is_too_hard)
+    best = max(sorted(tried), key=lambda index: (tried[index].is_suitable, tried[index].margin))
+    return SETTINGS[best], tried[best], tried[best].is_suitable
 
 
 def count_successes(
     run: Callable[[int], bool], episodes: int, *, most_successes: float = math.inf, most_failures: float = math.inf
 ) -> tuple[int, int]:
-    """Run episodes until a limit is exceeded or all have run; return the numbers of successes and of episodes.
+    """Run at most `episodes` episodes; return the number of successes and the number of episodes.
 
-    `run` returns the success of the episode with an index. No further episode is run after more than `most_successes`
+    `run` returns the success of the episode with an index. The loop ends early after more than `most_successes`
     successes or `most_failures` failures.
     """
     successes = 0
@@ -134,13 +138,13 @@ def count_successes(
 
 
 class StopOnRim(gymnasium.Wrapper):
-    """Wrapper that truncates an episode if the plug is still on the rim `PATIENCE` seconds after the search."""
+    """Wrapper that truncates an episode if the plug is still on the rim `SEATING_TIME` after the search."""
 
     def __init__(self, env: gymnasium.Env, file: PartTaskFile):
         super().__init__(env)
         numbers = file.motion
         times, _ = numbers.plan_search()
-        self._progress = 2.0 * (times[SEARCH_END] + PATIENCE) / times[-1] - 1.0
+        self._progress = 2.0 * (times[SEARCH_END] + SEATING_TIME) / times[-1] - 1.0
         self._height = 2.0 * (numbers.rim - IN_SOCKET) / numbers.travel - 1.0
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -199,9 +203,14 @@ def calibrate(
 ) -> PartTaskFile:
     """Return the task file with calibrated options `hard` and their results; unchanged if the calibration fails.
 
-    If no setting has the required success rates, the options are those of the best one. The task folder must contain
-    `file`. The radius is the largest distance of the plug from the axis [m]. Each policy runs at most `episodes`
-    episodes with each setting. A sentence on the result is logged.
+    If no setting has the required success rates, the options of the best setting are used.
+
+    Args:
+        folder: Task folder, which must contain `file`.
+        file: Task file.
+        radius: Largest distance of the plug from the axis [m].
+        episodes: Largest number of episodes of each policy with each setting.
+        log: Function called with a sentence on the result.
     """
     force_limit = force_limit_of(file, float(file.measured["force"]))
     turn = file.motion.search_turn or turn_of(file.clearance, radius)

@@ -54,8 +54,8 @@ class Trial:
     penetration: float  # largest penetration of the parts [m], without snapping pieces
     resting_penetration: float  # largest penetration at the end of the motion, while the resting plug is pushed [m]
     snap: float  # largest penetration of snapping pieces [m]
-    real_time_factor: float  # simulated time per CPU time; the simulation of a blocked plug ends early
-    recording: Recording  # the `SIGNALS` of `guiderail.diagrams.envs.recording`
+    real_time_factor: float  # ratio of simulated time to CPU time; the simulation of a blocked plug ends early
+    recording: Recording  # recorded signals, `SIGNALS` of `guiderail.diagrams.envs.recording`
 
 
 class Depths:
@@ -105,11 +105,9 @@ class Depths:
                 body = plant.GetBodyFromFrameId(inspector.GetFrameId(geometry))
                 if body.name() not in self._surfaces:
                     continue
-                X_BW = body.EvalPoseInWorld(context).inverse()
-                inside = X_BW.multiply(points.T).T
-                snaps = any(inspector.GetName(one).split("::")[-1] in self._snapping for one in ids)
-                depth = float(self._surfaces[body.name()].find_nearest(inside.reshape(-1, 3))[1].max())
-                if snaps:
+                points_B = body.EvalPoseInWorld(context).inverse().multiply(points.T).T
+                depth = float(self._surfaces[body.name()].find_nearest(points_B.reshape(-1, 3))[1].max())
+                if any(inspector.GetName(geometry_id).split("::")[-1] in self._snapping for geometry_id in ids):
                     self.deepest_snap = max(self.deepest_snap, depth)
                 else:
                     self.deepest = max(self.deepest, depth)
@@ -166,7 +164,7 @@ def insert(
     driven.simulator.set_monitor(monitor)
     start = time.process_time()
     recording = driven.run()
-    driven.simulator.clear_monitor()  # Drake never frees the diagram; a monitor would keep the surfaces
+    driven.simulator.clear_monitor()  # Drake never frees the diagram, and the monitor holds the surfaces in memory
     spent = time.process_time() - start - depths.seconds
     pose = _plug_pose(driven)
     lowest = float(min(lowest, pose[2]))
@@ -193,7 +191,7 @@ def _plug_pose(driven: DrivenStation) -> np.ndarray:
 def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) -> int:
     """Return 1 if the center of pressure of a misaligned plug lies towards the socket's axis, otherwise -1.
 
-    `pushed` holds the offset (x, y) of the socket [m] and the recording of each trial.
+    `pushed` has the offset (x, y) of the socket [m] and the recording of each trial.
     """
     towards = 0.0
     for offset, recording in pushed:
@@ -209,7 +207,7 @@ _SCALE = 10.0  # magnification, because the page's camera cannot get close to sm
 def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) -> None:
     """Write a page that animates a trial: the parts and, initially hidden, the contact pieces in different colors.
 
-    Tetrahedra are not shown. The meshes are those of `file` in `folder`.
+    The meshes are those of `file` in `folder`.
 
     Raises:
         InputError: If the environment forbids Drake to open a network port.
@@ -223,7 +221,7 @@ def write_preview(page: Path, folder: Path, file: PartTaskFile, trial: Trial) ->
         _show(meshcat, f"/{name}/seen", folder / part.visual, _SOLID[name])
         for piece in part.pieces:
             if not piece.file.endswith(".obj"):
-                continue  # Meshcat shows no tetrahedra
+                continue  # Meshcat cannot render tetrahedra
             color = Rgba(*rng.uniform(0.25, 0.95, 3), 1.0)
             _show(meshcat, f"/{name}/contact/{Path(piece.file).stem}", folder / piece.file, color)
         meshcat.SetProperty(f"/{name}/contact", "visible", False)
@@ -250,7 +248,7 @@ MAX_SESSIONS = 3  # largest number of attempts at each demonstration; the first 
 
 
 def demonstrate(folder: Path, file: PartTaskFile) -> tuple[int, int]:
-    """Write the demonstrations; return how many of them seat the plug, and how many were checked in time."""
+    """Write the demonstrations; return the number that seat the plug, and the number that were checked in time."""
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
     press_from = numbers.rim - numbers.press - 1e-3
@@ -306,8 +304,8 @@ def add_convex_pieces(
 ) -> PartTaskFile:
     """Return the task file with the names of both parts' convex pieces; unchanged if cutting or an insertion fails.
 
-    A part whose contact geometry is convex pieces keeps them. From the surface of another part, pieces are cut and
-    written; they may exceed the surface by twice the `tolerance` [m]. A sentence on the result is logged.
+    If the contact geometry of a part consists of convex pieces, they are used. Otherwise pieces are cut from its
+    surface and written; they may exceed the surface by twice the `tolerance` [m]. A sentence on the result is logged.
     """
     written: list[Path] = []
     changes: dict[str, PartModel] = {}
@@ -341,10 +339,11 @@ def add_convex_pieces(
 
 
 def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> tuple[bool, bool]:
-    """Insert the plug straight on `station=mujoco`, at an `offset` along x [m]; return if it is seated and if blocked.
+    """Insert the plug straight on `station=mujoco`, at an `offset` along x [m]; return the flags seated and blocked.
 
-    A seated plug is at the target at the end. A blocked plug always stayed above the target by more than the height
-    tolerance. A plug that was pushed down next to the target is neither. The task file need not be written yet.
+    A seated plug is at the target at the end. A blocked plug always stays above the target by more than the height
+    tolerance. If the plug is pushed down next to the target, both flags are False. The task file need not be written
+    yet.
     """
     times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset

@@ -80,7 +80,7 @@ class ForceGauge:
         R = RotationMatrix.MakeFromOneVector(force if size > MIN_FORCE else [0.0, 0.0, 1.0], 2).matrix()
         arrow = R[:, 2] * share * self._length
         self._meshcat.SetTransform(f"{PATH}/shaft", _scaled_pose(R, self._tail + 0.5 * arrow, share * self._length))
-        # The cone's tip is its origin, and it opens along z: it is turned over and moved forward by its height.
+        # Meshcat's cone has its origin at its tip and opens along z. It is turned over and moved by its height.
         tip = self._tail + arrow + R[:, 2] * self._head
         self._meshcat.SetTransform(f"{PATH}/head", _scaled_pose(R @ np.diag([1.0, -1.0, -1.0]), tip))
         height = share * self._length
@@ -93,7 +93,7 @@ class ForceGauge:
 
 
 def _scaled_pose(R: np.ndarray, p: np.ndarray, length: float = 1.0) -> np.ndarray:
-    """Return the transform (4, 4) that scales an object 1 m long in z to `length` [m] and moves it to a pose."""
+    """Return the transform (4, 4) that scales an object of length 1 m in z to `length` [m] and moves it to a pose."""
     X = np.eye(4)
     X[:3, :3] = R @ np.diag([1.0, 1.0, length])
     X[:3, 3] = p
@@ -114,17 +114,17 @@ BUTTONS = {KEEP: "Enter", DISCARD: "Backspace", UNDO: "KeyU", SLOW: "KeyM", END:
 # Largest speed of the command [m/s], [rad/s].
 MAX_SPEED = np.array([20 * MM, 20 * MM, 20 * MM, 60 * DEGREE, 20 * DEGREE, 20 * DEGREE])
 SLOW_RATE = 0.25  # rate of slow motion relative to real time
-UNDO_TIME = 1.0  # motion that one undo takes back [s]
-MAX_UNDOS = 60  # largest number of consecutive undos; each needs a copy of the simulation's state
+UNDO_TIME = 1.0  # duration of the motion that one undo removes [s]
+MAX_UNDOS = 60  # largest number of consecutive undos; each one needs a copy of the simulation's state
 FORCE_STEPS = 5  # control steps between updates of the gauge: more frequent updates would delay the page
-MIN_ROOM = 1_000_000  # room for the file of demonstrations [bytes], such as two minutes in a .csv file
+MIN_ROOM = 1_000_000  # required disk space for the demonstrations [bytes], enough for two minutes in a .csv file
 MIN_STEPS = 10  # smallest number of control steps of a demonstration
 MAX_REST = 0.1  # longest rest of the command in a demonstration [s]
 
 
 @dataclass(frozen=True)
 class _Snapshot:
-    """State before a control step, to which an undo returns."""
+    """State before a control step, which an undo restores."""
 
     context: Context  # copy of the root context
     steps: int  # number of simulated control steps
@@ -136,11 +136,11 @@ class _Snapshot:
 
 @dataclass
 class _Recording:
-    """Demonstration that is being recorded; rests, in which the operator looks and thinks, are shortened."""
+    """Demonstration that is being recorded; rests of the command are shortened to `MAX_REST`."""
 
     commands: list[np.ndarray] = field(default_factory=list)  # commanded poses of the recorded control steps
     resting: int = 0  # control steps for which the command has not changed
-    # States to which undos return; above `MAX_UNDOS`, the oldest are dropped.
+    # States that undos restore; above `MAX_UNDOS`, the oldest are dropped.
     snapshots: deque[_Snapshot] = field(default_factory=lambda: deque(maxlen=MAX_UNDOS))
 
     def add(self, command: np.ndarray, period: float) -> None:
@@ -254,9 +254,10 @@ class DemonstrationRecorder:
             self._gauge.show(self._force())
 
     def undo(self) -> None:
-        """Take back about the last second of motion: robot, parts, command and sliders.
+        """Undo about the last second of motion: restore robot, parts, command and sliders.
 
-        A pause before this motion is kept. At most `MAX_UNDOS` states are stored, at least one second apart.
+        A pause before this motion stays in the recording. At most `MAX_UNDOS` states are stored, at least one second
+        apart.
         """
         snapshots = self.recording.snapshots
         if not snapshots:
@@ -282,8 +283,8 @@ class DemonstrationRecorder:
             A sentence on the demonstration.
 
         Raises:
-            InputError: If the demonstration is too short, has no motion, or can be written neither to the file nor to a
-                temporary folder or the home folder; it is then not kept.
+            InputError: If the demonstration is too short, has no motion, or cannot be written to the file, a temporary
+                folder or the home folder. The demonstration is then not kept.
         """
         commands = np.array(self.recording.commands)
         if self.steps < MIN_STEPS or not np.ptp(commands, axis=0).any():
@@ -308,7 +309,7 @@ class DemonstrationRecorder:
         success = next((term for term in task.termination_terms() if term.termination == "success"), None)
         if success is None or list(success.inputs) != [task.workpiece]:
             return None
-        # As in the task's own success: the plant's context holds no simulated poses if another engine simulates.
+        # Read from the station's output port: if another engine simulates, the plant's context lacks the poses.
         context = self.station.GetMyContextFromRoot(self.simulator.get_context())
         poses = self.station.GetOutputPort("body_poses").Eval(context)
         bodies = (self.station.plant.GetBodyByName(name) for name in (task.fixture, task.workpiece))
@@ -342,7 +343,7 @@ class DemonstrationRecorder:
         }
 
     def _unused_path(self) -> Path:
-        """Return `out`, or the path of a new file next to it if there is a file that this session has not written."""
+        """Return `out`, or a new path next to it if another program wrote the file `out`."""
         path, number = self.out, 1
         while (version := _file_version(path)) is not None and (path != self.out or version != self._written):
             number += 1
@@ -357,7 +358,7 @@ class DemonstrationRecorder:
         """Set the target rate relative to real time."""
         if rate != self.simulator.get_target_realtime_rate():
             self.simulator.set_target_realtime_rate(rate)
-            # Without this, Drake would run faster or wait until the average rate since the start equals the new rate.
+            # Otherwise Drake would run faster or wait until the average rate since the start equals the new rate.
             self.simulator.ResetStatistics()
 
     def _press(self, button: str, log: Callable[[str], None]) -> None:
@@ -377,7 +378,7 @@ class DemonstrationRecorder:
             self._is_slow = not self._is_slow
 
     def _steps_since_snapshot(self) -> float:
-        """Return the control steps since the last snapshot, infinity if there is none."""
+        """Return the control steps since the last snapshot; infinity without a snapshot."""
         snapshots = self.recording.snapshots
         return self.steps - snapshots[-1].steps if snapshots else np.inf
 
@@ -396,7 +397,7 @@ class DemonstrationRecorder:
 
 
 def _file_version(path: Path) -> tuple[int, int] | None:
-    """Return numbers that change when any program writes the file (time [ns] and size); None if there is no file."""
+    """Return the modification time [ns] and the size of a file [bytes]; None if there is no file."""
     try:
         status = path.stat()
     except OSError:

@@ -18,7 +18,7 @@ from guiderail.tools.learning.interventions import Supervisor
 DEAD_ZONE = 0.15  # largest deflection of a gamepad's axis that moves no slider
 CAMERA_NEAR = 1e-3  # near clipping distance of the page's camera [m]
 
-# Keys that lower and raise each input, as JavaScript's codes, and the gamepad axis of each input with its sign.
+# Pair of keys that lower and raise each input (JavaScript codes), and gamepad axis of each input with its sign.
 KEY_PAIRS = (("KeyA", "KeyD"), ("KeyS", "KeyW"), ("KeyF", "KeyR"), ("KeyJ", "KeyL"), ("KeyK", "KeyI"), ("KeyH", "KeyY"))
 GAMEPAD_AXES = ((0, 1.0), (1, -1.0), (3, -1.0), (2, 1.0), (4, 1.0), (5, 1.0))
 
@@ -29,8 +29,8 @@ class Slider:
 
     limit: float  # largest magnitude of the value
     step: float  # change by one key press
-    keys: tuple[str, str]  # keys that lower and raise the value, as JavaScript's codes
-    scale: float = 1.0  # factor from the slider's unit to that of the input
+    keys: tuple[str, str]  # keys that lower and raise the value, as JavaScript codes
+    scale: float = 1.0  # factor from the slider's unit to the input's unit
     speed: float = 0.0  # change of the value per second at full deflection of its gamepad axis; 0: no axis moves it
 
 
@@ -141,7 +141,7 @@ class MeshcatSupervisor(Supervisor):
             time.sleep(0.1)
 
     def on_episode_start(self, env: gymnasium.Env) -> None:
-        """Show an episode of `env` with all sliders at zero; earlier clicks are dropped, except a stop.
+        """Show an episode of `env` with all sliders at zero; drop earlier clicks, except on the stop button.
 
         Raises:
             InputError: If an action has more numbers than there are sliders with keys.
@@ -166,7 +166,7 @@ class MeshcatSupervisor(Supervisor):
         return values if values.any() else None
 
     def label(self) -> str | None:
-        """Return the label clicked since the last call, or None; of several labels, the last one in `LABELS`."""
+        """Return the label clicked since the last call, or None; if several were clicked, the last one in `LABELS`."""
         labels = [label for button, label in LABELS.items() if self.panel.take_clicks(button)]
         labels += ["stop"] * self._is_stop_pending
         self._is_stop_pending = False

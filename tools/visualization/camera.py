@@ -27,7 +27,7 @@ PATH = "#00a33a"  # color of the robot's path
 
 
 class Frames(EnvCallback):
-    """Camera frames of an episode, evenly spaced over its length, which is not known in advance.
+    """Camera frames of an episode, evenly spaced although the length of the episode is not known in advance.
 
     The environment must have been created with `render_mode="rgb_array"`.
 
@@ -36,7 +36,7 @@ class Frames(EnvCallback):
     """
 
     def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
-        """Construct the callback; `max_frames` must be even, so that the frames stay evenly spaced."""
+        """Construct the callback; `max_frames` must be even, or the spacing of the frames would become uneven."""
         super().__init__(env)
         self._max_frames = max_frames
 
@@ -59,7 +59,7 @@ class Frames(EnvCallback):
         self.frames.append((time, transition.info["contact_force"], self.env.render()))
 
     def select(self, number: int) -> list[Any]:
-        """Return `number` evenly spaced frames, from the first to the last."""
+        """Return `number` evenly spaced frames, including the first and the last."""
         return [self.frames[i] for i in np.linspace(0, len(self.frames) - 1, number).round().astype(int)]
 
 
@@ -141,7 +141,7 @@ def path_in_picture(base: Any) -> np.ndarray:
 
 
 def draw_frames(axes: Iterable[Axes], frames: list[Any], letter: str = "") -> None:
-    """Draw a frame with its path into each of the axes, numbered if a letter is given."""
+    """Draw a frame with its path into each of the axes; with a letter, number the frames."""
     for number, (axis, (time, force, image, path)) in enumerate(zip(axes, frames, strict=True), start=1):
         axis.imshow(image)
         axis.plot(*path.T, color=PATH, linewidth=1.0, scalex=False, scaley=False)

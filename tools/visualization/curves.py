@@ -17,8 +17,10 @@ from guiderail.tools.visualization.style import color, legend_above, new_figure,
 def draw_passage(axis: Axes, demonstrations: bool = True, *, named: bool = False) -> None:
     """Draw the narrow passage: walls, forbidden zone, obstacle and goal.
 
-    With `demonstrations`, they are drawn in gray. With `named`, zone, obstacle, goal and demonstrations are labeled for
-    a legend.
+    Args:
+        axis: Axes.
+        demonstrations: True to draw the demonstrations in gray.
+        named: True to label zone, obstacle, goal and demonstrations for a legend.
     """
     passage = PassageGeometry()
     zone, obstacle, goal, path_label = ("forbidden zone", "obstacle", "goal", "demonstration") if named else 4 * ("",)
@@ -85,7 +87,7 @@ def plot_run(run: Path) -> Path:
         axis.set(ylabel=label)
     violation, force, jerk = pairs
     violation.axhline(0, color="firebrick", linewidth=0.8)
-    force.set_ylim(0.0, max(1.0, force.get_ylim()[1]))  # without contact, a flat line instead of magnified noise
+    force.set_ylim(0.0, max(1.0, force.get_ylim()[1]))  # numerical noise without contact is not magnified
     jerk.set(yscale="log" if (column["jerk_commanded_linear"] > 0).all() else "linear")
     for axis in (terms, *pairs):
         legend_above(axis)

@@ -35,7 +35,7 @@ from guiderail.tools.files import check_page, write_atomically
 _LOGGER = logging.getLogger(__name__)
 
 POINTS = 400  # largest number of samples of an episode, about the width of a page in pixels
-DRAWN = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's tree
+VISUALIZER_PATH = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's scene tree
 DIGITS = 5  # significant digits of a plotted number
 
 
@@ -55,7 +55,7 @@ class Motion(EnvCallback):
         self._actions: list[np.ndarray] = []
         inspector = self._eval_query(self.base.simulator.get_context()).inspector()
         self._frames = {
-            f"{DRAWN}/{inspector.GetName(frame).replace('::', '/')}": frame
+            f"{VISUALIZER_PATH}/{inspector.GetName(frame).replace('::', '/')}": frame
             for frame in inspector.GetAllFrameIds()
             if frame != inspector.world_frame_id()
             and inspector.NumGeometriesForFrameWithRole(frame, Role.kIllustration) > 0
@@ -74,9 +74,9 @@ class Motion(EnvCallback):
     def data(self) -> dict[str, Any]:
         """Return the episode as numbers for a page: `times` [s], `frames`, and the signals at those times.
 
-        `frames` maps each body's path in Meshcat's tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32 in
-        base64; a body that never moved has a single pose. Forces [N] and violations are the largest since the previous
-        sample, so that no peak is lost; violations are None without constraints. `time` is in percent of the longest
+        `frames` maps each body's path in Meshcat's scene tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32
+        in base64; a body that never moved has a single pose. To preserve peaks, forces [N] and violations are the
+        largest since the previous sample. Violations are None without constraints. `time` is in percent of the longest
         possible episode. An episode that failed before its first control step has one sample.
         """
         trace = self.base.trace
@@ -114,7 +114,7 @@ class Motion(EnvCallback):
         time = root.get_time()
         if time == 0.0:
             self._poses.clear()
-        # The tolerance is far below a step of the simulation, and far above rounding errors.
+        # The tolerance is far smaller than a simulation step, and far larger than rounding errors.
         if time > len(self._poses) * self._period - 1e-6:
             query = self._eval_query(root)
             poses = [query.GetPoseInWorld(frame) for frame in self._frames.values()]
@@ -139,7 +139,7 @@ def _encode(poses: np.ndarray) -> str:
 
 
 def _with_first(values: np.ndarray) -> list[float]:
-    """Return the values at the ends of control steps, with the first one also at time zero."""
+    """Return the values at the ends of control steps, and the first value also at time zero."""
     rounded = [float(f"{value:.{DIGITS}g}") for value in values]
     return [rounded[0], *rounded]
 
@@ -151,7 +151,7 @@ TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=T
 TRANSPARENCY = 0.35  # opacity of bodies when the page shows them transparent
 EPISODES = 4  # number of held-out episodes
 
-GREY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
+GRAY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
 GREEN, RED = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0)
 PALE = 0.3  # opacity of the paths of episodes that are not selected
 
@@ -211,17 +211,18 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     motion = Motion(env)
     rows, recorded = [], []
     for side, act in sides.items():
-        of_side = []
+        side_episodes = []
         for index in range(episodes):
             row = rollout(env, act, motion, seed=episode.seed + index, held_out=True)
             rows.append(row)
             unit, scale = violation_unit(constraints, base.trace.measured.shape[1])
-            of_side.append(motion.data() | {"outcome": outcome(row), "numbers": _format_numbers(row, unit, scale)})
+            numbers = {"outcome": outcome(row), "numbers": _format_numbers(row, unit, scale)}
+            side_episodes.append(motion.data() | numbers)
             path = scene.to_world(base.trace.measured.copy())
             _draw(meshcat, f"/guiderail/{side.name}/{index}", path, 2.0 * scene.line_radius, side.color)
-        recorded.append({"name": side.name, "color": _css(side.color), "rgba": side.color, "episodes": of_side})
+        recorded.append({"name": side.name, "color": _css(side.color), "rgba": side.color, "episodes": side_episodes})
     for name, lines, radius, color in (
-        ("demonstrations", [scene.to_world(d) for d in scene.demonstrations], scene.line_radius, GREY),
+        ("demonstrations", [scene.to_world(d) for d in scene.demonstrations], scene.line_radius, GRAY),
         ("constraint", scene.constraint, 2.0 * scene.line_radius, RED),
     ):
         for index, points in enumerate(lines):
@@ -242,7 +243,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     }
     page = meshcat.StaticHtml()
     env.close()
-    legend = [(_css(GREY), "demonstrations")] * bool(scene.demonstrations)
+    legend = [(_css(GRAY), "demonstrations")] * bool(scene.demonstrations)
     legend += [(_css(RED), "the constraint")] * bool(len(scene.constraint))
     caption = TEMPLATE.render(
         heading=episode.heading,
@@ -254,7 +255,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         run=episode.run,
         # In the frame of Meshcat's camera, y points up.
         views=[(name, *([x, z, -y] for x, y, z in camera)) for name, camera in views.items()],
-        # Escaped, so that the name of a body cannot end the script or open a comment in it.
+        # Escaped: otherwise the name of a body could end the script or begin a comment.
         data=json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     )
     write_atomically(html, _insert(page, episode.heading, caption).encode())
@@ -264,7 +265,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
 def find_report(html: Path, run: Path | None) -> str | None:
     """Return the path of a report relative to the page; None without a report.
 
-    It is looked for in the page's folder, the run's folder and the folder of the run's study, in this order.
+    The report is searched in the page's folder, the run's folder and the folder of the run's study, in this order.
     """
     folders = [html.parent, *([] if run is None else [run, run.parent])]
     report = next((folder / "report.html" for folder in folders if (folder / "report.html").is_file()), None)
@@ -272,7 +273,7 @@ def find_report(html: Path, run: Path | None) -> str | None:
 
 
 def _format_numbers(row: Mapping[str, Any], unit: str, scale: float) -> str:
-    """Format a row's return and its largest constraint violations, with `scale` units per m or rad."""
+    """Format a row's return and largest constraint violations; `scale` is the number of units per m or rad."""
     violations = (
         f"{name} {'none' if row[key] <= TOLERANCE else f'{scale * row[key]:.2g} {unit}'}"
         for name, key in (("commanded", "max_commanded_violation"), ("measured", "max_measured_violation"))
@@ -285,7 +286,7 @@ def _css(color: tuple[float, ...]) -> str:
 
 
 def _draw(meshcat: Any, name: str, points: np.ndarray, radius: float, color: tuple[float, ...]) -> None:
-    """Draw a path as a tube, because browsers draw all lines one pixel wide; a single point is not drawn."""
+    """Draw a path of at least two points as a tube, because browsers draw all lines one pixel wide."""
     if len(points) < 2:
         return
     vertices, faces = tube(points, radius)

@@ -35,7 +35,7 @@ from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above,
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")
 )
-UNCONSTRAINED = -1e20  # violations below this value mean that there is no constraint
+UNCONSTRAINED = -1e20  # a violation below this value means that there is no constraint
 DescribeDifferences = Callable[[RunConfig], Sequence[str]]
 
 
@@ -219,7 +219,7 @@ def _source(safety: dict[str, list[dict[str, Any]]]) -> str:
 
 
 def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDifferences) -> list[dict[str, Any]]:
-    """Return the differences from the reference: first those of all methods, then those of individual ones."""
+    """Return the differences from the reference: first the differences of all methods, then those of single methods."""
     of_methods = {
         name: list(dict.fromkeys(text for run in runs for text in describe_differences(run.config)))
         for name, runs in methods.items()
@@ -245,7 +245,7 @@ def _configuration(methods: dict[str, list[Run]]) -> tuple[Table | None, Table]:
 
 
 def _settings(runs: Sequence[Run]) -> dict[str, str]:
-    """Return every setting of a method's runs as text; different values of several seeds are listed."""
+    """Return every setting of a method's runs as text; if the seeds have different values, all values are listed."""
     settings = [
         {**flat(run.config), "preset": run.config.preset, "episodes": len(run.episodes), "seeds": run.config.seed}
         for run in runs
@@ -291,7 +291,7 @@ def _count(number: int, noun: str) -> str:
 
 SIZE = (4.6, 3.0)  # size of a figure [in]; two fit side by side on a wide screen
 STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "guiderail", "font.size": 9.0}
-DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # so that coinciding curves can be distinguished
+DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (6, 1.5, 1, 1.5)))  # line styles that distinguish coinciding curves
 
 
 def _curve(data: ReportData, task: str, column: str, label: str) -> str:
@@ -318,10 +318,8 @@ def _survival_curve(data: ReportData, task: str) -> str:
         axis = axes[0, 0]
         colors = data.colors(task)
         for (name, runs), dash in zip(data.methods(task).items(), cycle(DASHES), strict=False):
-            after, lengths = (
-                [episodes_to_convergence(run.episodes) for run in runs],
-                [len(run.episodes) for run in runs],
-            )
+            after = [episodes_to_convergence(run.episodes) for run in runs]
+            lengths = [len(run.episodes) for run in runs]
             steps, left = survival(after, lengths)
             steps, left = np.append(steps, max(lengths)), np.append(left, left[-1])
             axis.step(steps, left, where="post", color=colors[name], linestyle=dash, label=_label(name, runs))
@@ -366,11 +364,11 @@ def _held_out_figure(data: ReportData) -> str:
 
 
 def _label(name: str, runs: list[Run]) -> str:
-    return f"{name} ({len(runs)} seed{'s' if len(runs) > 1 else ''})"
+    return f"{name} ({_count(len(runs), 'seed')})"
 
 
 def _svg(figure: Any, description: str) -> str:
-    """Return a figure as an SVG element, which keeps its aspect ratio at any width."""
+    """Return a figure as an SVG element, whose aspect ratio does not depend on its width."""
     content = io.StringIO()
     figure.savefig(content, format="svg", metadata={"Date": None, "Creator": None})
     text = content.getvalue()

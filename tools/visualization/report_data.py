@@ -50,7 +50,10 @@ STEP_LOG_COLUMNS = (
 def _extremes(rows: pd.DataFrame, prefix: str, force: str) -> dict[str, Any]:
     """Return the numbers and maxima of commanded and measured violations, and the peak force.
 
-    The columns of violations begin with `prefix`, and `force` is the column of forces.
+    Args:
+        rows: Table of episodes or of control steps.
+        prefix: Prefix of the columns of violations.
+        force: Name of the column of forces.
     """
     result: dict[str, Any] = {}
     for kind in ("commanded", "measured"):
@@ -110,7 +113,7 @@ class ReportData:
     runs: list[Run] = field(default_factory=list)  # runs with at least one episode
     # Counts of successes, a row for each method, policy, seed, checkpoint and evaluation set.
     held_out: pd.DataFrame = field(default_factory=pd.DataFrame)
-    is_study: bool = False  # True if a folder contains a study's table
+    is_study: bool = False  # True if one of the folders contains a study's table
     folder_names: list[str] = field(default_factory=list)  # unique name of each run's folder
 
     @property
@@ -225,7 +228,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
 
 
 def _source(folder: Path, study: str) -> str:
-    """Return the file from which a study was run, with the option that its imports need, as words of a command."""
+    """Return the arguments of `guiderail study` for a study: its file, and the option that its imports need."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         source = json.loads(source_file(folder, study).read_bytes())
         return shlex.quote(str(source["file"])) + " --trust-imports" * bool(source["imports"])
@@ -233,10 +236,11 @@ def _source(folder: Path, study: str) -> str:
 
 
 def _studies_of(name: str, table: pd.DataFrame) -> list[str]:
-    """Return the possible names of the study of which the table `name` is a part; none if no suffix matches.
+    """Return the possible names of the whole study if the table `name` is a part of a study.
 
-    The name of a partial study's table is the study's name, then all methods of the table, its seeds, or both, joined
-    by dashes (`Study.subset_name`). The seeds in the name are those of a method that declares no seeds of its own.
+    A part is named after the whole study, followed by all methods of the table, its seeds, or both, joined by dashes
+    (`Study.subset_name`). Methods that declare seeds of their own are ignored for the seeds in the name. The list is
+    empty if no such suffix matches.
     """
     seeds = {
         str(method): [*dict.fromkeys(map(str, rows["seed"]))] for method, rows in table.groupby("method", sort=False)
@@ -265,7 +269,7 @@ def _success_counts(rows: pd.DataFrame, file: Path) -> pd.DataFrame:
 
 
 def _evaluated(run: Run, episodes: int) -> pd.DataFrame:
-    """Return the counts of a run's held-out episodes; if `episodes` is not 0, evaluate them unless they are stored."""
+    """Return the counts of a run's stored held-out episodes; if `episodes` is not 0, first evaluate missing ones."""
     if episodes:
         environment = run.config.environment
         evaluate_trained(RunFolder(run.path), run.config, episodes)
@@ -294,7 +298,7 @@ def _name_methods(runs: list[Run]) -> None:
         _name_sources(task_runs, settings)
         keys = list(dict.fromkeys(key for one in settings for key in one))
         differing = [key for key in keys if len({repr(one.get(key)) for one in settings}) > 1]
-        # Options that come with a guidance or an algorithm are implied by its name.
+        # The name of a guidance or an algorithm implies its options.
         by_name = [key for key in ("guidance", "algorithm") if key in differing]
         names = {tuple(one.get(key) for key in by_name) for one in settings}
         methods = {tuple(repr(one.get(key)) for key in differing) for one in settings}
@@ -340,9 +344,9 @@ def command(config: RunConfig, out: str) -> str:
     words += ["--algorithm", config.learner.algorithm]
     words += [] if config.preset is None else ["--preset", config.preset]
     words += ["--episodes", str(config.episodes), "--seed", str(config.seed)]
-    usual = asdict(PRESETS[config.preset]) if config.preset in PRESETS else {}
+    of_preset = asdict(PRESETS[config.preset]) if config.preset in PRESETS else {}
     for key, value in asdict(config.learner).items():
-        if key != "algorithm" and usual.get(key) != value:
+        if key != "algorithm" and of_preset.get(key) != value:
             text = ",".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
             words += ["--set", f"{key}={text}"]
     for key, value in environment.items():

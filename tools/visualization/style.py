@@ -17,7 +17,7 @@ from guiderail.tools.files import check_picture, write_atomically
 
 
 def label(guidance: str) -> str:
-    """Return the label of a guidance in a legend; an unknown guidance is its own label."""
+    """Return the label of a guidance in a legend; for an unknown guidance, its name."""
     return GUIDANCE.get(guidance).label if guidance in GUIDANCE.names() else guidance
 
 
@@ -90,13 +90,13 @@ def draw_runs(
 
 
 def legend(figure: Figure, axis: Axes) -> None:
-    """Draw one legend above all axes, where it covers no data."""
+    """Draw one legend above all axes, outside of the data."""
     handles, labels = axis.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels), frameon=False)
 
 
 def legend_above(axis: Axes, columns: int = 3) -> None:
-    """Draw a legend above one of several axes, where it covers no data."""
+    """Draw a legend above one of several axes, outside of the data."""
     if axis.get_legend_handles_labels()[1]:
         place: dict[str, Any] = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "borderaxespad": 0.2}
         axis.legend(frameon=False, fontsize=8, ncols=columns, **place)

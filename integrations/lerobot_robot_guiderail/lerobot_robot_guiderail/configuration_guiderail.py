@@ -29,7 +29,7 @@ class GuiderailConfig(PreTrainedConfig):
 
     @property
     def observation_delta_indices(self) -> None:
-        """None: the policy uses the present observation."""
+        """None: the policy uses only the current observation."""
 
     @property
     def action_delta_indices(self) -> None:
@@ -40,7 +40,7 @@ class GuiderailConfig(PreTrainedConfig):
         """None: the policy is not trained here."""
 
     def get_optimizer_preset(self) -> AdamConfig:
-        """Return the optimizer's configuration, which nothing uses."""
+        """Return the default configuration of Adam; LeRobot requires a value, which is not used."""
         return AdamConfig()
 
     def get_scheduler_preset(self) -> None:

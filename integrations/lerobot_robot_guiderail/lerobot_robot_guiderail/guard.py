@@ -1,7 +1,7 @@
-"""Guard of chunks as a step of LeRobot's processors: bounds, velocity and jerk limits of the actions of any policy.
+"""Guard of chunks as a LeRobot processor step: bounds, velocity and jerk limits of the actions of any policy.
 
-`add_guard` puts the step at the end of a stored policy's postprocessor, which `lerobot-rollout` then applies. The step
-needs the core of guiderail in LeRobot's environment (`pip install guiderail`), not the simulation.
+`add_guard` appends the step to a stored policy's postprocessor, which `lerobot-rollout` applies. The step needs the
+core of guiderail in LeRobot's environment (`pip install guiderail`), not the simulation.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ HORIZON = 16  # steps for which a single action is repeated to form a chunk
 class ChunkGuardProcessorStep(ProcessorStep):
     """Step that changes actions as little as possible so that they are within the limits (`ChunkGuard`).
 
-    A chunk (1, K, A) is limited as a whole. A single action, (A,), (1, A) or by name, is limited as a chunk that
-    repeats it. All returned actions have to be executed, one per control period. An action that is not finite is
-    refused. The limits hold up to the rounding of the action's type.
+    A chunk (1, K, A) is limited as a whole. A single action, an array (A,) or (1, A) or a dictionary by name, is
+    limited as a chunk that repeats the action. All returned actions have to be executed, one per control period. A NaN
+    or infinite action is refused. The limits are satisfied up to the rounding of the action's type.
 
     Attributes:
         lower: Lower bounds of the A numbers of an action; None for no bound.
@@ -34,9 +34,9 @@ class ChunkGuardProcessorStep(ProcessorStep):
         jerk: Jerk limits [unit/s³].
         period: Control period [s], one over `--fps`.
         mode: "projection" or "slowdown".
-        start: Position at which an episode starts at rest; by default the observation in the first transition. Then it
-            may be outside of the bounds as far as one step within the limits leads inside.
-        names: Names of the numbers, for actions and observations by name.
+        start: Position at which an episode starts at rest; by default the observation in the first transition. An
+            observed start may be outside of the bounds if one step within the limits reaches the inside.
+        names: Names of the A numbers, for actions and observations by name.
     """
 
     lower: list[float | None]
@@ -54,11 +54,12 @@ class ChunkGuardProcessorStep(ProcessorStep):
             from guiderail.models.primitives import LinearConstraints
         except ImportError as error:
             raise ImportError("the guard needs guiderail in this environment: pip install guiderail") from error
-        sizes = {len(one) for one in (self.lower, self.upper, self.velocity, self.jerk, *filter(None, [self.names]))}
+        lists = (self.lower, self.upper, self.velocity, self.jerk, *filter(None, [self.names]))
+        sizes = {len(numbers) for numbers in lists}
         if len(sizes) != 1:
             raise ValueError("lower, upper, velocity, jerk and names have one entry for each number of an action")
-        lower = np.array([-math.inf if one is None else one for one in self.lower], float)
-        upper = np.array([math.inf if one is None else one for one in self.upper], float)
+        lower = np.array([-math.inf if bound is None else bound for bound in self.lower], float)
+        upper = np.array([math.inf if bound is None else bound for bound in self.upper], float)
         box = LinearConstraints.box(lower, upper)
         self._min_steps = MIN_STEPS
         self._guard = ChunkGuard(
@@ -71,26 +72,27 @@ class ChunkGuardProcessorStep(ProcessorStep):
         """Return the transition with its action within the limits.
 
         Raises:
-            ValueError: If the action has the wrong shape or names or is not finite, the start is unknown, or `start` is
-                outside of the bounds, or the observation is farther outside than one step within the limits.
+            ValueError: If the action has the wrong shape or names or is not finite, the start is unknown, `start` is
+                outside of the bounds, or an observed start is so far outside that one step within the limits does not
+                reach the inside.
         """
         action = transition.get(TransitionKey.ACTION)
         by_name = isinstance(action, dict)
         if by_name and (unknown := sorted(set(action) - set(self.names))):
             raise ValueError(f"the guard would drop the numbers {unknown} of an action: give limits and names for them")
-        values = self._of_names(action) if by_name else np.asarray(torch.as_tensor(action).detach().cpu(), dtype=float)
+        values = self._to_array(action) if by_name else np.asarray(torch.as_tensor(action).detach().cpu(), dtype=float)
         if not self._is_started:
             self._start_at(transition.get(TransitionKey.OBSERVATION))
             self._is_started = True
         size = len(self.velocity)
-        is_alone = values.ndim == 1 or (values.ndim in (2, 3) and len(values) == 1)
-        if not is_alone or values.shape[-1] != size or not values.size:
+        is_single_batch = values.ndim == 1 or (values.ndim in (2, 3) and len(values) == 1)
+        if not is_single_batch or values.shape[-1] != size or not values.size:
             raise ValueError(f"an action has the shape ({size},), (1, {size}) or (1, K, {size}), not {values.shape}")
         chunk = values.reshape(-1, size)
         number = len(chunk)
-        ending = HORIZON if number == 1 else max(self._min_steps, number)
-        held = np.concatenate([chunk, np.tile(chunk[-1], (ending - number, 1))])
-        result = self._guard.guard(held, number)
+        num_steps = HORIZON if number == 1 else max(self._min_steps, number)
+        padded = np.concatenate([chunk, np.tile(chunk[-1], (num_steps - number, 1))])
+        result = self._guard.guard(padded, number)
         self.is_fallback = result.is_fallback
         limited = result.outputs[:number].reshape(values.shape)
         changed = transition.copy()
@@ -101,7 +103,8 @@ class ChunkGuardProcessorStep(ProcessorStep):
         )
         return changed
 
-    def _of_names(self, numbers: Any) -> np.ndarray:
+    def _to_array(self, numbers: Any) -> np.ndarray:
+        """Return a dictionary's numbers in the order of `names`, (A,)."""
         missing = [name for name in self.names if name not in numbers]
         if missing or not self.names:
             raise ValueError(f"the guard needs the numbers {missing or 'of an action by name: give names'}")
@@ -111,7 +114,7 @@ class ChunkGuardProcessorStep(ProcessorStep):
         if self.start is not None:
             self._guard.reset(np.array(self.start, float))
         elif isinstance(observation, dict):
-            self._guard.reset_near(self._of_names(observation))
+            self._guard.reset_near(self._to_array(observation))
         else:
             raise ValueError("the guard needs the position at which the episode starts: give start")
 
@@ -129,7 +132,7 @@ class ChunkGuardProcessorStep(ProcessorStep):
 
 
 def add_guard(policy: Path | str, **limits: Any) -> None:
-    """Put a guard at the end of the postprocessor of a stored policy.
+    """Append a guard to the postprocessor of a stored policy.
 
     Args:
         policy: Folder of the policy.

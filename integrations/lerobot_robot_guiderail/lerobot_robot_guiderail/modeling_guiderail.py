@@ -1,4 +1,4 @@
-"""Policy of LeRobot that is a network trained by guiderail."""
+"""LeRobot policy with a network that guiderail trained."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lerobot_robot_guiderail.configuration_guiderail import GuiderailConfig
 
 
 class GuiderailPolicy(PreTrainedPolicy):
-    """Deterministic policy, whose observation is the first part of the robot's `observation.state`."""
+    """Deterministic policy; its observation is the first part of the robot's `observation.state`."""
 
     config_class = GuiderailConfig
     name = "guiderail"

@@ -19,7 +19,7 @@ from lerobot_robot_guiderail.configuration_guiderail import GuiderailConfig
 def make_guiderail_pre_post_processors(
     config: GuiderailConfig, dataset_stats: Any = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Return the processors before and after the policy; the statistics of a data set are not used."""
+    """Return the processors before and after the policy; `dataset_stats` is not used."""
     del dataset_stats
     before = [
         RenameObservationsProcessorStep(rename_map={}),

@@ -1,4 +1,4 @@
-"""Robot of LeRobot that is a simulated environment of guiderail, in a process of its own."""
+"""LeRobot robot that runs a simulated environment of guiderail in a child process."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lerobot.robots import Robot, RobotConfig
 
 logger = logging.getLogger(__name__)
 
-SUFFIX = ".pos"  # LeRobot's rollout gives a policy only numbers with this ending
+SUFFIX = ".pos"  # ending of all names, because LeRobot's rollout passes only such numbers to a policy
 POSE_NAMES = ("x", "y", "z", "rz", "ry", "rx")
 WRENCH_NAMES = ("fx", "fy", "fz", "tx", "ty", "tz")
 STOP_TIME = 10.0  # longest wait for the end of guiderail's process before it is killed [s]
@@ -29,7 +29,7 @@ class GuiderailRobotConfig(RobotConfig):
     Attributes:
         environment: Name of a task, or folder of a run, whose environment is used.
         options: Environment options by name; a JSON object on the command line.
-        python: Interpreter with guiderail; this one by default.
+        python: Python interpreter with guiderail; by default the interpreter of this process.
         seed: Seed of the first episode.
     """
 
@@ -42,8 +42,8 @@ class GuiderailRobotConfig(RobotConfig):
 class GuiderailRobot(Robot):
     """Environment of guiderail as a robot; one action is one step of the environment.
 
-    An action passes guiderail's guidance, so that its constraints and force bound hold for every policy and every
-    teleoperator. After the end of an episode the next action starts a new episode instead.
+    Actions pass guiderail's guidance, so its constraints and its force bound apply to every policy and teleoperator.
+    After the end of an episode, the next action is not executed and starts a new episode.
     """
 
     config_class = GuiderailRobotConfig
@@ -57,7 +57,7 @@ class GuiderailRobot(Robot):
 
     @cached_property
     def _description(self) -> dict[str, Any]:
-        """First line that guiderail's process prints. If no process runs, one is started to read it."""
+        """First line that guiderail's process prints. If no process runs, a process is started to read the line."""
         if self._process is not None:
             return self._receive()
         self._start()
@@ -96,7 +96,7 @@ class GuiderailRobot(Robot):
         """Start guiderail's process and the first episode.
 
         Raises:
-            ConnectionError: If the robot is connected, or guiderail does not start; with guiderail's message.
+            ConnectionError: If the robot is connected, or guiderail does not start, with guiderail's error message.
         """
         del calibrate
         if self.is_connected:
@@ -117,7 +117,7 @@ class GuiderailRobot(Robot):
         return self._flatten(self._state)
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """Advance the environment by one step, or start a new episode after the end of one.
+        """Advance the environment by one step, or, after the end of an episode, start a new episode.
 
         Args:
             action: Numbers of `action_features`.
@@ -127,7 +127,7 @@ class GuiderailRobot(Robot):
 
         Raises:
             ConnectionError: If the robot is not connected.
-            ValueError: If a name is missing or unknown, or a number is NaN or infinite; nothing moves.
+            ValueError: If a name is missing or unknown, or a number is NaN or infinite. The robot is not moved.
         """
         self._check_connected()
         names = list(self.action_features)

@@ -1,4 +1,4 @@
-"""Guard of chunks in the real LeRobot's pipelines; run by `make lerobot`."""
+"""Guard of chunks in LeRobot's pipelines; run by `make lerobot`."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Plug-in with the real LeRobot; run by `make lerobot`, with guiderail's interpreter in GUIDERAIL_PYTHON."""
+"""Plug-in in LeRobot; run by `make lerobot`. GUIDERAIL_PYTHON is the interpreter with guiderail."""
 
 import json
 import os

@@ -112,7 +112,7 @@ class Steps(gymnasium.Env):
 def test_episode_ends_when_the_plug_stays_on_the_rim():
     file = SimpleNamespace(motion=MotionNumbers(travel=0.010, rim=0.007))
     times = file.motion.plan_search()[0]
-    late = times[3] + difficulty.PATIENCE
+    late = times[3] + difficulty.SEATING_TIME
     rows = [(late - 0.01, 0.007), (late + 0.01, 0.0064), (late + 0.01, 0.0066)]
     env = difficulty.StopOnRim(Steps(rows, times[-1]), file)
     assert [env.step(None)[3] for _ in rows] == [False, False, True]

@@ -15,10 +15,17 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, constant_policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization import replay
-from guiderail.tools.visualization.replay import DRAWN, Motion, default_page, find_report, violation_unit, write_page
+from guiderail.tools.visualization.replay import (
+    VISUALIZER_PATH,
+    Motion,
+    default_page,
+    find_report,
+    violation_unit,
+    write_page,
+)
 
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
-BALL = f"{DRAWN}/robot/ball"
+BALL = f"{VISUALIZER_PATH}/robot/ball"
 
 
 def _to_the_right(env):

@@ -30,7 +30,8 @@ TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)  
 _TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _ANGLE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
 _ORDERS = ("wxyz", "xyzw")
-_ALSO = {
+# Other spellings of units.
+_SPELLINGS = {
     "m": ("meter", "meters", "metre", "metres"),
     "deg": ("degree", "degrees", "\u00b0"),
     "rad": ("radian", "radians"),
@@ -38,16 +39,18 @@ _ALSO = {
     "ms": ("msec",),
     "us": ("usec", "\u03bcs"),
     "ns": ("nsec",),
-}  # other spellings of units
-_SAME_UNIT = {other: unit for unit, others in _ALSO.items() for other in others}
+}
+_UNIT_OF_SPELLING = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
 _PERIODS = (1e-4, 1.0)  # range of plausible sampling periods [s]; a time step outside it must have another unit
+# Prefix of the name of a pose column.
 _PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
+# Names of columns of other quantities than a pose, such as velocity and force.
 _NO_POSE = re.compile(
     r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
-)  # column names of quantities other than a pose, such as velocity and force
+)
 _QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
 _EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
-# Numbered columns, whose names do not state the order. With a fifth one they are joint positions.
+# Numbered columns of a quaternion, whose names do not state the order. Five or more such columns are joint positions.
 _UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
 _DELIMITERS = ",\t;| "  # accepted delimiters; the first one in the header is used, in this order
 _EMPTY = ("", "na", "n/a", "#n/a", "null", "none")  # texts of an empty field, in lower case
@@ -102,7 +105,7 @@ def read_csv_files(
     if not files:
         raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
     recorded = Recorded([], [], ())
-    first_of_kind: dict[bool, Path] = {}  # first file that guiderail has written, and first one of another origin
+    first_of_kind: dict[bool, Path] = {}  # first file that guiderail wrote (True), and first file of another origin
     for file in files:
         like = recorded.outputs[0] if recorded.outputs else None
         columns = _table(file)
@@ -130,7 +133,7 @@ def read_csv_files(
 def _read_written(
     file: Path, given: Sequence[str], target: Sequence[float] | None, like: np.ndarray | None
 ) -> Recorded:
-    """Read a file that `Demonstrations.save` has written; `given` has the names of given options, which are refused."""
+    """Read a file that `Demonstrations.save` wrote; `given` has the names of the user's options, which are refused."""
     if given:
         raise InputError(f"{file} holds demonstrations, whose conventions are known: leave --{given[0]} out")
     demonstrations = Demonstrations.load(file)
@@ -220,7 +223,7 @@ def _table(file: Path) -> list[_Column]:
 def _units(
     file: Path, columns: Sequence[_Column], known: Collection[str], given: str | None, option: str
 ) -> list[str | None]:
-    """Return the unit of each column: the one in its name, otherwise `given`; the two must not differ."""
+    """Return the unit of each column: the unit in the column's name, otherwise `given`; the two must not differ."""
     units = []
     for column in columns:
         unit = _unit_of_name(file, column.name, known) or given
@@ -234,10 +237,10 @@ def _units(
 
 
 def _unit_of_name(file: Path, name: str, known: Collection[str]) -> str | None:
-    """Return the unit in a column's name, in brackets or as its ending; None if it has neither."""
+    """Return the unit in a column's name, in brackets or as its ending; None if the name has no unit."""
     plain = unicodedata.normalize("NFKC", name).lower()  # maps the micro sign to the Greek letter
     if inside := [text.strip() for text in re.findall(r"[\[(]([^\[\]()]*)", plain)]:
-        units = [unit for text in inside if (unit := _SAME_UNIT.get(text, text)) in known]
+        units = [unit for text in inside if (unit := _UNIT_OF_SPELLING.get(text, text)) in known]
         if not units:
             raise InputError(f"{file} has {name}, whose unit is not one of {', '.join(known)}: convert or rename it")
         return units[-1]
@@ -253,7 +256,7 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
-    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if there is none."""
+    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if both are missing."""
     named = rf"{wanted}(_mm|_cm|_m|_rad|_deg)?"
     exact = [one for one in columns if re.fullmatch(named, one.plain)]
     ends = [one for one in columns if re.fullmatch(_PREFIX + named, one.plain)]
@@ -261,7 +264,7 @@ def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | No
 
 
 def _columns(file: Path, columns: Sequence[_Column], wanted: Sequence[str]) -> list[_Column]:
-    """Return the columns `wanted`, or none if one of them is missing."""
+    """Return the columns `wanted`, or an empty list if one of them is missing."""
     found = [one for name in wanted if (one := _column(file, columns, name)) is not None]
     return found if len(found) == len(wanted) else []
 
@@ -332,9 +335,9 @@ def _rotations(
                 )
             values = np.column_stack([one.values for one in matches])
             return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
-    fixed = [[one for one in columns if re.fullmatch(rf"R{axis} ?\[(deg|rad)\]", one.name)] for axis in "xyz"]
-    if all(len(one) == 1 for one in fixed):  # the names of guiderail; a rotation vector has rx, ry and rz
-        matches = [one for (one,) in fixed]
+    fixed = [[column for column in columns if re.fullmatch(rf"R{axis} ?\[(deg|rad)\]", column.name)] for axis in "xyz"]
+    if all(len(named) == 1 for named in fixed):  # names that guiderail writes; a rotation vector has rx, ry and rz
+        matches = [column for (column,) in fixed]
         scales = [_ANGLE_UNITS[str(unit)] for unit in _units(file, matches, _ANGLE_UNITS, angles, "--angles")]
         assumptions.append("Rz, Ry and Rx are ZYX Euler angles, Rz Ry Rx")
         return matches, Rotation.from_euler("xyz", np.column_stack([one.values for one in matches]) * scales)

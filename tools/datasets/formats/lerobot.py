@@ -19,7 +19,7 @@ VERSION = "v3.0"
 INFO = Path("meta") / "info.json"
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 TASK = "guiderail demonstration"
-_CLOCKS = {
+_INDEX_FEATURES = {
     "timestamp": "float32",
     "frame_index": "int64",
     "episode_index": "int64",
@@ -36,8 +36,8 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
         signal: Name of a feature with a vector of floats; None to choose one by the rules of `choose_signal`.
 
     Raises:
-        InputError: If the folder is not such a dataset, a file is damaged, there are more than `MAX_LINES` frames, or
-            no single feature can be chosen.
+        InputError: If the folder is not a LeRobot dataset of version 3, a file is damaged, there are more than
+            `MAX_LINES` frames, or no single feature can be chosen.
     """
     import pyarrow as arrow
     import pyarrow.parquet as parquet
@@ -56,7 +56,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     if not version.startswith("v3"):
         raise InputError(f"{folder} is a LeRobot dataset of version {version}: convert it to v3.0 by LeRobot's script")
     chosen, assumptions = choose_signal(sorted(vectors), signal, str(folder), "--signal")
-    # Copies made by macOS hold hidden files next to the data.
+    # macOS adds hidden files to copied folders.
     files = sorted(file for file in (folder / "data").rglob("*.parquet") if not file.name.startswith("."))
     if not files:
         raise InputError(f"{folder} has no data/*.parquet: copy the whole dataset")
@@ -87,7 +87,7 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
 
 def _is_vector(name: str, feature: dict[str, Any]) -> bool:
     kind = str(feature.get("dtype", ""))
-    return len(feature.get("shape", ())) == 1 and name not in _CLOCKS and kind.startswith("float")
+    return len(feature.get("shape", ())) == 1 and name not in _INDEX_FEATURES and kind.startswith("float")
 
 
 def _names(feature: dict[str, Any], size: int) -> tuple[str, ...]:
@@ -146,7 +146,7 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
     features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": [size], "names": names} for name in ("action", "observation.state")
     }
-    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _CLOCKS.items()}
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _INDEX_FEATURES.items()}
     ends = np.cumsum(lengths)
     episode_columns = {
         "episode_index": list(range(len(lengths))),

@@ -1,4 +1,4 @@
-"""Imported motions with the assumptions made, and conversions that the importers share."""
+"""Imported motions with the assumptions of the import, and conversions that several importers use."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from guiderail.models.primitives.poses import SINGULAR
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "goal", "setpoint", "reference")
-"""Words in the name of a commanded signal, as opposed to a measured one."""
+"""Words that distinguish the name of a commanded signal from that of a measured signal."""
 
 
 @dataclass
@@ -58,8 +58,8 @@ def poses_in_target(
         rotations: Rotations (N,) in the recording's frame.
         target: Pose of the target in the recording's frame, (6,): [x y z] in meters, and the angles [rx ry rz] in
             degrees of rotations about the fixed axes x, y and z, in this order. None keeps the recording's frame.
-        like: Poses of an earlier demonstration, (L, 6). Angles are shifted by full turns, so that their mean is nearest
-            to the mean of these poses: a full turn between two demonstrations would be learned as variance.
+        like: Poses of an earlier demonstration, (L, 6). Angles are shifted by full turns to bring their mean nearest to
+            the mean of these poses. A full turn between two demonstrations would otherwise be learned as variance.
 
     Raises:
         InputError: If `target` is not six finite numbers, or Ry comes within 1° of ±90°, where Rz and Rx are not
@@ -69,9 +69,9 @@ def poses_in_target(
         pose = as_numbers(target, "target")
         if pose.shape != (6,) or not is_finite(pose):
             raise InputError(f"target must be six finite numbers, [x y z rx ry rz], not {brief(target)}")
-        turn = Rotation.from_euler("xyz", pose[3:], degrees=True)
-        positions = turn.inv().apply(positions - pose[:3])
-        rotations = turn.inv() * rotations
+        target_rotation = Rotation.from_euler("xyz", pose[3:], degrees=True)
+        positions = target_rotation.inv().apply(positions - pose[:3])
+        rotations = target_rotation.inv() * rotations
     if np.abs(rotations.as_matrix()[:, 2, 0]).max(initial=0.0) > SINGULAR:
         raise InputError(
             "the angles [Rz Ry Rx] of this recording are singular, because Ry comes near ±90°: give a target frame "
@@ -85,7 +85,7 @@ def poses_in_target(
 
 
 def describe_time_shift(demonstrations: Demonstrations) -> list[str]:
-    """Return a remark that an export shifts demonstrations to start at time zero; an empty list if all do."""
+    """Return a remark that an export shifts times to start at zero; an empty list if all times start at zero."""
     starts = sorted(float(t[0]) for t in demonstrations.times)
     if not any(starts):
         return []
@@ -99,10 +99,11 @@ def is_commanded(name: str) -> bool:
 
 
 def choose_signal(candidates: Sequence[str], given: str | None, where: str, option: str) -> tuple[str, list[str]]:
-    """Return the signal that is imported, with the assumption made.
+    """Choose the signal to import; return its name, and the assumption of the choice.
 
-    It is `given`, or else the only candidate, or else the only candidate that was commanded, because primitives should
-    learn commands. `where` and `option` name the file and the command-line option in messages.
+    The choice is `given`. If `given` is None, it is the only candidate, or the only one of several candidates whose
+    name states that it was commanded, because a primitive should learn commands. `where` and `option` are the names of
+    the file and of the command-line option in error messages.
 
     Raises:
         InputError: If these rules do not determine one signal.

@@ -24,7 +24,7 @@ from guiderail.tools.datasets.formats.recorded import (
 )
 from guiderail.tools.files import atomic_folder
 
-# Attributes that lead to the pose in a message, by message type.
+# Nested attributes of a message that contain its pose, by message type.
 POSES = {
     "geometry_msgs/msg/PoseStamped": ("pose",),
     "geometry_msgs/msg/Pose": (),
@@ -42,13 +42,13 @@ _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bit
 
 
 def find_bags(path: Path) -> list[Path]:
-    """Return the bag at a path, or all bags in the folder that are not hidden, sorted by name; empty without one.
+    """Return the bag at a path, or all bags in the folder that are not hidden, sorted by name.
 
     A folder is a bag if it has a `metadata.yaml`, and a file if its name ends in .mcap.
     """
     if _is_bag(path):
         return [path]
-    entries = [one for one in path.iterdir() if not one.name.startswith(".")] if path.is_dir() else []
+    entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")] if path.is_dir() else []
     return in_order(filter(_is_bag, entries))
 
 
@@ -95,10 +95,10 @@ def _read_bag(
     except Exception as error:  # the reader raises many types for damaged bags
         raise InputError(f"{bag} cannot be read as a bag: {brief(str(error))}") from error
     try:
-        kinds = {one.topic: one.msgtype for one in reader.connections}
+        kinds = {connection.topic: connection.msgtype for connection in reader.connections}
         candidates = [name for name, kind in kinds.items() if kind in POSES or kind in (JOINTS, DATA)]
         chosen, assumptions = choose_signal(sorted(candidates), topic, str(bag), "--signal")
-        connections = [one for one in reader.connections if one.topic == chosen]
+        connections = [connection for connection in reader.connections if connection.topic == chosen]
         if len(connections) > 1:
             raise InputError(
                 f"{bag} has {len(connections)} publishers on {chosen}, whose messages would be mixed: "
@@ -116,7 +116,7 @@ def _read_bag(
         raise InputError(f"{bag} has more than {MAX_LINES} messages on {chosen}: record a shorter motion")
     if len(rows) < 2:
         raise InputError(f"{bag} has {len(rows)} messages on {chosen}: a motion needs at least two")
-    times, remarks = _clock(rows)
+    times, remarks = _message_times(rows)
     assumptions += remarks
     messages = [message for _, message in rows]
     if target is not None and kinds[chosen] in (DATA, JOINTS):
@@ -160,10 +160,9 @@ def _array_names(message: Any) -> tuple[str, ...]:
 
 
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
-    """Return positions (N, J) in the order of the first message's names; other messages may have another order.
+    """Return positions (N, J) in the order of the first message's names; the order may differ between messages.
 
-    Messages of other joints are refused, not skipped, because the first message may be from a device other than the
-    arm.
+    A message with other joints is refused, not skipped: the first message may be the one from the wrong device.
     """
     expected = list(messages[0].name)
     if len(set(expected)) < len(expected):
@@ -185,10 +184,10 @@ def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
     return np.array(rows)
 
 
-def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
-    """Return the time of each message since the first one [s] (N,), with remarks.
+def _message_times(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
+    """Return the time of each message since the first message (N,) [s], with remarks.
 
-    Times are those of the header stamps if these increase, otherwise those of receipt.
+    Times are the stamps in the headers if they increase, otherwise the times of receipt.
     """
     headers: list[Any] = [getattr(message, "header", None) for _, message in rows]
     if all(header is not None for header in headers):
@@ -202,7 +201,7 @@ def _clock(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[str]]:
 
 
 def _frame(message: Any, path: Sequence[str]) -> str:
-    """Return a description of the frame of a pose; `path` has the attributes that lead from the message to the pose."""
+    """Return a description of the frame of a pose; `path` has the nested attributes that contain the pose."""
     for holder in (message, reduce(getattr, path[:1], message)):
         header = getattr(holder, "header", None)
         if header is not None and header.frame_id:
@@ -245,7 +244,10 @@ def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
 
 
 def _stamps(demonstrations: Demonstrations) -> tuple[list[np.ndarray], list[str]]:
-    """Return times in nanoseconds (N_m,) of each demonstration, with remarks; if one is negative, all start at zero."""
+    """Return the times of each demonstration (N_m,) [ns], with remarks.
+
+    If a time is negative, all demonstrations are shifted to start at zero.
+    """
     times, notes = list(demonstrations.times), []
     if min(t[0] for t in times) < 0.0:
         times, notes = [t - t[0] for t in times], describe_time_shift(demonstrations)
