@@ -1,14 +1,15 @@
 """Student trained alongside a KGRL teacher from the same transitions, and refined on its own (thesis, 6.2.3).
 
-The student's action is a displacement in task space, so it needs no primitive at execution. While the teacher acts, the
-student's replay buffer gets the teacher's transitions with the equivalent displacement as action. Then the student
-acts itself, inside the constraints (`safe_residual`), and learns from its own transitions.
+The student's action is a displacement in task space, so the student needs no primitive at execution. While the teacher
+acts, its transitions are stored in the student's replay buffer, with the equivalent displacement as action. Then the
+student acts itself, inside the constraints (`safe_residual`), and learns from its own transitions.
 
 Run it with `python -m research.alongside --out runs/alongside`.
 """
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.evaluation import load_or_compute
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Callback, Transition, rollout
+from guiderail.tools.evaluation.rollout import Callback, Transition, rollout
 from guiderail.tools.learning.learner import described_observation, learner_arguments
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.learning.train import configure
 from guiderail.tools.tables import read_table, write_table
-from research.command import Parser, print_result, run_program
-from research.distillation import median_time, teacher_actions
+from research.command import Parser, print_rows, run_program
+from research.distillation import evaluate_in_blocks, median_time, teacher_actions
 
 TASK, SETTINGS = "BncConnector", {"symmetry": "near"}
 TEACHER = {"guidance": "kgrl", "difficulty": "hard", "reward": "aligned"}
@@ -40,14 +40,13 @@ VARIANTS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "student, without constraints": ("student", {**STUDENT, "guidance": "residual"}),
     "student, refined": ("refined", STUDENT),
 }
-BLOCK = 10  # number of episodes in a stored file
 
 
 class TaskSpaceTransitions(Callback):
-    """Callback that gives the teacher's transitions to a student, with the equivalent displacement as action.
+    """Callback that trains a student on the teacher's transitions, with the equivalent displacement as action.
 
-    The displacement is the command minus the motion without actions, averaged over the control steps of the action,
-    divided by the student's gains and clipped to ±1.
+    The displacement is the command minus the motion without actions, averaged over the control steps of the action. It
+    is divided by the student's gains and clipped to ±1.
 
     Args:
         env: Environment of the teacher.
@@ -65,7 +64,7 @@ class TaskSpaceTransitions(Callback):
         self._env, self._student, self._step = env.unwrapped, student, 0
 
     def on_episode_start(self) -> None:
-        """Start an episode in which another policy acts."""
+        """Start an episode in which the teacher acts."""
         self._step = 0
         self._student.start_recorded(False, self._student.actor())
 
@@ -131,21 +130,21 @@ def evaluate_variant(out: Path, variant: str, episodes: int, seed: int, run_seed
 def times_per_action(out: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The student's time covers its network, the sum with the motion, and the projection onto the constraints.
+    The student's time is that of its network, the sum with the motion, and the projection onto the constraints.
     """
     repeat, prior = configure(TASK, TEACHER).action_repeat, make_prior_knowledge(TASK, **STUDENT).demonstrations
-    teach, observations, _ = teacher_actions(TASK, TEACHER, repeat, Policy.load(out / "teacher"))
+    act_as_teacher, observations, _ = teacher_actions(TASK, TEACHER, repeat, Policy.load(out / "teacher"))
     assert prior is not None
     assert prior.keep_out is not None
     policy, keep_out = Policy.load(out / "refined"), prior.keep_out
     means, gains = prior.reference.means, prior.residual_gains()
 
-    def act(index: int) -> None:
+    def act_as_student(index: int) -> None:
         displacement = gains * (prior.selection @ np.asarray(policy(observations[index]), float))
         for step in range(repeat):
             keep_out.project(means[step], means[step] + displacement)
 
-    return {"teacher": median_time(teach), "student, refined": median_time(act)}
+    return {"teacher": median_time(act_as_teacher), "student, refined": median_time(act_as_student)}
 
 
 def compare(
@@ -171,15 +170,8 @@ def compare(
         train_both(out, training, refinement, seed)
     times, rows = times_per_action(out), []
     for number, variant in enumerate(VARIANTS):
-        tables = []
-        for first in range(0, episodes, BLOCK):
-            count = min(BLOCK, episodes - first)
-            file, arguments = (
-                out / "episodes" / f"{number}-{first}-{count}.csv",
-                (variant, count, HELD_OUT_SEED + first),
-            )
-            tables.append(load_or_compute(file, lambda arguments=arguments: evaluate_variant(out, *arguments, seed)))
-        table = pd.concat(tables)
+        evaluate = partial(evaluate_variant, out, variant, run_seed=seed)
+        table = evaluate_in_blocks(out / "episodes" / str(number), evaluate, episodes)
         rows.append(
             {
                 "variant": variant,
@@ -198,7 +190,7 @@ def compare(
 def _refuse_other_training(out: Path, episodes: int, refinement: int, seed: int) -> None:
     """Raise an InputError if the policies in a folder were trained with another seed or number of episodes."""
     rows = read_table(out / "training.csv")
-    # Older tables have no seed.
+    # A table of an older version has no column `seed`.
     acting, seeds = (rows[name].tolist() if name in rows else [] for name in ("acting", "seed"))
     if acting != ["teacher"] * episodes + ["student"] * refinement or {*seeds} != {seed}:
         raise InputError(
@@ -217,15 +209,8 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seed", type=int, default=0, help="seed of training (default: 0)")
     parser.add_json()
     options = parser.parse_args(arguments)
-    rows = compare(
-        options.out,
-        episodes=options.episodes,
-        training=options.training,
-        refinement=options.refinement,
-        seed=options.seed,
-    )
-    table = str(options.out / "alongside.md")
-    print_result({"table": table, "rows": rows} if options.json else {"table": table}, as_json=options.json)
+    settings = {name: getattr(options, name) for name in ("episodes", "training", "refinement", "seed")}
+    print_rows(options.out / "alongside.md", compare(options.out, **settings), as_json=options.json)
 
 
 if __name__ == "__main__":

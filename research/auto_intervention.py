@@ -1,9 +1,9 @@
 """Learner with automatic interventions from one demonstration, after AutoSERL (docs/experiments.md).
 
-Y. Liu et al., "One Demonstration Is Enough for Real-World Robotic Reinforcement Learning", arXiv 2607.01651, guide the
-robot to the nearest point in a sliding window of the demonstration, if this point lies ahead, and replay the
-demonstration where the robot is stuck, until the policy succeeds alone. Here the demonstration is the base motion, so
-its action is zero. There is no separate buffer of interventions.
+Y. Liu et al., "One Demonstration Is Enough for Real-World Robotic Reinforcement Learning", arXiv 2607.01651. There, the
+robot is guided to the nearest point in a sliding window of the demonstration if this point lies ahead. If the robot is
+stuck, the demonstration is replayed. There are no interventions after the policy has succeeded alone. Here, the
+demonstration is the base motion, so its action is zero, and interventions have no replay buffer of their own.
 """
 
 from collections.abc import Mapping
@@ -27,18 +27,18 @@ class AutoInterventionConfig(OffPolicyConfig):
     """Settings of TQC with automatic interventions."""
 
     algorithm: str = "auto_intervention"
-    window: Positive = 25  # number of steps ahead of the last progress among which the nearest step is searched
-    stall_actions: Positive = 6  # actions without progress after which the demonstration takes over
-    intervention_actions: Positive = 6  # actions that an intervention lasts
-    until_successes: Positive = 3  # consecutive greedy successes after which there are no interventions
+    window: Positive = 25  # number of steps after the last progress in which the nearest step is searched
+    stall_actions: Positive = 6  # number of actions without progress after which an intervention begins
+    intervention_actions: Positive = 6  # duration of an intervention in actions
+    until_successes: Positive = 3  # number of consecutive greedy successes after which interventions end
 
 
 class SlidingWindow:
-    """Progress of a robot along a demonstration: the nearest step in a window ahead of the last progress.
+    """Progress of a robot along a demonstration: the nearest step in a window after the last progress.
 
     Args:
         reference: Reference of the demonstration; distances are in its standard deviations.
-        window: Number of steps ahead.
+        window: Number of steps in the window after the last progress.
     """
 
     def __init__(self, reference: ReferenceTrajectory, window: int):
@@ -55,7 +55,7 @@ class SlidingWindow:
 
 @register_learner("auto_intervention")
 class AutoInterventionLearner(TqcLearner):
-    """Learner of TQC in which the demonstration's action takes over where progress along it stalls.
+    """TQC learner in which the demonstration's action replaces the policy's if progress along the demonstration stalls.
 
     Attributes:
         interventions: Number of interventions in this episode.
@@ -83,12 +83,12 @@ class AutoInterventionLearner(TqcLearner):
         self._is_intervening = False
 
     def on_episode_start(self) -> None:
-        """Start an episode without progress."""
+        """Start an episode, with no progress along the demonstration."""
         super().on_episode_start()
         self._start()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the policy's action, or that of the demonstration, zero, during an intervention."""
+        """Return the policy's action; during an intervention, the demonstration's action, which is zero."""
         action = super().act(observation)
         self._is_intervening = self._remaining > 0
         self._remaining = max(self._remaining - 1, 0)
@@ -99,8 +99,8 @@ class AutoInterventionLearner(TqcLearner):
         super().on_step(transition)
         has_advanced = self._progress.advance(self._env.trace.measured[-1])
         self._stalled = 0 if has_advanced or self._is_intervening else self._stalled + 1
-        is_over = self.is_greedy or self.greedy_successes >= self.config.until_successes
-        if self._stalled >= self.config.stall_actions and not is_over:
+        may_intervene = not self.is_greedy and self.greedy_successes < self.config.until_successes
+        if self._stalled >= self.config.stall_actions and may_intervene:
             self._stalled, self._remaining = 0, self.config.intervention_actions
             self.interventions += 1
 

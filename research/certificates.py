@@ -1,8 +1,8 @@
 """Certificates of shipped skills, with the worst command that an adversary found.
 
-Each skill is certified, the certificate is checked by a checker that shares no code with the primitive, and the skill
-is attacked. The ratio of a bound to the worst command found shows how tight the bound is. The table
-has the largest ratio over all steps, separately for steps at which a constraint can be active.
+Each skill is certified, its certificate is verified by a checker that shares no code with the primitive, and the skill
+is attacked. The ratio of a bound to the worst command found shows how tight the bound is. The table has the largest
+ratio of all steps at which a constraint can be active, and the largest ratio of the other steps.
 
 Run it with `python -m research.certificates --out studies`.
 """
@@ -81,7 +81,7 @@ def certify_skills(out: Path, declaration: Declaration) -> dict[str, Any]:
 
     Returns:
         The table's path and number of skills. `failed` has a sentence for each skill whose certificate is rejected or
-        violated, and is absent if there is none.
+        violated; the entry is absent if all certificates are valid.
 
     Raises:
         InputError: If a skill cannot be certified.
@@ -103,7 +103,7 @@ def certify_skills(out: Path, declaration: Declaration) -> dict[str, Any]:
 
 
 def _failure(row: Mapping[Any, Any]) -> str:
-    """Return what is wrong with a skill's certificate; an empty string if nothing is."""
+    """Return a sentence on a rejected or violated certificate; an empty string for a valid certificate."""
     if row["checker"] != "yes":
         return f"{row['skill']}: the certificate is rejected by the checker: {row['checker']}"
     return f"{row['skill']}: an adversary exceeded {row['bound_violations']} bounds" if row["bound_violations"] else ""

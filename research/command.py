@@ -30,11 +30,11 @@ class Parser(argparse.ArgumentParser):
 
     def add_out(self, default: str | None) -> None:
         """Add the option `--out`, a folder, required if there is no default."""
-        words = "folder of the results; finished results in it are reused"
+        text = "folder of the results; finished results in it are reused"
         if default is None:
-            self.add_argument("--out", type=Path, required=True, help=words)
+            self.add_argument("--out", type=Path, required=True, help=text)
         else:
-            self.add_argument("--out", type=Path, default=Path(default), help=f"{words} (default: {default})")
+            self.add_argument("--out", type=Path, default=Path(default), help=f"{text} (default: {default})")
 
     def add_environment(self) -> None:
         """Add the options `--env` and `--import` of programs that build a task's environment."""
@@ -83,6 +83,11 @@ def print_result(result: Mapping[str, Any], *, as_json: bool = False) -> None:
     width = max(map(len, result), default=0)
     for key, value in result.items():
         print(f"{key.replace('_', ' '):<{width}}  {cell(value)}")
+
+
+def print_rows(table: Path, rows: list[dict[str, Any]], *, as_json: bool) -> None:
+    """Print the path of a table; as JSON, print its rows as well."""
+    print_result({"table": str(table)} | ({"rows": rows} if as_json else {}), as_json=as_json)
 
 
 def run_program(main: Callable[[list[str]], int | None], arguments: list[str] | None = None) -> NoReturn:

@@ -8,6 +8,7 @@ Run it with `python -m research.distillation --teacher runs/teacher --student ru
 
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,10 @@ from guiderail.tools.evaluation.evaluation import load_or_compute, policy_digest
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
-from research.command import Parser, print_result, run_program
+from research.command import Parser, print_rows, run_program
 
-BLOCK = 10  # episodes of a stored file
-MEASURED = 300  # actions whose time is measured
+BLOCK = 10  # number of episodes in a stored file
+MEASURED = 300  # number of timed actions
 # Options of each way to execute the student. The teacher has the options of its own run.
 VARIANTS: dict[str, dict[str, Any]] = {
     "teacher": {},
@@ -60,32 +61,47 @@ def evaluate_variant(teacher: RunFolder, student: Path, variant: str, episodes: 
         env.reset(seed=config.seed)
         zero = np.zeros(env.action_space.shape, np.float32)
         act = Policy.load(teacher.path) if variant == "teacher" else lambda observation: zero
-
         return evaluate_policy(env, act, episodes=episodes, seed=seed, processes=1)
     finally:
         env.close()
 
 
+def evaluate_in_blocks(prefix: Path, evaluate: Callable[[int, int], pd.DataFrame], episodes: int) -> pd.DataFrame:
+    """Evaluate held-out episodes in blocks of `BLOCK`; a block that is stored is not evaluated again.
+
+    Args:
+        prefix: Path of the stored files, to which the first episode and the number of episodes are appended.
+        evaluate: Function from a number of episodes and the seed of the first episode to their rows.
+        episodes: Number of episodes.
+    """
+    tables = []
+    for first in range(0, episodes, BLOCK):
+        count = min(BLOCK, episodes - first)
+        file = prefix.with_name(f"{prefix.name}-{first}-{count}.csv")
+        tables.append(load_or_compute(file, partial(evaluate, count, HELD_OUT_SEED + first)))
+    return pd.concat(tables)
+
+
 def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The teacher's time covers its network and a constrained primitive in every control step. The student's time covers
-    only its network.
+    The teacher's time is that of its network and of a constrained primitive in every control step. The student's time
+    is that of its network.
     """
     config, policy, base = teacher.config(), Policy.load(teacher.path), find_base_policy(str(student))
     options = beyond_defaults(config.task, config.environment)
-    teach, observations, num_outputs = teacher_actions(config.task, options, config.action_repeat, policy)
+    act_as_teacher, observations, num_outputs = teacher_actions(config.task, options, config.action_repeat, policy)
 
-    def imitate(index: int) -> None:
+    def act_as_student(index: int) -> None:
         chunk_samples(base, observations[index], num_outputs)
 
-    return {"teacher": median_time(teach), "student": median_time(imitate)}
+    return {"teacher": median_time(act_as_teacher), "student": median_time(act_as_student)}
 
 
 def teacher_actions(
     task: str, options: Mapping[str, Any], repeat: int, policy: Policy
 ) -> tuple[Callable[[int], None], np.ndarray, int]:
-    """Return a function that computes an action of a KGRL policy and its commands, for one of several observations.
+    """Return a function that computes a KGRL policy's action and its commands, for timing.
 
     Args:
         task: Name of the task.
@@ -94,7 +110,8 @@ def teacher_actions(
         policy: Policy of the teacher.
 
     Returns:
-        The function of the observation's index, the observations (n, …), and the number of outputs O of a command.
+        The function of the index of an observation, the random observations (n, …), and the number of outputs O of a
+        command.
     """
     prior = make_prior_knowledge(task, **options).demonstrations
     if prior is None:
@@ -104,17 +121,17 @@ def teacher_actions(
     observations = np.random.default_rng(0).uniform(-0.5, 0.5, (MEASURED, size)).astype(np.float32)
     starts = (np.arange(MEASURED) * repeat) % (primitive.reference.num_steps - repeat)
 
-    def teach(index: int) -> None:
+    def act(index: int) -> None:
         action = gains * (prior.selection @ np.asarray(policy(observations[index]), float))
         for step in range(starts[index], starts[index] + repeat):
             primitive.predict(int(step), action)
 
-    return teach, observations, prior.num_outputs
+    return act, observations, prior.num_outputs
 
 
 def median_time(act: Callable[[int], None]) -> float:
-    """Return the median time of an action [ms], for a function of its index."""
-    for index in range(MEASURED):  # factors of the primitive's steps are computed at first use
+    """Return the median duration of `act` [ms], which computes the action with an index."""
+    for index in range(MEASURED):  # not timed: the first evaluation of a step factors the primitive's matrices
         act(index)
     times = []
     for index in range(MEASURED):
@@ -142,16 +159,11 @@ def compare(teacher: Path, student: Path, out: Path, *, episodes: int = 100) -> 
     find_base_policy(str(student))
     Policy.load(teacher)
     folder, rows = RunFolder(teacher), []
-    runs = [one for one in (teacher, student) if (one / "policy.safetensors").is_file()]
+    runs = [run for run in (teacher, student) if (run / "policy.safetensors").is_file()]
     policies = "-".join([teacher.name, student.name, *map(policy_digest, runs)])
     for number, variant in enumerate(VARIANTS):
-        tables = []
-        for first in range(0, episodes, BLOCK):
-            count = min(BLOCK, episodes - first)
-            file = out / "episodes" / f"{number}-{policies}-{first}-{count}.csv"
-            arguments = (folder, student, variant, count, HELD_OUT_SEED + first)
-            tables.append(load_or_compute(file, lambda arguments=arguments: evaluate_variant(*arguments)))
-        table = pd.concat(tables)
+        evaluate = partial(evaluate_variant, folder, student, variant)
+        table = evaluate_in_blocks(out / "episodes" / f"{number}-{policies}", evaluate, episodes)
         rows.append(
             {
                 "variant": variant,
@@ -182,8 +194,7 @@ def main(arguments: list[str]) -> None:
     parser.add_json()
     options = parser.parse_args(arguments)
     rows = compare(options.teacher, options.student, options.out, episodes=options.episodes)
-    table = str(options.out / "distillation.md")
-    print_result({"table": table, "rows": rows} if options.json else {"table": table}, as_json=options.json)
+    print_rows(options.out / "distillation.md", rows, as_json=options.json)
 
 
 if __name__ == "__main__":

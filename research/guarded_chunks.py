@@ -5,6 +5,7 @@ Finite differences of the recorded commands are compared with the limits, indepe
 Run it with `python -m research.guarded_chunks --out runs/guarded_chunks`.
 """
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,15 @@ import research.base_policies  # noqa: F401 (registers the base policy)
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate_policies
-from guiderail.tools.evaluation.evaluation import load_or_compute, policy_digest
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
+from guiderail.tools.evaluation.evaluation import policy_digest
 from guiderail.tools.tables import write_table
-from research.command import Parser, print_result, run_program
+from research.command import Parser, print_rows, run_program
+from research.distillation import evaluate_in_blocks
 
 TASK, BASE_POLICY = "BncConnector", "connector_slow_search"
 GUARDS = ("none", "projection", "slowdown")
 MAX_SPEED, MAX_JERK = (0.03, 1.0), (5.0, 200.0)  # of the position [m/s, m/s³] and the angles [rad/s, rad/s³]
 ROUNDING = 1e-9  # relative tolerance of a limit, because stored numbers are rounded
-BLOCK = 10  # episodes of a stored file
 EXCESSES = ("bound_excess", "speed_ratio", "jerk_ratio")
 
 
@@ -75,7 +75,7 @@ def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd
     try:
         bound = env.unwrapped.task.declaration.options.bound
         size, period = env.action_space.shape, env.unwrapped.task.control_period
-        limits = [np.repeat(one, 3) for one in (MAX_SPEED, MAX_JERK)]
+        limits = [np.repeat(pair, 3) for pair in (MAX_SPEED, MAX_JERK)]
         upper = np.array([bound, bound, np.inf, np.inf, np.inf, np.inf])
 
         def collect(env: Any, row: Any) -> dict[str, float]:
@@ -106,16 +106,14 @@ def compare_guards(out: Path, *, base_policy: str = BASE_POLICY, episodes: int =
     rows, name = [], Path(base_policy).name
     if (Path(base_policy) / "policy.safetensors").is_file():
         name += f"-{policy_digest(Path(base_policy))}"
-    tables: dict[str, list[pd.DataFrame]] = {guard: [] for guard in GUARDS}
-    for first in range(0, episodes, BLOCK):
-        number = min(BLOCK, episodes - first)
-        for guard in GUARDS:
-            file = out / "episodes" / f"{name}-{guard}-{first}-{number}.csv"
-            arguments = (guard, base_policy, number, HELD_OUT_SEED + first)
-            tables[guard].append(load_or_compute(file, lambda arguments=arguments: evaluate_guard(*arguments)))
-    unguarded = pd.concat(tables["none"])["success"].to_numpy()
-    for guard in GUARDS:
-        table = pd.concat(tables[guard])
+    tables = {
+        guard: evaluate_in_blocks(
+            out / "episodes" / f"{name}-{guard}", partial(evaluate_guard, guard, base_policy), episodes
+        )
+        for guard in GUARDS
+    }
+    unguarded = tables["none"]["success"].to_numpy()
+    for guard, table in tables.items():
         success = table["success"].to_numpy()
         rows.append(
             {
@@ -146,8 +144,7 @@ def main(arguments: list[str]) -> None:
     parser.add_json()
     options = parser.parse_args(arguments)
     rows = compare_guards(options.out, base_policy=options.base_policy, episodes=options.episodes)
-    table = options.out / "guarded_chunks.md"
-    print_result({"table": str(table), "rows": rows} if options.json else {"table": str(table)}, as_json=options.json)
+    print_rows(options.out / "guarded_chunks.md", rows, as_json=options.json)
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ POLICIES: dict[str, dict[str, Any]] = {
 """Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,
 connector_robot_sensing, grid_clamp_robot_sensing and pouring_hard (`rl_sct_longer`)."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
-MAX_SIZE = 200_000  # of the files of one policy [bytes]
+MAX_SIZE = 200_000  # largest total size of the files of one policy [bytes]
 EPISODES = 40  # held-out episodes of the policy and of each baseline policy
 
 
@@ -76,7 +76,7 @@ def make(name: str, out: Path, episodes: int = EPISODES) -> guiderail.Evaluation
 
 
 def main() -> None:
-    """Make the policies that are named on the command line; all of them by default."""
+    """Train and store the policies that are named on the command line; all policies by default."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[*POLICIES, []], help="Policies; all by default.")
     parser.add_argument("--out", type=Path, default=Path("runs/pretrained"), help="Folder of the runs.")

@@ -40,10 +40,10 @@ def log_dimensionless_jerk(positions: np.ndarray, period: float) -> float:
 
     Args:
         positions: Positions, (N, O).
-        period: Time between them [s].
+        period: Time between two positions [s].
 
     Returns:
-        −inf for fewer than four positions or no motion.
+        The log dimensionless jerk; −inf for fewer than four positions or no motion.
     """
     positions = np.asarray(positions, dtype=float)
     if len(positions) < 4:
@@ -66,10 +66,10 @@ def spectral_arc_length(
 
     Args:
         positions: Positions, (N, O).
-        period: Time between them [s].
+        period: Time between two positions [s].
         cutoff: Largest frequency [Hz].
-        threshold: Smallest amplitude, as a fraction of the largest.
-        padding: Powers of two by which the signal is zero-padded.
+        threshold: Smallest amplitude, as a fraction of the largest amplitude.
+        padding: Base-2 logarithm of the factor by which zero-padding lengthens the signal.
     """
     speed = np.linalg.norm(np.diff(np.asarray(positions, dtype=float), axis=0), axis=1) / period
     if not len(speed) or not np.max(speed) > 0:
@@ -88,7 +88,7 @@ def spectral_arc_length(
 
 TASK = "BncConnector"
 ACTION_REPEAT = 10  # control steps per action, as in the training of BncConnector
-SLOW = 25  # control steps per action; two actions per second resolve 1 Hz, the cutoff of one of the low-pass filters
+SLOW = 25  # control steps per action; two actions per second resolve 1 Hz, the cutoff frequency of a low-pass filter
 PLACES = ("free", "connector")
 OUT_OF_REACH = (MAX_GIVEN_OFFSET, MAX_GIVEN_OFFSET)  # jack offset for motions in free space [m]
 ALONE = "demonstration alone"
@@ -124,10 +124,10 @@ def methods() -> list[Method]:
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
         settings = {"history": history, "history_variance": variance}
         listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", repeated[1], 1, settings))
-    usual = {"history": 10, "history_variance": HISTORY_VARIANCE}
-    listed.append(Method("sKGRL adaptive", "skgrl", repeated[1], 1, usual | {"adaptive_history": True}))
+    defaults = {"history": 10, "history_variance": HISTORY_VARIANCE}
+    listed.append(Method("sKGRL adaptive", "skgrl", repeated[1], 1, defaults | {"adaptive_history": True}))
     listed.append(Method(f"KGRL repeat {ACTION_REPEAT}", "kgrl", repeated[ACTION_REPEAT], ACTION_REPEAT))
-    listed += [Method(f"sKGRL repeat {n}", "skgrl", repeated[n], n, usual) for n in (ACTION_REPEAT, SLOW)]
+    listed += [Method(f"sKGRL repeat {n}", "skgrl", repeated[n], n, defaults) for n in (ACTION_REPEAT, SLOW)]
     residual: dict[str, Explore] = {"white": repeated[1], f"repeat {ACTION_REPEAT}": repeated[ACTION_REPEAT]}
     residual |= {f"gSDE {n}": partial(state_dependent, interval=n) for n in (1, 8, 64)}
     residual |= {"pink": partial(open_loop, pink), "OU": partial(open_loop, ornstein_uhlenbeck)}
@@ -145,7 +145,7 @@ def smoothness(
         episodes: Episodes of each method in free space, and as many in contact.
         action_scale: Common exploration RMS, in demonstration standard deviations.
         outputs: "all" for all six outputs, as in the thesis, or "xy" for the outputs that the learned policies move.
-        seed: Seed of the random actions and of the jack offsets, which are new in every episode.
+        seed: Seed of the random actions and of the jack offsets, which are sampled again for every episode.
 
     Raises:
         InputError: If a number is out of range.
@@ -239,8 +239,8 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
     primitive = config.primitive(history=method.guidance == "skgrl")
     if not method.environment.get("adaptive_history"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
-    # One action scale sets the gains for every length of an adaptive history. It is computed for the full length,
-    # which the history has in free space.
+    # An adaptive history has several lengths, but one action scale. It is computed for the full length, which is the
+    # length in free space.
     reached = exploration_rms(primitive, config.null_space_gains(primitive), method.action_repeat)[indices]
     return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
 
@@ -278,7 +278,7 @@ def _row(
 
 
 def _ratios(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return how many times the jerk of sKGRL is below that of KGRL and of residuals, with the success rates."""
+    """Return the ratios of the jerk of KGRL and of residual RL to the jerk of sKGRL, with the success rates."""
     free = {row["method"]: row for row in rows if row["place"] == "free"}
     success = {row["method"]: row["success_rate"] for row in rows if row["place"] == "connector"}
     others = {name: row for name, row in free.items() if name.startswith("residual")}

@@ -1,7 +1,7 @@
 """Differences between a run and the thesis.
 
-`THESIS` holds the settings that the thesis gives, and their sections. Where the thesis gives none, the remarks name
-what this project uses. Options that deviate from this project's own defaults are listed too.
+`THESIS` has the settings that the thesis states, with their sections. For settings that the thesis omits, remarks
+describe the choice of this project. Options that differ from this project's defaults are listed as well.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NEUTRAL = {
     "kernel_parameters": "parameters of a kernel other than the thesis's",
     "driver": "the program that drives a robot",
     "robot_url": "the address of a robot's messages",
-    "robot_timeout": "the time after which a silent robot is given up",
+    "robot_timeout": "the time without messages after which the connection to a robot counts as lost",
 }
 """Options that are never a difference, with the reason."""
 
@@ -36,12 +36,12 @@ class Setting:
     """Settings of the thesis for a task.
 
     Attributes:
-        section: Sections of the thesis that give the settings.
-        options: Values of the environment's options; several where the thesis has several.
-        preset: Name of the preset that holds the table of the learner's settings.
+        section: Sections of the thesis that state the settings.
+        options: Values of the environment's options; several values if the thesis has several.
+        preset: Name of the preset with the thesis's table of the learner's settings.
         algorithms: Names of the learners.
-        remarks: Pairs of a text and a predicate. The text is a difference of every run for whose environment the
-            predicate is true; it is a format string over the environment's options.
+        remarks: Pairs of a text and a predicate of the environment's options. If the predicate is true for a run, the
+            text is a difference of the run. It is a format string of the environment's options.
     """
 
     section: str
@@ -71,7 +71,7 @@ _PRIMITIVE = {
     "kernel": ("squared_exponential",),  # section 4.3.3, "the same kernel in all our experiments"
     "length_scale": (0.5,),  # the thesis's l = 2 is 1 / (2 ℓ²)
 }
-_IN_REMARKS = ("action_scale", "mouth_chamfer", "difficulty")  # options whose values the remarks have
+_IN_REMARKS = ("action_scale", "mouth_chamfer", "difficulty")  # options whose values are in the remarks
 _SCALE = (
     "actions of ±1 are κ = {action_scale:g} standard deviations of the demonstrations (thesis: no scale given)",
     _always,
@@ -172,7 +172,7 @@ THESIS = {
     ),
 }  # fmt: skip
 
-# Settings of the learner that the thesis does not have: name, whether it is in use, description.
+# Settings of the learner that the thesis does not have: name, predicate that is true if it is used, description.
 _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
     (
         "greedy_episode_fraction",
@@ -190,7 +190,7 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
     ("layer_norm", lambda p: p.layer_norm, "layer normalization"),
     (
         "constant_episodes",
-        lambda p: p.constant_episodes > 0 and not p.init_from,  # it counts the episodes of the earlier run
+        lambda p: p.constant_episodes > 0 and not p.init_from,  # the episodes of the earlier run count as well
         "the first {constant_episodes} episodes repeat one action each",
     ),
     ("init_from", lambda p: bool(p.init_from), "learning continues from an earlier run"),
@@ -208,14 +208,14 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
     ("n_steps", lambda p: p.n_steps > 1, "{n_steps}-step returns"),
 )
 _COMPARED = ("learning_rate", "tau", "train_freq", "gradient_steps", "ent_coef", "net_arch", "buffer_size")
-# Settings that only table 3.2 gives.
+# Settings that only table 3.2 has.
 _TABLE_3_2_ONLY = ("learning_starts", "batch_size")
 
 
 def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]:
-    """Describe the differences between a run and the thesis, one sentence fragment each.
+    """Return the differences between a run and the thesis, one sentence fragment each.
 
-    For a task that is not in the thesis, the only entry says so.
+    For a task that is not in the thesis, the only entry states this.
 
     Args:
         config: Configuration of the run.
@@ -243,13 +243,13 @@ def describe_differences(config: RunConfig, *, learns: bool = True) -> list[str]
 
 
 def _is_given(name: str, environment: Mapping[str, Any]) -> bool:
-    """Return True if the thesis gives an option for the environment's guidance."""
+    """Return True if the thesis states a value of an option for the environment's guidance."""
     guidance = environment.get("guidance")
     return guidance == "skgrl" if name in HISTORY else guidance == "sct" or name != "active_constraints"
 
 
 def _non_defaults(config: RunConfig, setting: Setting) -> list[str]:
-    """Describe options that the thesis does not give and that differ from the defaults of the task's difficulty."""
+    """Describe options that the thesis omits and that differ from the defaults of the task's difficulty."""
     from guiderail.tools.environments import beyond_defaults, check_environment  # imports Drake, which takes a second
 
     task, environment = config.task, config.environment

@@ -1,1 +1,1 @@
-"""Fuzzing of tasks with actions that no trained policy sends, `python -m research.action_fuzzing TASK`."""
+"""Fuzzing of tasks with random and extreme actions, `python -m research.action_fuzzing TASK`."""

@@ -19,10 +19,10 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 def interference(dimensions: BncDimensions, R_JP: np.ndarray, p_JP: np.ndarray) -> tuple[float, float]:
-    """Compute the penetration depths [m] of the rigid geometry: of the deeper lug, and of the barrel's end.
+    """Compute the penetration depths of the rigid geometry: of the deeper lug and of the barrel's end [m].
 
-    The slot is unrolled. The gasket's pad is soft and is ignored. Only the end of the barrel is checked, which assumes
-    a roughly upright plug.
+    The slot is unrolled. The gasket's pad is soft and is ignored. Of the barrel, only the end is checked, which is
+    sufficient for an almost upright plug.
 
     Args:
         dimensions: Dimensions of the connector.
@@ -44,7 +44,7 @@ def _lug_inside(d: BncDimensions, p_P: np.ndarray) -> float:
     beyond_face = p_P[2] + d.lug_radius
     if beyond_face <= 0.0:
         return 0.0
-    # The slots are equal. An angle nearer to the other slot's entry than to this slot's end belongs to the other slot.
+    # The slots are equal. A lug whose angle is nearer to the other slot's entry than to this slot's end belongs there.
     angle = np.arctan2(p_P[1], p_P[0]) % np.pi
     if angle > 0.5 * (np.pi + d.detent_angle):
         angle -= np.pi
@@ -82,10 +82,10 @@ def _distance(corners: np.ndarray, point: np.ndarray) -> float:
 
 
 ACTION_DIMS = {"x, y": (0, 1), "all six": (0, 1, 2, 3, 4, 5)}
-STANDING_STEPS = 5  # number of actions after which a penetration is no longer an impact
+STANDING_STEPS = 5  # number of actions for which a penetration has to last to count as standing, not as an impact
 _D = BncWorkcell().dimensions
-# Compliant surfaces deform in an impact. Beyond these depths a body could pass through a wall: a lug with
-# its center inside the wall, or a barrel as deep in the ring as the ring is thick.
+# Compliant surfaces deform in an impact. Beyond these depths, a body could pass through a wall: the center of a lug
+# would be inside the wall, or a barrel as deep in the ring as the ring is thick.
 LIMITS = {
     "lug_impact_mm": _D.lug_radius / MM,
     "barrel_impact_mm": (_D.ring_radius - _D.bore_radius) / MM,

@@ -15,8 +15,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pandas as pd
+from pydrake.math import RigidTransform
 
+from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselineFactory
 from guiderail.tools.evaluation.metrics import TOLERANCE
@@ -24,7 +27,6 @@ from guiderail.tools.evaluation.rollout import Callback, EnvCallback, Transition
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import read_table, table_text
-from research.action_fuzzing.recompute import Frames, RecomputedViolation, nominal_frames
 
 # Columns of an episode's row that the table of a campaign has.
 COLUMNS = (
@@ -52,17 +54,72 @@ class NonFiniteCounter(EnvCallback):
         return {"not_finite": self._count + sum(int(np.sum(~np.isfinite(values))) for values in recorded)}
 
 
+Frames = Callable[[Mapping[str, Any]], Mapping[str, RigidTransform]]
+"""Function from the values sampled at a reset to the poses of a template's objects."""
+
+
+def nominal_frames(sampled: Mapping[str, Any]) -> Mapping[str, RigidTransform]:
+    """Return an empty mapping, which means that every object has its nominal pose."""
+    return {}
+
+
+class RecomputedViolation(EnvCallback):
+    """Callback that adds `recomputed_violation`, the largest violation of an episode's commands; −inf if unconstrained.
+
+    It is computed with NumPy from the recorded `desired_pose` and the task's constraints, or the template's active
+    constraints in the state of each control step. It does not depend on the systems that report violations.
+    """
+
+    def __init__(self, env: gymnasium.Env, frames: Frames | None = nominal_frames):
+        """Construct the callback.
+
+        Args:
+            env: Environment of a declared task.
+            frames: Poses of the template's objects. If None, the poses are unknown, and only the task's constraints
+                are recomputed.
+        """
+        super().__init__(env)
+        self._frames = frames
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return `recomputed_violation`."""
+        task: Task | None = getattr(self.base.task, "declaration", None)
+        if task is None or not len(self.base.trace):
+            return {"recomputed_violation": -np.inf}
+        return {"recomputed_violation": float(self._violations(task).max())}
+
+    def _violations(self, task: Task) -> np.ndarray:
+        """Return the violation of every control step, (n,)."""
+        poses = self.base.trace.commanded
+        constraints = task.constraints()
+        if constraints is not None:
+            # Command n of the trace (from zero) has to satisfy the constraints of step n.
+            G, c = constraints.window(np.arange(len(poses)))
+            return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
+        if self._frames is None or "template" not in task.provides():
+            return np.full(len(poses), -np.inf)
+        placed = task.template()
+        frames = {**placed.frames, **self._frames(self.base.sampled)}
+        states = self.base.trace.signals["state"][:, 0].astype(int)
+        return np.array(
+            [
+                placed.template.violation(state, pose_to_transform(pose), frames)
+                for state, pose in zip(states, poses, strict=True)
+            ]
+        )
+
+
 @dataclass(frozen=True)
 class Case:
-    """Environment that is fuzzed with every kind of actions.
+    """Environment that is fuzzed with every kind of action.
 
     Attributes:
         name: Name in the table.
         environment: Options of the environment.
         constrained: True if every command must satisfy the constraints.
         options: Options of every reset.
-        may_wait: True if a fallback is allowed, because it means waiting or stopping before a wall.
-        limits: Limits of columns; those of the campaign by default.
+        may_wait: True if a fallback is allowed, because it is a wait or a stop before a wall.
+        limits: Limits of columns; by default the limits of the campaign.
     """
 
     name: str
@@ -84,7 +141,7 @@ class Campaign:
         task: Name of the task.
         cases: Environments.
         limits: Largest allowed values of columns, including those of the callback.
-        make_callback: Makes a callback that adds numbers to an episode's row; a larger number is worse.
+        make_callback: Constructor of a callback that adds numbers to an episode's row; a larger number is worse.
         actions: Kinds of actions, by name.
         frames: Function from the values sampled at a reset to the poses of a template's objects; None if unknown.
     """
@@ -107,14 +164,14 @@ def run_campaign(
     environment: Mapping[str, Any] | None = None,
     report: Callable[[str], None] | None = None,
 ) -> list[dict[str, Any]]:
-    """Run episodes until `is_done`, cycling through every case with every kind of actions.
+    """Run episodes until `is_done`, cycling through every case with every kind of action.
 
     Args:
         campaign: Campaign to run.
         is_done: Called with the rows before each episode; True ends the campaign.
         seed: Seed of the first episode; episode i has seed + i.
         out: Table that is written after every round of the cases. Episodes in it are not run again.
-        step_log: Folder of a file per episode with every control step.
+        step_log: Folder of the step logs, a file per episode.
         environment: Options of every case, which override its own.
         report: Called with a line of text after every round.
 
@@ -167,7 +224,7 @@ def run_campaign(
 
 
 def _digest(task: str, environment: Mapping[str, Any]) -> str:
-    """Return a digest of the resolved environment, with a prefix so that no reader parses it as a number."""
+    """Return a digest of the resolved environment; its prefix keeps CSV readers from parsing it as a number."""
     resolved = json.dumps(check_environment(task, environment), sort_keys=True, default=str)
     return f"env-{hashlib.blake2b(resolved.encode(), digest_size=6).hexdigest()}"
 

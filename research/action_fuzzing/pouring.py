@@ -1,6 +1,6 @@
 """Fuzzing of pouring: noisy, random and adversarial inputs.
 
-Collisions are counted at every plant step. The thermos must not be commanded to tilt before the template allows it.
+Collisions are counted at every plant step. The thermos must not be commanded to tilt in the template's first state.
 """
 
 from collections.abc import Callable, Mapping
@@ -19,7 +19,7 @@ from research.action_fuzzing.campaign import Campaign, Case
 
 
 class EarlyTilt(EnvCallback):
-    """Callback: largest commanded tilt in the template's first state, which keeps the thermos upright."""
+    """Callback that records the largest commanded tilt in the template's first state, which requires no tilt."""
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `early_tilt` [rad] over all control steps; 0 if the template was never in its first state."""
@@ -29,7 +29,7 @@ class EarlyTilt(EnvCallback):
 
 
 def _tilt(pose: np.ndarray) -> float:
-    """Return the angle [rad] between the axis of a thermos with a pose, (6,), and the vertical."""
+    """Return the angle between the thermos's axis and the vertical [rad], for a pose (6,) of the thermos."""
     R = pose_to_transform(pose).rotation().matrix()
     return float(np.arctan2(np.hypot(R[0, 2], R[1, 2]), R[2, 2]))
 
@@ -44,7 +44,7 @@ def noisy_pour(rng: np.random.Generator, spread: float = 1.5) -> PolicyFn:
 
 
 def random_walk(rng: np.random.Generator) -> PolicyFn:
-    """Return a policy of inputs ±1 that are resampled with probability 0.1, so that it reaches the whole workspace."""
+    """Return a policy of inputs ±1 that are resampled with probability 0.1: longer moves reach the whole workspace."""
     action = np.sign(rng.normal(size=3))
 
     def act(observation: np.ndarray) -> np.ndarray:
@@ -94,7 +94,7 @@ def campaign() -> Campaign:
     return Campaign(
         "Pouring",
         [
-            # Random inputs bring the arm to a joint limit when the mug is far off; the last command is repeated there.
+            # With a large mug offset, random inputs reach joint limits, where the last command is repeated.
             Case("sct", {"guidance": "sct", "mug_offset": MAX_MUG_OFFSET}, constrained=True, may_wait=True),
             Case("none", {"guidance": "none", "mug_offset": MAX_MUG_OFFSET}, constrained=False, limits={}),
         ],

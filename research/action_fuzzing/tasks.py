@@ -19,9 +19,9 @@ CONSTRAINED = ("kgrl", "skgrl", "sct")
 
 
 def grid_clamp() -> Campaign:
-    """Return the campaign: with any guidance, commands stay in the template's cuboid and forces below the limit.
+    """Return the campaign: with every guidance, commands stay in the template's cuboid and forces below the limit.
 
-    While the clamp is blocked, the last command is repeated. This counts as a fallback, which is allowed.
+    While the clamp is blocked, the last command is repeated. This is an allowed fallback.
     """
     cases = [
         Case(
@@ -62,9 +62,9 @@ def narrow_passage() -> Campaign:
 def campaign_of(task: str) -> Campaign:
     """Return a campaign of every guidance of a task, with the default options.
 
-    The violation of a task's constraints is recomputed. That of a template's constraints is only reported by the
-    guidance, because the poses of the template's objects are unknown. A fallback (waiting, or stopping before a wall)
-    is a failure with KGRL and sKGRL only.
+    Violations of the task's constraints are recomputed. Violations of a template's constraints are only reported by the
+    guidance, because the poses of the template's objects are unknown. A fallback (a wait, or a stop before a wall) is a
+    failure with KGRL and sKGRL only.
 
     Args:
         task: Name of the task.

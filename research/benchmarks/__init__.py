@@ -25,8 +25,8 @@ BENCHMARKS = (
     "many_envs",
     "actors",
 )
-WITH_TASK = ("training", "cold_start", "actors")  # benchmarks of a task that the caller names
-WITH_IMPORTS = ("cold_start",)  # benchmarks that start other processes, which have to import the task's modules
+WITH_TASK = ("training", "cold_start", "actors")  # benchmarks of a task that the user chooses
+WITH_IMPORTS = ("cold_start",)  # benchmarks with child processes, which have to import the task's modules
 WITH_PICTURE = ("time_step", "engines")
 
 
@@ -65,7 +65,7 @@ def run_benchmark(
 
 
 def with_progress(items: Collection[Item], label: str) -> Iterator[Item]:
-    """Yield items one after the other, and print each on standard error."""
+    """Yield items one after the other, and print each of them on standard error."""
     for index, item in enumerate(items, 1):
         print(f"{label} {index}/{len(items)}: {item}", file=sys.stderr, flush=True)
         yield item

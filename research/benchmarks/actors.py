@@ -20,16 +20,16 @@ from guiderail.tools.learning.train import configure, with_defaults
 from guiderail.tools.learning.trainer import run_training
 from research.benchmarks import with_progress
 
-EPISODES, SKIPPED = 12, 5  # episodes of a run, and untimed ones among them, in which learning begins
-MEASURED = ((1, 0), (2, 1), (2, 2))  # cores and actors
-EXTRAPOLATED = ((16, 4), (100, 4))
+EPISODES, SKIPPED = 12, 5  # number of episodes of a run, and number of the first ones, which are not timed
+MEASURED = ((1, 0), (2, 1), (2, 2))  # numbers of cores and of actors of the measured runs
+EXTRAPOLATED = ((16, 4), (100, 4))  # numbers of cores and of actors for which the model is evaluated
 
 
 def seconds_per_episode(simulation: float, learning: float, cores: int, num_envs: int) -> float:
     """Return the wall-clock time of a training episode [s].
 
-    Without actors, a process simulates and learns in turn. With N actors, the time is the largest of three: all work
-    divided by the cores, the learning in one process, and the simulation divided by N.
+    Without actors, one process simulates and learns in turn. With N actors, the time is the largest of three times: all
+    work divided by the number of cores, the learning in one process, and the simulation divided by N.
 
     Args:
         simulation: Processor time of an episode's simulation [s].
@@ -64,7 +64,7 @@ def measure(task: str = "BncConnector", environment: Mapping[str, Any] | None = 
 
 
 def _run(task: str, environment: Mapping[str, Any], cores: int, num_envs: int) -> dict[str, float]:
-    """Train a run; return wall-clock time, and processor time of this process and of its actors, per episode [s]."""
+    """Train a run; return the wall-clock time and the processor times of learner and actors, per episode [s]."""
     config = configure(
         task, environment, **with_defaults(task, {"episodes": EPISODES, "settings": _settings(num_envs)})
     )

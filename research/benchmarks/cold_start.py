@@ -2,7 +2,7 @@
 
 Each run is `guiderail train` in a new process, timed from its start to its end, including imports, saving and drawing.
 The evaluation of its policy is not timed. For each seed, both kinds run one after the other, so that the load of the
-machine is the same for both. No setting was chosen with these seeds.
+machine is similar. No setting was tuned on these seeds.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EPISODES = 20  # with seeds 30 to 34, training has converged after at most 10 ep
 SEEDS = range(400, 405)
 HELD_OUT = 100
 KINDS = {"alternating": "false", "pipelined": "true"}  # the setting `pipelined`
-REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # [s]
+REQUIRED_MEDIAN, REQUIRED_WORST = 60.0, 120.0  # largest accepted median and longest duration of a run [s]
 
 
 def measure(
@@ -46,7 +46,7 @@ def measure(
 
     Args:
         task: Name of the task.
-        environment: Its options; by default those of the connector with a hidden offset per run.
+        environment: Options of the task's environment; by default for the connector, `ENVIRONMENT`.
         imports: Modules or files that register the task.
         episodes: Training episodes of a run.
         seeds: Seeds of the runs.

@@ -32,12 +32,11 @@ MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
 PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses with 4 N
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
 NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
-IN, FARTHEST = 9.5 * MM, 0.4 * MM  # a plug below this height dropped in; offset at which none does [m]
+CAPTURED = 9.5 * MM  # height below which a plug has dropped into the jack [m]
+FARTHEST = 0.4 * MM  # offset at which no plug drops in [m]
 HALVINGS = 6  # bisection steps of the capture offset
-AROUND, SPEEDS = (
-    3.0 * MM,
-    (0.003, 0.02, 0.04),
-)  # radius of a circle on the rim [m], speeds [m/s]
+AROUND = 3.0 * MM  # radius of the circle on the rim along which the plug is dragged [m]
+SPEEDS = (0.003, 0.02, 0.04)  # speeds along the circle [m/s]
 CAPTURES = {  # station, and True if Drake's polygons have the areas of the circles that they approximate
     "Drake": ("gantry", False),
     "Drake, equal areas": ("gantry", True),
@@ -65,9 +64,10 @@ def measure() -> dict[str, Any]:
     levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
-    captures |= {engine: _capture(*how) / MM for engine, how in with_progress(CAPTURES.items(), "capture")}
+    captures |= {engine: _capture(*values) / MM for engine, values in with_progress(CAPTURES.items(), "capture")}
     drags = {
-        contact: [drag(*how, speed) for speed in SPEEDS] for contact, how in with_progress(CONTACTS.items(), "drag")
+        contact: [drag(*values, speed) for speed in SPEEDS]
+        for contact, values in with_progress(CONTACTS.items(), "drag")
     }
     measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
     return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
@@ -113,13 +113,13 @@ def _lever(name: str, offset: float, modulus: float) -> float:
 
 
 def _capture(name: str, equal_area: bool = False) -> float:
-    """Return the largest offset at which a plug that is pressed on the jack drops in [m]."""
+    """Return the largest offset at which a plug that is pressed on the jack drops into it [m]."""
     near, far = 0.0, FARTHEST
     for _ in range(HALVINGS):
         middle = 0.5 * (near + far)
         workcell = BncWorkcell(NARROW, equal_area=equal_area)
-        dropped = _pressed(name, workcell, middle)["pose"][-1, 2] < IN
-        near, far = (middle, far) if dropped else (near, middle)
+        is_captured = _pressed(name, workcell, middle)["pose"][-1, 2] < CAPTURED
+        near, far = (middle, far) if is_captured else (near, middle)
     return near
 
 

@@ -2,8 +2,8 @@
 
 `joint` consists of springs and dampers in the gantry's joints, solved together with the contact. `cartesian` is the
 Cartesian impedance controller of the arm, whose forces are constant during a plant step. Both have the same stiffness,
-damping ratio and limits. A scripted insertion is simulated with several time steps, each compared with the finest.
-The demonstration alone and the scripted policy act in the same held-out episodes with each impedance.
+damping ratio and limits. A scripted insertion is simulated with several time steps, and compared with the finest one.
+The demonstration alone and the scripted policy are evaluated in the same held-out episodes with each impedance.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def measure() -> dict[str, Any]:
     for row, (control, parts) in zip(motions, jobs, strict=True):
         if parts == TIME_STEPS[control][-1]:
             row |= _difference(finest[control], finest[CONTROLS[0]], "joint")
-    acting = [(d, name, control) for d in DIFFICULTIES for name in POLICIES for control in CONTROLS]
+    cases = [(difficulty, name, control) for difficulty in DIFFICULTIES for name in POLICIES for control in CONTROLS]
     return {
         "motion": motions,
         "step": [step_response(control) for control in CONTROLS],
-        "episodes": [_episodes(*one) for one in with_progress(acting, "episodes")],
+        "episodes": [_episodes(*case) for case in with_progress(cases, "episodes")],
     }
 
 
@@ -83,7 +83,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
 
 
 def step_response(control: str, time_step: float | None = None) -> dict[str, Any]:
-    """Return a row whose `response` (n, 6) is that of the tool center to a step of all coordinates, relative to it."""
+    """Return a row whose `response` (n, 6) is the pose after a step of all coordinates, relative to the step."""
     station = GantryStation(BncWorkcell(), time_step=time_step, impedance_control=control)  # type: ignore[arg-type]
     start = np.array([0.0, 0.0, 50.0 * MM, 0.0, 0.0, 0.0])
     simulator = Simulator(station)
@@ -121,12 +121,12 @@ def show(results: dict[str, Any]) -> None:
     """Print the results."""
     print("scripted insertion   step     CPU    peak    locks  RMS error to the finest step")
     for row in results["motion"]:
-        near = f"{row['own_position_rms'] / MM:6.3f} mm"
+        errors = f"{row['own_position_rms'] / MM:6.3f} mm"
         if row.get("joint_position_rms"):
-            near += f", {row['joint_position_rms'] / MM:.3f} mm to the joint impedance"
+            errors += f", {row['joint_position_rms'] / MM:.3f} mm to the joint impedance"
         print(
             f"  {row['control']:<17}{1e3 * row['time_step']:6.2f} ms {row['seconds']:5.2f} s "
-            f"{row['peak_force']:5.1f} N  {'yes' if row['locks'] else 'no':<5} {near}"
+            f"{row['peak_force']:5.1f} N  {'yes' if row['locks'] else 'no':<5} {errors}"
         )
     print("step response, relative to the step, after 1, 2, 3, 5, 10 control periods")
     for row in results["step"]:

@@ -1,17 +1,21 @@
 """Duration of gradient steps compared with Stable-Baselines3: `python -m research.benchmarks learner`.
 
-CPU time of one core. The two learners alternate, and the ratio is the median over the turns. An observation has 13
-entries and an action 2, as in the connector task.
+Durations are CPU times of one core. The two learners alternate, and the ratio is the median over the turns. An
+observation has 13 entries and an action 2, as in the connector task.
 
-TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25 quantiles, batches of 64) takes this share of
-Stable-Baselines3's time: 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused optimizer; 0.20
-to 0.25 with hand-written gradients. A further change multiplies the time with hand-written gradients by 1.02 to 1.08 if
-PyTorch instead of NumPy sorts the quantiles, by 0.96 to 1.05 if the memory of the quantile errors is preallocated, by
-1.05 to 1.08 if a matrix product sums the quantile errors, and by 40 with two threads on busy cores, because waiting
-threads spin.
+Fractions of Stable-Baselines3's time, for TQC with the preset `tqc_contact` (two critics of 128 by 128 units, 25
+quantiles, batches of 64):
+- 0.20 to 0.25 with hand-written gradients, as implemented
+- 0.39 with critics batched in PyTorch's autograd, flat parameters and a fused optimizer
 
-With large batches and layers the matrix products dominate: SAC with 256 by 256 units and batches of 256
-(`table_4_1_simulation`) takes 0.68 of Stable-Baselines3's time.
+Factors by which a change multiplies the duration with hand-written gradients:
+- 1.02 to 1.08 if PyTorch instead of NumPy sorts the quantiles
+- 0.96 to 1.05 if the memory of the quantile errors is preallocated
+- 1.05 to 1.08 if a matrix product sums the quantile errors
+- 40 with two threads on busy cores, because waiting threads spin
+
+With large batches and layers, the matrix products dominate: for SAC with 256 by 256 units and batches of 256
+(`table_4_1_simulation`), the fraction is 0.68.
 """
 
 import time
@@ -98,9 +102,10 @@ def _with_transitions(kind: type[OffPolicyLearner], preset: str) -> OffPolicyLea
     learner = kind(settings, _Spaces(), action_repeat=10, seed=0, max_transitions=_TRANSITIONS)
     random = np.random.default_rng(0)
     for index in range(_TRANSITIONS):
-        seen, then = random.standard_normal((2, 13)).astype(np.float32)
+        observation, following = random.standard_normal((2, 13)).astype(np.float32)
         action = random.uniform(-1, 1, 2).astype(np.float32)
-        learner.store(Transition(seen, action, float(random.standard_normal()), then, index % 50 == 49, False, {}))
+        reward, is_terminated = float(random.standard_normal()), index % 50 == 49
+        learner.store(Transition(observation, action, reward, following, is_terminated, False, {}))
     return learner
 
 

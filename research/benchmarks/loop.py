@@ -1,8 +1,8 @@
 """Timing of the control loop of a robot: `python -m research.benchmarks loop`.
 
-Measures the duration of each part of the loop, next to the part's period, and the jitter of LCM messages on localhost.
-Both are measured without added load and with a busy process on every core. Durations are wall-clock times, including
-the worst case.
+The results are the duration of each part of the loop, compared with the part's period, and the jitter of LCM messages
+on localhost. Both are measured without added load and with a busy process on every core. Durations are wall-clock
+times, and the largest one is reported as well.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
 from research.benchmarks import with_progress
 
-TASK, HOLD = "BncConnector", 10
-UNITS = 128
-START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
+TASK, ACTION_REPEAT = "BncConnector", 10
+UNITS = 128  # units in each hidden layer of the policy
+START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])  # start pose of the tool [m, rad]
 SECONDS = 6.0  # robot time for each of the two loads [s]
 PERIOD = IiwaDriver.period
 Row = dict[str, Any]
@@ -67,7 +67,7 @@ def _timed(call: Callable[[int], object], number: int) -> np.ndarray:
         started = time.perf_counter()
         call(index)
         seconds[index] = time.perf_counter() - started
-    return seconds[number // 20 :]  # without the first calls, which a warm-up makes on hardware before motion
+    return seconds[number // 20 :]  # without the first calls: on hardware, they are made before the robot moves
 
 
 def _policy(observations: int, actions: int) -> Policy:
@@ -85,7 +85,7 @@ def _parts() -> list[Row]:
     policy, observation = _policy(13, 2), np.zeros(13, np.float32)
     config = make_prior_knowledge(TASK, guidance="skgrl").demonstrations
     assert config is not None
-    rows = [_row("policy", HOLD * CONTROL_PERIOD, _timed(lambda index: policy(observation), number))]
+    rows = [_row("policy", ACTION_REPEAT * CONTROL_PERIOD, _timed(lambda index: policy(observation), number))]
     rng = np.random.default_rng(0)
     primitive = config.primitive(history=True)
     history = np.tile(primitive.reference.means[0], (primitive.history, 1))
@@ -102,14 +102,14 @@ def _parts() -> list[Row]:
 def _stepped(lcm: DrakeLcm, station: HardwareStation, number: int) -> np.ndarray:
     """Measure the duration [s] of a station's step per status message of a simulated robot in the same process."""
     robot = SimulatedIiwa(BncWorkcell(), lcm)
-    simulator, other = Simulator(station), robot.simulator()
-    robot.set_pose(other.get_mutable_context(), START)
-    other.Initialize()
+    simulator, robot_simulator = Simulator(station), robot.simulator()
+    robot.set_pose(robot_simulator.get_mutable_context(), START)
+    robot_simulator.Initialize()
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
     station.start(simulator)
     seconds = np.empty(number)
     for index in range(number):
-        other.AdvanceTo((index + 1) * PERIOD)
+        robot_simulator.AdvanceTo((index + 1) * PERIOD)
         started = time.perf_counter()
         simulator.AdvancePendingEvents()
         station.receive(simulator.get_mutable_context())
@@ -129,8 +129,8 @@ def _transport() -> list[Row]:
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
     context = multiprocessing.get_context("spawn")
-    here, there = context.Pipe()
-    sender = context.Process(target=_send_statuses, args=(there, url), daemon=True)
+    pipe, sender_pipe = context.Pipe()
+    sender = context.Process(target=_send_statuses, args=(sender_pipe, url), daemon=True)
     lcm = DrakeLcm(url)
     received: list[float] = []
 
@@ -140,11 +140,11 @@ def _transport() -> list[Row]:
 
     lcm.Subscribe("STATUS", answer)
     sender.start()
-    there.close()  # the second process has a copy; while this one is open, the pipe would not end with that process
+    sender_pipe.close()  # the second process has a copy; without this, its end would not close the pipe
     with _realtime_priority():
-        while not here.poll():
+        while not pipe.poll():
             lcm.HandleSubscriptions(10)
-    answered = here.recv()
+    answered = pipe.recv()
     sender.join()
     rows = [_row("from a status to the next", PERIOD, np.diff(received)[20:])]
     return [*rows, _row("round trip over LCM", PERIOD, np.array(answered)[20:])]
@@ -171,7 +171,7 @@ class _Answers:
         return len(self._sent) - 1 in self._answered
 
     def seconds(self) -> list[float]:
-        """Return the duration until each answer [s]; infinite without one."""
+        """Return the duration until each answer [s]; infinite without an answer."""
         return [self._answered.get(number, np.inf) - sent for number, sent in enumerate(self._sent)]
 
 
@@ -192,7 +192,7 @@ def _send_statuses(pipe: Connection, url: str) -> None:
 
 @contextmanager
 def _realtime_priority() -> Iterator[None]:
-    """Run with real-time priority where the system allows it."""
+    """Run with real-time priority if the system allows it."""
     has_priority = set_realtime_priority()
     try:
         yield
@@ -203,17 +203,17 @@ def _realtime_priority() -> Iterator[None]:
 
 @contextmanager
 def _busy(is_busy: bool) -> Iterator[None]:
-    """Run a busy process on every core."""
+    """Run a busy process on every core if `is_busy`."""
     context = multiprocessing.get_context("spawn")
-    others = [context.Process(target=_work, daemon=True) for _ in range((os.cpu_count() or 1) * is_busy)]
-    for other in others:
-        other.start()
+    processes = [context.Process(target=_work, daemon=True) for _ in range((os.cpu_count() or 1) * is_busy)]
+    for process in processes:
+        process.start()
     try:
         yield
     finally:
-        for other in others:
-            other.terminate()
-            other.join()
+        for process in processes:
+            process.terminate()
+            process.join()
 
 
 def _work() -> None:

@@ -1,8 +1,9 @@
 """Parallel environments, one process each: `python -m research.benchmarks many_envs`.
 
-Gymnasium's vector environment (`gymnasium.make_vec`) waits for the slowest process at every step. It sends actions and
-reads results one environment after the other; the time of this per environment is the serial part. The rate for more
-cores than the machine has is extrapolated: n environments on n cores take the time of one plus n − 1 serial parts.
+Gymnasium's vector environment (`gymnasium.make_vec`) waits for the slowest process at every step. It sends actions to
+and reads results from one environment after the other. The serial part is the duration of this communication per
+environment. The rate for more cores than the machine has is extrapolated: n environments on n cores take the time of a
+single environment plus n − 1 serial parts.
 """
 
 from __future__ import annotations

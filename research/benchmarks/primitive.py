@@ -1,10 +1,10 @@
 """Duration of a control step of an LC-NS-KMP: `python -m research.benchmarks primitive`.
 
 Every row is a closed loop (history → next point, uniform actions in ±1, gains calibrated by authority) in one of three
-regimes: constraints slack, sometimes active, or active at almost every step. The dense step computes as in the thesis:
-it inverts K + ħΣ and solves the dual of equation 4.20 over the whole window with PIQP, or with DAQP if PIQP is not
-installed. The difference is the largest deviation from the dense step, relative to the outputs' scales. Most of it is
-the numerical error of the dense step: the tests compare both with extended precision.
+regimes: constraints slack, sometimes active, or active at almost every step. The dense step is computed as in the
+thesis: K + ħΣ is inverted, and the dual of equation 4.20 over the whole window is solved with PIQP, or with DAQP if
+PIQP is not installed. The difference is the largest deviation from the dense step, relative to the outputs' scales.
+Most of this difference is the numerical error of the dense step: the tests compare both with extended precision.
 """
 
 import gc
@@ -23,12 +23,11 @@ from research.benchmarks import with_progress
 # Outputs O, constraint rows F, horizon H and history P of a planar task, the connector, and a larger problem.
 SIZES = ((2, 1, 40, 10), (6, 4, 40, 10), (6, 12, 100, 20))
 REGIMES = {"slack": 1.3, "grazing": 1.0, "active": 0.5}
-DENSE_SECONDS = 5.0
-_LARGEST = SIZES[-1]
-STEPS = 20_000
-PERIOD = 0.02
-BATCH = 4096
-_MOTION = 400
+DENSE_SECONDS = 5.0  # time after which no further dense step is computed [s]
+STEPS = 20_000  # timed steps of each regime
+PERIOD = 0.02  # control period [s]
+BATCH = 4096  # predictions in a batch
+_MOTION = 400  # steps of the motion
 
 
 @dataclass
@@ -69,7 +68,11 @@ def _reference(outputs: int) -> ReferenceTrajectory:
 
 
 def _primitive(size: tuple[int, int, int, int], share: float, solver: str = "daqp") -> LcNsKmp:
-    """Return a primitive with F/2 outputs in a box, a share of the mean's range; F = 1 is one upper bound."""
+    """Return a primitive with a box constraint on F/2 outputs; for F = 1, with one upper bound.
+
+    The half-width of the box is `share` times the largest absolute mean. If `share` is above 1, three standard
+    deviations are added to the mean first.
+    """
     outputs, rows, horizon, history = size
     reference = _reference(outputs)
     reach = share * (np.abs(reference.means) + reference.standard_deviations * (share > 1) * 3).max(axis=0)
@@ -182,12 +185,12 @@ def _predict(size: tuple[int, int, int, int], steps: int) -> dict[str, dict[str,
 
 
 def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict[str, Any]]:
-    """Return for each solver the median duration of the same constrained steps, and the difference to DAQP."""
+    """Return the median duration of the same constrained steps with each solver, and the difference from DAQP."""
     first = _primitive(size, REGIMES["active"])
     actions = authority_gains(first) * np.random.default_rng(2).uniform(-1, 1, (997, first.num_outputs))
     _, _, samples = _Loop(first, actions).run(first.predict, 4 * _MOTION)
     rows = {}
-    for name in SOLVERS if size != _LARGEST else ("daqp", "piqp"):  # OSQP needs a second per step at the largest size
+    for name in SOLVERS if size != SIZES[-1] else ("daqp", "piqp"):  # OSQP needs a second per step at the largest size
         p = _primitive(size, REGIMES["active"], name)
         seconds, failed, difference = [], 0, 0.0
         scale = np.abs(p.reference.means).max(axis=0)

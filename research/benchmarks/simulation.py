@@ -1,17 +1,18 @@
 """Speed of contact simulation: `python -m research.benchmarks simulation`.
 
-The result is the best CPU time of several runs on one core, because it depends least on other processes. Python's share
-is the time in callbacks of systems that are written in Python. It is measured in further runs, because timing the
-callbacks makes the simulation slower by a few percent.
+The result is the best CPU time of several runs on one core, because the best time depends least on other processes.
+Python's share is the time in callbacks of systems that are written in Python. The share is measured in further runs,
+because timing the callbacks makes the simulation slower by a few percent.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -35,7 +36,7 @@ from guiderail.systems.support.last_valid_pose import LastValidPose
 from guiderail.systems.wrench_sensor import WrenchSensor
 from research.benchmarks import with_progress
 
-# Timed callbacks. A callback that another one of these causes counts once, as a part of the outer one.
+# Timed callbacks. The time of a callback inside another timed callback counts only for the outer callback.
 CALLBACKS: tuple[tuple[type, str], ...] = (
     (WrenchSensor, "_sample"),
     (PoseWrench, "_wrench"),
@@ -49,8 +50,7 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (ImpedanceMonitor, "_saturation"),
     (Recorder, "_record"),
 )
-# From first contact of the plug to its release in the locked state [s].
-CONTACT = (3.8, 7.6)
+CONTACT = (3.8, 7.6)  # interval from first contact of the plug to its release in the locked state [s]
 # Motion of the clamp: dragged over the table into its holes and pushed until it snaps in. Times [s], x and z [m].
 CLAMP_TIMES, CLAMP_X, CLAMP_Z = (0.0, 0.4, 2.4, 4.0), (-0.003, -0.003, 0.0, 0.0), (0.014, 0.009, 0.009, -0.005)
 CLAMP_CONTACT = (0.4, 4.0)
@@ -95,14 +95,10 @@ def timed_callbacks() -> Iterator[Callable[[], float]]:
 
         return call
 
-    originals = [(system, name, getattr(system, name)) for system, name in CALLBACKS]
-    for system, name, method in originals:
-        setattr(system, name, timed(method))
-    try:
+    with ExitStack() as stack:
+        for system, name in CALLBACKS:
+            stack.enter_context(patch.object(system, name, timed(getattr(system, name))))
         yield lambda: spent[0]
-    finally:
-        for system, name, method in originals:
-            setattr(system, name, method)
 
 
 def real_time_factor(name: str) -> dict[str, float]:

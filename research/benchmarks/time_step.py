@@ -24,7 +24,7 @@ from guiderail.tools.visualization.style import new_figure, save_figure
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
-HALVINGS = (0, 1, 2, 3, 4)  # halvings of the control period; the last is the reference
+HALVINGS = (0, 1, 2, 3, 4)  # halvings of the control period that give the time steps; the last one is the reference
 MOTIONS = {
     "connector, no offset": ("BncConnector", (0.0, 0.0, 0.0)),
     "connector, slips off the rim": ("BncConnector", (0.8 * MM, -0.9 * MM, 0.0)),
@@ -93,7 +93,7 @@ def show(results: dict[str, Any]) -> None:
 
 
 def draw(results: dict[str, Any], path: Path) -> Path:
-    """Draw error and peak force over CPU time: a curve per motion, a dot per time step; the default one is filled."""
+    """Draw error and peak force over CPU time: a curve per motion, a dot per time step, filled for the default step."""
     figure, axes = new_figure(1, 2, (10.0, 4.0))
     columns = (("force_rms", "force, RMS error [N]"), ("peak_contact_force", "peak contact force [N]"))
     for axis, (column, label) in zip(axes.flat, columns, strict=True):

@@ -1,8 +1,9 @@
 """Profile of a training run: `python -m research.benchmarks training TASK --env station=arm`.
 
-The profiled run of `guiderail train` is short, and its learner starts early. Wall-clock time counts for the innermost
-measured part: time in a system's callback does not count for the simulation, and time that Drake needs to evaluate a
-port does not count for the callback that reads it. Drake's own computations (contact, solver, kinematics) are one part.
+The profiled run of `guiderail train` is short, and its learner starts early. Wall-clock time counts only for the
+innermost measured part: time in a system's callback does not count for the simulation, and the time in which Drake
+evaluates a port does not count for the callback that reads the port. Drake's own computations (contact, solver,
+kinematics) are one part.
 """
 
 from __future__ import annotations
@@ -12,11 +13,12 @@ import pkgutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import InputPort, OutputPort
@@ -59,7 +61,7 @@ CALLBACK = "Python: "
 
 
 class Profiler:
-    """Wall-clock time by part, each instant for the innermost part.
+    """Wall-clock time by part; each instant counts for the innermost part.
 
     Attributes:
         seconds: Duration of each part [s].
@@ -73,7 +75,7 @@ class Profiler:
         self._last = time.perf_counter()
 
     def timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        """Return the function with its time counted for a part."""
+        """Return the function wrapped so that its time counts for a part."""
         self.seconds.setdefault(part, 0.0)
         self.calls.setdefault(part, 0)
         inside, seconds, calls = self._inside, self.seconds, self.calls
@@ -95,7 +97,7 @@ class Profiler:
         return call
 
     def stop(self) -> None:
-        """Count the time until now."""
+        """Count the time since the last measurement."""
         now = time.perf_counter()
         self.seconds[self._inside[-1]] += now - self._last
         self._last = now
@@ -104,18 +106,14 @@ class Profiler:
 @contextmanager
 def timed_parts() -> Iterator[Profiler]:
     """Profile all calls in the context."""
-    # The modules of the systems are imported before the profiler's clock starts.
+    # Imports the modules of the systems before the profiler's clock starts.
     parts = [*PARTS, *((system, name, CALLBACK + system.__name__) for system, name in _callbacks())]
-    originals = [(owner, name, inspect.getattr_static(owner, name)) for owner, name, _ in parts]
     profiler = Profiler()
-    for owner, name, part in parts:
-        setattr(owner, name, profiler.timed(getattr(owner, name), part))
-    try:
+    with ExitStack() as stack:
+        for owner, name, part in parts:
+            stack.enter_context(patch.object(owner, name, profiler.timed(getattr(owner, name), part)))
+        stack.callback(profiler.stop)
         yield profiler
-    finally:
-        profiler.stop()
-        for owner, name, original in originals:
-            setattr(owner, name, original)
 
 
 def _callbacks() -> Iterator[tuple[type, str]]:

@@ -98,7 +98,7 @@ def figure_3_6(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[s
 
 
 def figure_3_8(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[str, Any]:
-    """Draw episodes to convergence and the shares of spills and collisions with both learners."""
+    """Draw episodes to convergence and the percentages of spills and collisions with both learners."""
     figure, axes = new_figure(3, 2, (9, 9))
     tables = {algorithm: _pouring(out, algorithm, seeds, episodes) for algorithm in ("sac", "tqc")}
     for column, (algorithm, rows) in enumerate(tables.items()):
@@ -165,7 +165,7 @@ def table_3_3(out: Path, seeds: int = 3, episodes: int | None = None) -> dict[st
 def _pouring(
     out: Path, algorithm: str, seeds: int, episodes: int | None, methods: tuple[str, ...] = tuple(METHODS)
 ) -> pd.DataFrame:
-    """Return a row for each run: all finished seeds in the folder are used, and new ones are run up to `seeds`."""
+    """Return a row for each run: of all finished seeds in the folder, and of new seeds until there are `seeds` runs."""
     study = figure_study(f"pouring_{algorithm}", seeds=seeds, episodes=episodes, methods=methods, evaluate=False)
     selected = {}
     for method, known in study.methods.items():

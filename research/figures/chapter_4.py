@@ -55,10 +55,10 @@ def explore(primitive: LcNsKmp, gain: np.ndarray, seed: int) -> np.ndarray:
 
 
 def figure_4_2(out: Path) -> dict[str, Any]:
-    """Draw demonstrations with their mixture, and motions with one action and with random ones, inside bounds.
+    """Draw demonstrations with their mixture, motions with one action, and motions with random actions, inside bounds.
 
-    The table has the distance of each motion from the motion without actions: at the time `MODULATED_AT`, and the
-    largest distance at times more than `NEARBY` before or after it.
+    The table has two distances of each motion from the motion without actions: at the time `MODULATED_AT`, and the
+    largest one at times that differ from it by more than `NEARBY`.
     """
     demonstrations = synthetic_demonstrations()
     reference = ReferenceTrajectory.from_demonstrations(demonstrations, components=COMPONENTS)

@@ -69,7 +69,7 @@ def figure_5_2(out: Path) -> dict[str, Any]:
             axis.plot(*windows[n].T, color="tomato", linewidth=0.8, alpha=0.8)
         axis.plot(*executed[:300].T, color="firebrick", linewidth=1.6)
         axis.set(title=f"{label(kind)} exploration", xlim=(0.2, 0.65), ylim=(0.03, 0.5))
-        # Distance between an executed point and the point that the window of the step before predicted for it.
+        # Distance of an executed point from the prediction for this point in the previous step's window.
         jumps = np.linalg.norm(executed[1:] - np.array([window[1] for window in windows[:-1]]), axis=1)
         rows.append(
             {
@@ -127,7 +127,7 @@ def figure_5_3(out: Path) -> dict[str, Any]:
 
 
 def figure_5_4(out: Path) -> dict[str, Any]:
-    """Draw the recovery from pushes, where the demonstrations vary much and where they vary little."""
+    """Draw the recovery from pushes at positions with a large and with a small variance of the demonstrations."""
     env: Any = make_environment(
         TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history_source": "measured"}
     )
@@ -186,7 +186,7 @@ def _recovery(
     commanded: np.ndarray,
     row: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return the speed and the safety of the recovery from a push."""
+    """Return a row with the speed and the safety of the recovery from a push."""
     length = min(len(nominal), len(path))
     deviation = np.abs(path[step:length, 0] - nominal[step:length, 0])
 
@@ -374,7 +374,7 @@ def _first(spec: EpisodeSpec, *, success: bool) -> EpisodeSpec:
                 return replace(spec, seed=spec.seed + k)
     finally:
         env.close()
-    raise InputError(f"{EPISODES} episodes {spec.acting} all ended alike: take more --episodes")
+    raise InputError(f"{EPISODES} episodes {spec.acting} all ended alike: give more --episodes")
 
 
 def figure_5_8(out: Path, seeds: int = 1, episodes: int = 3) -> dict[str, Any]:

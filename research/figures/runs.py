@@ -32,8 +32,9 @@ def figure_study(
         name: Name of the study.
         seeds: Number of seeds, from the study's first.
         episodes: Episodes of each run; the study's own number by default.
-        methods: Names of methods; all of the study by default. A name that the study lacks is a kind of guidance.
-        evaluate: True to evaluate its policies.
+        methods: Names of methods; all methods of the study by default. A name that the study does not have is the name
+            of a guidance.
+        evaluate: True to evaluate the policies.
         changes: Other fields of the study.
     """
     study = load_study(study_path(name))
@@ -52,7 +53,7 @@ def episodes_of(rows: pd.DataFrame, method: str) -> list[pd.DataFrame]:
 
 
 def mean_of_last(rows: pd.DataFrame, method: str, column: str, episodes: int = 10) -> float:
-    """Return the mean of a column over seeds and the last episodes."""
+    """Return the mean of a column over the last episodes of all seeds."""
     return float(np.mean([run[column].tail(episodes) for run in episodes_of(rows, method)]))
 
 
@@ -72,8 +73,8 @@ def learning_curves(
         columns: Label of each column.
         shape: Rows and columns of panels.
         size: Size of the figure [inches].
-        lines: Label and color of each method; those of its guidance by default.
-        window: Number of episodes that a point averages.
+        lines: Label and color of each method; by default label and color of the guidance with the method's name.
+        window: Number of episodes of the moving mean.
     """
     lines = lines or {method: (label(method), color(method)) for method in dict.fromkeys(rows["method"])}
     figure, axes = new_figure(*shape, size)
@@ -111,7 +112,7 @@ def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], presets:
         for preset, values in thesis.items():
             row |= {f"thesis, {preset}": values.get(name), preset: getattr(PRESETS[preset], name)}
         rows.append(row | {preset: getattr(PRESETS[preset], name) for preset in presets})
-    other = [
+    differences = [
         f"{preset}: {name} {getattr(PRESETS[preset], name)}, not {value}"
         for preset, values in thesis.items()
         for name, value in values.items()
@@ -119,7 +120,7 @@ def settings_table(path: Path, thesis: Mapping[str, Mapping[str, Any]], presets:
     ]
     return {
         "table": str(write_table(path, rows)),
-        "the presets of that name have the thesis's values": "; ".join(other) or "yes, all",
+        "the presets of that name have the thesis's values": "; ".join(differences) or "yes, all",
     }
 
 

@@ -12,8 +12,8 @@ THESIS = {
     "episodes involved a collision with SAC (medians), 2 to 5 % with TQC, with templates hardly any",
     "3.10": "a real robot: 100 % success in 70 episodes, 9820 time steps, with and without the cost of force",
     "3.11": "both rewards converge in about 70 episodes",
-    "4.2": "one action at 3.2 s changes the motion nearby, smoothly and inside the bounds; random ones do more where "
-    "demonstrations differ more",
+    "4.2": "one action at 3.2 s changes the motion nearby, smoothly and inside the bounds; random actions change it "
+    "more where the demonstrations' variance is larger",
     "4.3": "a passage, an obstacle in the robot's way, a restricted zone beyond x = 0.6",
     "4.4": "residual RL explores in all directions alike, KGRL hardly in the passage",
     "4.5": "KGRL succeeds from the first episode on; both kinds of residual RL are unstable and often get stuck",
@@ -22,7 +22,7 @@ THESIS = {
     "4.8": "a real robot: a success rate of 1 in 45 episodes, with less force and shorter episodes",
     "5.2": "KGRL's motion jumps from window to window, sKGRL's is smooth",
     "5.3": "as figure 4.3",
-    "5.4": "after a push the robot returns as fast as the demonstrations' variance says, never into the zone",
+    "5.4": "after a push the robot returns faster where the demonstrations' variance is smaller, never into the zone",
     "5.5": "one motion of KGRL is erratic, five of sKGRL are smooth",
     "5.6": "sKGRL has the higher return, by a lower cost of actions, and takes longer to avoid the obstacle",
     "5.7": "a real robot: an unsuccessful episode while learning, and a successful one after it",
@@ -30,7 +30,7 @@ THESIS = {
     "5.9": "a real robot: a success rate of 1 in 42 episodes (KGRL) and 44 (sKGRL); KGRL's return is higher in the end",
     "5.10": "a real robot: sKGRL's jerk is orders of magnitude below KGRL's",
     "table 3.2": "learning rates, discounts and batches of SAC and TQC on two robots",
-    "table 3.3": "what is known about pouring, as a reward and as a template",
+    "table 3.3": "prior knowledge about pouring, as a reward and as a template",
     "table 4.1": "TQC in simulation and on the real robot",
 }
 

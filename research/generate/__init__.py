@@ -27,8 +27,8 @@ def _passage(*folder: Path) -> None:
 
 def _session(name: str) -> Callable[..., None]:
     def record(*folder: Path) -> None:
-        recording = import_module("research.generate.bnc_connector")
-        recording.main(*(folder or (None,)), getattr(recording, name))
+        bnc_connector = import_module("research.generate.bnc_connector")
+        bnc_connector.main(*(folder or (None,)), getattr(bnc_connector, name))
 
     return record
 
@@ -50,7 +50,7 @@ def _mixtures(*folder: Path) -> None:
     np.savez(Path(*(folder or [mixture.STORED_PATH.parent]), mixture.STORED_PATH.name), **arrays)
 
 
-# Functions that write the files into a folder; without an argument, into the folder of the package.
+# Function that writes the files of each generator into a folder; without an argument, into the folder of the package.
 GENERATORS: dict[str, Callable[..., None]] = {
     "connector-demonstrations": _session("INSERT_SESSION"),
     "connector-search-demonstrations": _session("SEARCH_SESSION"),
@@ -67,7 +67,7 @@ def generate(name: str, folder: Path | None = None) -> None:
 
     Args:
         name: One of `GENERATORS`.
-        folder: Folder to write into; that of the package by default.
+        folder: Folder to write into; by default the folder of the files in the package.
 
     Raises:
         InputError: For an unknown name, or a folder that does not exist.

@@ -34,7 +34,7 @@ class Session:
     Attributes:
         motions: Function of a seed and times (N,) that returns the motions (M, N, 6).
         path: File of the shipped recording.
-        station: Builds the station that is driven.
+        station: Constructor of the station.
         source: Description of the recording.
     """
 
@@ -55,7 +55,7 @@ FIRM_SEARCH_SESSION = Session(
 
 
 def record_one(motion: np.ndarray, station: Callable[..., Station] = GantryStation) -> tuple[Recording, bool]:
-    """Drive a motion, (N, 6), through a station's impedance; return the recording and whether the plug is locked."""
+    """Command a motion (N, 6) on a station; return the recording, and True if the plug ends locked."""
     workcell = BncWorkcell()
     driven, recording = drive_along(station(workcell, time_step=TIME_STEP), TIMES, motion)
     return recording, workcell.is_locked(workcell.workpiece_in_target(driven.station.plant, driven.plant_context))
@@ -94,7 +94,7 @@ def record(session: Session, seeds: range) -> dict[str, np.ndarray]:
 
 
 def main(folder: Path | None = None, session: Session = INSERT_SESSION) -> None:
-    """Write the file of a session into `folder`, by default the one of the shipped recording."""
+    """Write the file of a session into `folder`, by default the folder of the shipped recording."""
     arrays: dict[str, Any] = record(session, range(100))
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)

@@ -19,7 +19,7 @@ from research.outside_envs.sawyer import (
 )
 from research.outside_envs.task import OutsideTask, Part, Recording, num_steps
 
-OFFSETS = (0.02, 0.04)  # distance of the assumed peg from the true one in y, on either side [m]
+OFFSETS = (0.02, 0.04)  # smallest and largest distance of the assumed peg from the true peg in y, on either side [m]
 PARTS = {
     "reach": Part(30, "object_start", OPEN),
     "grasp": Part(28, "object_start", close_at_end, dwell=22),

@@ -4,11 +4,12 @@
     python -m research.outside_envs.learn peg --method baselines --out DIR
     python -m research.outside_envs.learn table --out DIR
 
-`make outside` makes the Python environment with metaworld, robosuite and their version of MuJoCo. A result that exists
-in DIR is not computed again.
+`make outside` creates the Python environment with metaworld, robosuite and their version of MuJoCo. A result that
+exists in DIR is not computed again.
 """
 
 import argparse
+import csv
 import json
 import time
 from collections.abc import Callable
@@ -18,10 +19,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from scipy import stats
 
 from guiderail.tools.files import write_atomically
 from guiderail.tools.guided.guide import Guide
-from research.outside_envs.table import print_table
 from research.outside_envs.task import LearnerSettings, OutsideTask
 
 TASKS = ("peg", "assembly", "nut")
@@ -30,8 +31,13 @@ TOLERANCE = 1e-9  # largest violation of a constraint that is not counted [unit 
 HELD_OUT_SEED = 10_000
 SELECTION_SEED = 5_000  # seed of the episodes that select the best constant action
 NUM_DEMONSTRATIONS = 10
-LEARNING_RATE, LAST_LEARNING_RATE = 5e-4, 1e-4  # falls in the second half of the training
+LEARNING_RATE, LAST_LEARNING_RATE = 5e-4, 1e-4  # initial and final value; it falls in the second half of the training
 ENTROPY_FALL = (0.4, 0.9)  # fractions of the training between which the target entropy falls
+# Columns of the table of results.
+COLUMNS = (
+    "task", "method", "seed", "training_episodes", "held_out_episodes", "success_rate", "success_low", "success_high",
+    "success_left", "success_right", "violated_episodes", "max_commanded_violation", "peak_force", "cpu_seconds",
+)  # fmt: skip
 Row = dict[str, Any]
 PolicyFn = Callable[[Any, dict[str, Any]], np.ndarray]
 """(observation, info of the last step) → action (A,)."""
@@ -62,7 +68,7 @@ def run_episode(env: Any, policy: PolicyFn, seed: int, side: float) -> Row:
 
 
 def add_step(row: Row, info: dict[str, Any]) -> Row:
-    """Return the row of an episode after one more step."""
+    """Return the row of an episode, updated with the `info` of a step; an empty row is initialized."""
     row = row or {"success": False, "violation": -np.inf, "force": 0.0, "fallbacks": 0, "decisions": 0}
     return {
         "success": row["success"] or bool(info["is_success"]),
@@ -75,7 +81,7 @@ def add_step(row: Row, info: dict[str, Any]) -> Row:
 
 
 def evaluate(env: Any, policy: PolicyFn, episodes: int, seed: int = HELD_OUT_SEED) -> dict[str, Any]:
-    """Return the summary of held-out episodes; the goal is on the left and on the right in turn."""
+    """Return the summary of held-out episodes, in which the assumed goal is alternately on the left and right."""
     return summarize([run_episode(env, policy, seed + i, (-1.0) ** i) for i in range(episodes)])
 
 
@@ -180,7 +186,7 @@ def train(
 
 
 def policy_of(model: Any) -> PolicyFn:
-    """Return the deterministic policy of a model of `train`; its actor ignores the hidden values, which are zeros."""
+    """Return the deterministic policy of a trained model; zeros replace the hidden values, which the actor ignores."""
 
     def policy(observation: np.ndarray, _: dict[str, Any]) -> np.ndarray:
         unknown = np.zeros(model.observation_space.shape[0] - len(observation), np.float32)
@@ -191,7 +197,7 @@ def policy_of(model: Any) -> PolicyFn:
 
 
 def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int = 1000) -> list[tuple[Any, ...]]:
-    """Return the transitions of `count` successful episodes of the scripted policy in the bare environment."""
+    """Return the transitions of `count` successful episodes of the scripted policy, without guidance."""
     transitions: list[tuple[Any, ...]] = []
     successes, env = 0, WithHidden(env)
     for attempt in range(10 * count):
@@ -216,8 +222,8 @@ def demonstrate_transitions(task: OutsideTask, env: Any, count: int, seed: int =
 def evaluate_baselines(task: OutsideTask, env: Any, episodes: int) -> dict[str, Any]:
     """Return the summaries of policies that learn nothing, by name.
 
-    The constant action is the best of all with −0.7, 0 or 0.7 in each of the first three entries and 0 in the others,
-    selected on other episodes.
+    The constant action is the best of all actions with −0.7, 0 or 0.7 in each of the first three entries and 0 in the
+    others. It is selected on other episodes.
     """
     size = env.action_space.shape[0]
     rng = np.random.default_rng(0)
@@ -237,6 +243,52 @@ def evaluate_baselines(task: OutsideTask, env: Any, episodes: int) -> dict[str, 
     for name, row in result.items():
         print(name, row["by_side"], flush=True)
     return result
+
+
+def read_rows(folder: Path) -> list[dict[str, Any]]:
+    """Return a row for each policy of the results in a folder."""
+    rows = []
+    for path in sorted(folder.glob("*.json")):
+        result = json.loads(path.read_text())
+        training = result.get("training")
+        for name, held_out in result["held_out"].items():
+            parts = [held_out, training] if training else [held_out]
+            won, episodes = held_out["successes"], held_out["episodes"]
+            interval = stats.binomtest(won, episodes).proportion_ci(method="wilson")
+            left, right = (side[0] / max(side[1], 1) for side in held_out["by_side"])
+            method = result["method"] if name == "learned" else f"{result['method']}: {name}"
+            worst = float(np.max([0.0, *(part["max_violation"] for part in parts)]))  # NaN if one is NaN
+            values = (
+                result["task"], method, result["seed"], len(result.get("curve", [])), episodes, won / episodes,
+                round(interval.low, 3), round(interval.high, 3), left, right,
+                sum(part["violated_episodes"] for part in parts), worst,
+                round(max(part["max_force"] for part in parts), 1), round(result["cpu_s"]),
+            )  # fmt: skip
+            rows.append(dict(zip(COLUMNS, values, strict=True)))
+    return rows
+
+
+def print_table(folder: Path) -> None:
+    """Print the results of a folder as a Markdown table, and write them to `outside_envs.csv` in it.
+
+    Violations and forces are those of the training and of the held-out episodes together.
+    """
+    rows = read_rows(folder)
+    with (folder / "outside_envs.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    print("| task | method | seed | episodes | held out (95 %) | left, right | violated, worst [mm] | force [N] |")
+    print("|---|---|---|---|---|---|---|---|")
+    for row in rows:
+        rate, low, high = (f"{row[f'success_{name}']:.0%}" for name in ("rate", "low", "high"))
+        left, right = (f"{row[f'success_{name}']:.0%}" for name in ("left", "right"))
+        violation = f"{row['violated_episodes']}, {1e3 * row['max_commanded_violation']:.1f}"
+        print(
+            f"| {row['task']} | {row['method']} | {row['seed']} | {row['training_episodes']} | "
+            f"{rate} of {row['held_out_episodes']} ({low} to {high}) | {left}, {right} | {violation} | "
+            f"{row['peak_force']:.0f} |"
+        )
 
 
 def main() -> None:

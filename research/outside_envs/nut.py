@@ -20,11 +20,11 @@ from research.outside_envs.task import REWARD_SCALE, SUCCESS_REWARD, OutsideTask
 logging.getLogger("robosuite_logs").setLevel(logging.ERROR)
 PERIOD = 0.05  # duration of a step [s]
 STEP, TURN = 0.05, 0.5  # displacement and rotation of an action of 1 [m, rad]
-# Least and largest distance of the assumed peg from the true one in y, on either side [m]. 0 is the task of robosuite.
+# Smallest and largest distance of the assumed peg from the true peg in y, on either side [m]; 0 as in robosuite's task.
 OFFSETS = (0.0, 0.0)
 HANDLE = 0.054  # distance of the handle from the nut's center [m]
 MAX_YAW = np.radians(110.0)  # largest yaw of the gripper [rad], because of the range of the last joint
-MAX_LAG = 0.03  # height above the command at which the first attempt ends, because the nut lies on the peg [m]
+MAX_LAG = 0.03  # height of the gripper above its command that ends the first attempt: the nut lies on the peg [m]
 LONGEST = 170  # steps of a recording
 OPEN, CLOSED = -1.0, 1.0
 
@@ -55,7 +55,8 @@ LENGTH = num_steps(PARTS)
 class HiddenPeg(gymnasium.Env):
     """robosuite's environment as a Gymnasium environment whose observation has the assumed position of the peg.
 
-    The reward is robosuite's shaped one (privileged), scaled to be negative before success; the success is robosuite's.
+    The reward is robosuite's shaped, privileged reward, scaled to be negative before success. The criterion of success
+    is robosuite's.
 
     Args:
         seed: Seed of the scene and of the offset.
@@ -63,11 +64,11 @@ class HiddenPeg(gymnasium.Env):
 
     Attributes:
         true_goal: Position of the handle at the peg, with height 0, and yaw (4,) [m, rad].
-        assumed_goal: The same at the assumed peg.
+        assumed_goal: Position of the handle at the assumed peg, with height 0, and yaw (4,) [m, rad].
         object_start: Position of the handle at reset, with height 0, and yaw (4,) [m, rad].
         commanded: Last commanded position and yaw (4,) [m, rad].
-        last_blocked: y of the gripper in the frame of the assumed peg when the nut last lay on the peg [1/50 m], and 1;
-            zeros before (2,).
+        last_blocked: y of the gripper in the frame of the assumed peg when the nut last lay on the peg [1/50 m], and 1,
+            (2,); zeros if it did not lie there yet.
         side: Side of the assumed peg, −1 or 1.
         steps: Steps since the reset.
         length: Steps after which an episode is truncated.
@@ -155,7 +156,7 @@ class HiddenPeg(gymnasium.Env):
         return int(self._sim_env.robots[0].eef_site_id["right"])
 
     def _reseed(self, seed: int) -> None:
-        """Give one generator with this seed to the environment, its placement samplers and its robots."""
+        """Set one generator with this seed for the environment, its placement samplers and its robots."""
         env = self._sim_env
         env.rng = np.random.default_rng(seed)
         env.placement_initializer.rng = env.rng
@@ -174,8 +175,8 @@ class HiddenPeg(gymnasium.Env):
     def _grasp(self) -> tuple[float, float, float]:
         """Return the yaw of the grasp, the yaw at the peg, and the direction of the handle there [rad].
 
-        The nut fits in four orientations. If the yaw limit allows it, the handle points towards the robot or sideways,
-        because the robot's reach ends behind the peg.
+        The nut fits in four orientations. Orientations in which the handle points towards the robot or sideways are
+        preferred, because the robot's reach ends behind the peg.
         """
         offset = (self._handle() - self._nut())[:2]
         direction = float(np.arctan2(offset[1], offset[0]))
@@ -214,9 +215,9 @@ def to_action(env: Any, observation: Any, command: np.ndarray, grip: float) -> n
 
 
 class Script:
-    """Scripted policy, which observes the true peg: waypoints with a height, a gripper command and a waiting time."""
+    """Scripted policy, which observes the true peg and moves through waypoints."""
 
-    # Frame, height [m], gripper, and steps at the waypoint.
+    # Frame, height [m], gripper command, and number of steps at each waypoint.
     WAYPOINTS = (
         ("object_start", 0.95, OPEN, 2),
         ("object_start", 0.833, OPEN, 2),

@@ -21,7 +21,7 @@ from research.outside_envs.task import LearnerSettings, OutsideTask, Part, Recor
 
 OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
 HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
-MAX_LAG = 0.035  # lag of the hand at which the first two attempts end, because the peg presses on the box [m]
+MAX_LAG = 0.035  # lag of the hand that ends the first two attempts, because the peg is pressed on the box [m]
 OUTSIDE = 0.7  # fraction of an insertion after which the peg enters the hole
 MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table, for the highest assumed hole [m]
 
@@ -31,8 +31,8 @@ def is_blocked(env: Any, observation: Any) -> bool:
     return bool(env.unwrapped.data.mocap_pos[0][0] - env.raw[0] < -MAX_LAG)
 
 
-# `MIN_HEIGHT` in each frame. The assumed hole is at most 0.13 m + `HEIGHT_OFFSET` above the table. If it is lower,
-# lower commands are allowed.
+# `MIN_HEIGHT` in each frame. The assumed hole is at most 0.13 m + `HEIGHT_OFFSET` above the table. If the assumed hole
+# is lower, the smallest height above the table is lower, too.
 _FLOORS = {"object_start": MIN_HEIGHT, "assumed_goal": MIN_HEIGHT - 0.13 - HEIGHT_OFFSET}
 LOWER = {name: np.array([-np.inf, -np.inf, height]) for name, height in _FLOORS.items()}
 # A retraction that began at the end of the insertion would first push the blocked peg 1 cm further through the hand.
@@ -119,11 +119,11 @@ TASK = OutsideTask(
     pose=pose,
     to_action=to_action,
     scripted=scripted(SawyerPegInsertionSideV3Policy()),
-    # Grasp along the peg, last blocked position, phase. With all 26 entries the policy depends on irrelevant ones, such
-    # as the peg's first position.
+    # Grasp along the peg, last blocked position, phase. With all 26 entries, the policy would depend on irrelevant
+    # entries, such as the peg's first position.
     observed=(6, 19, 20, 21, 22),
     action_dims=(1, 2),
-    decisions=("retract", "retract 2"),  # an action lasts for an attempt
+    decisions=("retract", "retract 2"),  # one action per attempt
     settings=LearnerSettings(60, 20, 3, 0.97, (-1.0, -4.0)),
     schedule={
         "reach": np.array([-0.6, 0.3]),

@@ -25,15 +25,15 @@ def close_at_end(phase: float, is_held: bool) -> float:
 class HiddenGoal(gymnasium.Wrapper):
     """Environment of metaworld with another observation, reward and criterion of success.
 
-    The observation has the assumed position of the goal, which lies left or right of the true one; the reward is
-    metaworld's (privileged), scaled to be negative before success.
+    The observation has the assumed position of the goal, which lies left or right of the true position. The reward is
+    metaworld's privileged reward, scaled to be negative before success.
 
     Args:
         env: Environment of metaworld.
         seed: Seed of the scene and of the offset.
         length: Steps after which an episode is truncated.
-        offsets: Least and largest distance of the assumed goal from the true one in y, on either side [m].
-        height_offset: Largest distance in z [m].
+        offsets: Smallest and largest distance of the assumed goal from the true goal in y, on either side [m].
+        height_offset: Largest distance of the assumed goal from the true goal in z [m].
         obstacle: Body whose contact force is measured.
         max_reward: Upper limit to which metaworld's reward is clipped before success.
         is_blocked: (env, observation) → true if the object presses against the obstacle; None: never.
@@ -41,14 +41,14 @@ class HiddenGoal(gymnasium.Wrapper):
     Attributes:
         true_goal: Position (3,) of the goal [m].
         assumed_goal: Position (3,) of the goal that the robot assumes [m].
-        object_start: Position (3,) of the object at reset, on the table: its height is 0 [m].
+        object_start: Position (3,) of the object at reset, with height 0 [m].
         side: Side of the assumed goal, −1 or 1.
         steps: Steps since the reset.
         length: Steps after which an episode is truncated.
         raw: Observation of metaworld.
-        last_blocked: y and z of the hand in the frame of the assumed goal when it was last blocked [1/20 m], and 1;
-            zeros before (3,).
-        is_success: True after the step that succeeded.
+        last_blocked: y and z of the hand in the frame of the assumed goal when it was last blocked [1/20 m], and 1,
+            (3,); zeros if it was not blocked yet.
+        is_success: True if the last step succeeded.
     """
 
     def __init__(
@@ -142,7 +142,7 @@ def record(
     Args:
         env: Environment.
         policy: Scripted policy of metaworld, which observes the true goal.
-        signal: (env) → for each recorded part after the first, true where it begins.
+        signal: (env) → for each recorded part after the first, True from its beginning on.
         is_over: (env) → true at the end of a recording, called after each step.
         longest: Largest number of steps of a recording.
         count: Number of recordings.

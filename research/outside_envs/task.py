@@ -13,8 +13,8 @@ from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.tools.guided.guide import Guide
 
 ACTION_REPEAT = 5  # steps of the environment for which an action is applied, with and without guidance
-# With a larger factor, the package's own reward would favor pressing the part in front of its goal over a success.
-SUCCESS_REWARD, REWARD_SCALE = 10.0, 0.01  # reward of a success, and factor of the package's own reward before it
+# With a larger factor of the package's own reward, pressing the part near its goal would be worth more than a success.
+SUCCESS_REWARD, REWARD_SCALE = 10.0, 0.01  # reward of a success; factor of the package's own reward before a success
 BOX_MARGIN, MIN_BOX_MARGIN = 0.15, 0.01  # margin of a segment's box, as a fraction of the demonstrated range and [m]
 FLOOR = 2e-3  # standard deviation added to every covariance [unit of the output]
 
@@ -25,14 +25,14 @@ class Part:
 
     Attributes:
         steps: Control steps.
-        frame: Name of the environment's attribute that holds the frame's origin (O,).
+        frame: Name of the environment's attribute with the frame's origin (O,).
         extra: Discrete output, as in `Segment`.
-        dwell: Control steps for which the last point is then held.
-        source: Name of the part whose recording is used, if not its own.
-        until_fraction: Fraction of the recording's samples that is used, from the first one.
-        is_reversed: True to run that recording backwards.
+        dwell: Control steps for which the last point is commanded after the motion.
+        source: Name of the part whose recording is used; empty for the part's own recording.
+        until_fraction: Fraction of the recording's samples that is used, from the first sample.
+        is_reversed: True to run the recording backwards.
         lower: Lower limits (O,) of the commands in the frame, used if they are above the demonstrated limits.
-        until: (env, observation) → true to end the segment early.
+        until: Predicate (env, observation) that ends the segment early.
     """
 
     steps: int
@@ -53,7 +53,7 @@ class Recording:
     Attributes:
         path: Outputs (N, O) in the world.
         events: Samples at which the recorded parts after the first begin.
-        origins: Origins (O,) by the name of the environment's attribute.
+        origins: Origins of the frames (O,), by the name of the environment's attribute.
     """
 
     path: np.ndarray
@@ -68,15 +68,15 @@ class LearnerSettings:
     Attributes:
         learning_starts: Transitions with random actions.
         gradient_steps: Gradient steps per transition.
-        return_steps: Transitions of a return.
-        average_decay: Decay per transition of the running average of the actor's weights, which is evaluated.
+        return_steps: Number n of transitions in an n-step return.
+        average_decay: Decay per transition of the running average of the actor's weights. The average is evaluated.
         entropy_per_action: Target entropy of the policy for each entry of an action, at the beginning and at the end
-            of the training. Stable-Baselines3's default is −1; less noise spoils fewer attempts.
+            of the training. Stable-Baselines3's default is −1; with less noise, fewer attempts fail.
     """
 
     learning_starts: int = 120
     gradient_steps: int = 2
-    return_steps: int = 5  # the reward of a success comes after some forty decisions
+    return_steps: int = 5  # the reward of a success follows after about forty decisions
     average_decay: float = 0.999
     entropy_per_action: tuple[float, float] = (-2.0, -2.0)
 
@@ -89,15 +89,15 @@ class OutsideTask:
         parts: Segments of the motion by name, in their order.
         outputs: Names of the outputs.
         period: Duration of a step of the environment [s].
-        make_env: (seed) → environment; its `info` has `is_success`, `side` and `peak_force` [N].
+        make_env: (seed) → environment whose `info` has `is_success`, `side` and `peak_force` [N].
         record: (count, seed) → successful recordings of the package's scripted policy, which observes the hidden goal.
         pose: (env, observation) → commanded pose (O,), at which a motion begins.
         to_action: (env, observation, command, extra) → the environment's own action.
         scripted: (env) → the environment's own action by the scripted policy, which observes the hidden goal.
-        schedule: Fixed action in each segment in which a decision is made; together the actions search without
-            observations.
-        observed: Indices of the entries that a policy with guidance observes, of the environment's observation followed
-            by phase and command; all if empty.
+        schedule: Fixed action in each segment in which a decision is made; the sequence of these actions is a search
+            without observations.
+        observed: Indices of the entries that a policy with guidance observes; all entries if empty. The entries are the
+            environment's observation, the phase and the command.
         action_dims: Indices of the outputs that an action moves; all by default.
         decisions: Names of segments; an action is applied until one of them begins. If empty, an action is applied for
             `ACTION_REPEAT` steps.
@@ -119,7 +119,7 @@ class OutsideTask:
     settings: LearnerSettings = LearnerSettings()
 
     def make_segments(self, count: int = 10, seed: int = 1000) -> list[Segment]:
-        """Return the segments, from `count` demonstrations recorded with a seed."""
+        """Record `count` demonstrations with a seed, and return the segments of the motion."""
         recorded = [name for name, part in self.parts.items() if not part.source]
         recordings = self.record(count, seed)
         clocks = [self.period * np.arange(len(one.path)) for one in recordings]
@@ -146,7 +146,7 @@ class OutsideTask:
         return segments
 
     def make(self, guidance: str | Guide, seed: int, segments: list[Segment]) -> gymnasium.Env:
-        """Return the guided environment, or for guidance="none" the bare one with repeated actions."""
+        """Return the guided environment; for guidance="none", the package's own environment with repeated actions."""
         env = self.make_env(seed)
         if guidance == "none":
             return RepeatedAction(env, segments, self.pose)
@@ -192,9 +192,9 @@ class HeldAction(gymnasium.Wrapper):
 
 
 class RepeatedAction(gymnasium.Wrapper):
-    """Wrapper that repeats the environment's own action; a command is a violation if it is outside every segment's box.
+    """Wrapper that repeats the environment's own action and appends the time, from −1 to 1, to the observation.
 
-    The time of the episode, from −1 to 1, is appended to the observation.
+    A command violates the constraints if it is outside of the box of every segment.
     """
 
     def __init__(self, env: Any, segments: list[Segment], pose: Callable[[Any, Any], np.ndarray]):

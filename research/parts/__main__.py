@@ -10,9 +10,8 @@ from typing import Any
 from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import write_table
 from research.command import Parser, print_result, run_program
-from research.parts.campaign import finish, learn, prepare
+from research.parts.campaign import finish, learn, prepare, summarize, to_table
 from research.parts.pairs import Pair, find_pairs
-from research.parts.table import summarize, to_table
 
 DIFFICULTIES = ("standard", "hard", "automate")
 

@@ -1,4 +1,4 @@
-"""Steps of the benchmark for one pair. Each step runs in its own processes, and its result is stored."""
+"""Steps of the benchmark for one pair, each run in its own processes and stored; table of the results."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import yaml
 
@@ -65,7 +66,7 @@ def run_guiderail(log: Path, timeout: float, *arguments: object) -> str:
 def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """Return the result of a step, and store it; a stored result is not computed again.
 
-    A failed step has the result {"error": reason}.
+    The result of a failed step is {"error": reason}.
     """
     if not stored.exists():
         try:
@@ -81,7 +82,7 @@ def finish(stored: Path, step: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 def prepare(pair: Pair, out: Path, timeout: float) -> dict[str, Any]:
     """Prepare a pair and insert the plug from its aligned pose.
 
-    While the parts overlap, the plug is shrunk by the distance in the `OverlapError`.
+    As long as the parts overlap, the plug is shrunk by the distance in the `OverlapError`.
 
     Raises:
         StepError: If the pair is refused, or needs more than `timeout` [s] of CPU time.
@@ -111,7 +112,7 @@ def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
                 write(str(error))
                 if error.shrink is None or shrink + error.shrink > MAX_SHRINK:
                     raise StepError(str(error)) from error
-                shrink += error.shrink  # repeated until the parts no longer overlap
+                shrink += error.shrink  # repeated until the parts do not overlap
             except InputError as error:
                 write(str(error))
                 raise StepError(str(error)) from error
@@ -148,7 +149,7 @@ def learn(
         episodes: Number of training episodes.
         held_out: Number of evaluated episodes.
         timeout: Wall time of each command [s].
-        shrink: Distance by which the plug is smaller [mm].
+        shrink: Distance by which the plug's surface is moved inwards [mm].
     """
     folder = write_task(pair, out, timeout, shrink)
     run = out / "runs" / f"{pair.name}-{difficulty}-{seed}"
@@ -176,3 +177,66 @@ def describe_calibration(measured: dict[str, Any] | None) -> str:
     text = f"{nearest:g} to {farthest:g} mm, {measured['turn_degrees']:g}°, {measured['force_limit']:g} N: random "
     text += f"{measured['uniform_random']}, scripted {measured['scripted']}"
     return text if measured["calibrated"] else f"{text} (not as hard as required)"
+
+
+MEASURED = (
+    "clearance_mm",
+    "shrink_mm",
+    "deviation_mm",
+    "triangles",
+    "compliant",
+    "pieces",
+    "preparation_s",
+    "inserted_s",
+    "real_time_factor",
+    "penetration_mm",
+    "penetration_pushed_on_the_rim_mm",
+    "force",
+    "inserted",
+)
+LEARNED = (
+    "demonstrations_seated",
+    "total_s",
+    "calibration",
+    "success_rate",
+    "uniform_random_success_rate",
+    "scripted_success_rate",
+    "demonstration_success_rate",
+    "episodes_to_convergence",
+    "training_episodes",
+    "training_minutes",
+    "peak_force",
+    "max_commanded_violation",
+)
+
+
+def to_table(rows: Mapping[str, Mapping[str, Any]]) -> pd.DataFrame:
+    """Return one row per pair; the columns of training results contain the difficulty and the seed."""
+    lines = []
+    for name, row in sorted(rows.items()):
+        line: dict[str, Any] = {"part": name, **{key: row.get(key) for key in MEASURED}}
+        for key, result in row.items():
+            if isinstance(result, dict):
+                line |= {f"{key} {column}": result.get(column) for column in LEARNED}
+                line[f"{key} reason"] = result.get("error")
+        lines.append({**line, "reason": row.get("error")})
+    return pd.DataFrame(lines)
+
+
+def summarize(rows: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return counts and percentiles over all pairs."""
+    prepared = [row for row in rows.values() if "error" not in row]
+    inserted = [row for row in prepared if row["inserted"]]
+    summary: dict[str, Any] = {"pairs": len(rows), "prepared": len(prepared), "inserted": len(inserted)}
+    for key in ("preparation_s", "inserted_s", "real_time_factor"):
+        values = [row[key] for row in prepared]
+        if values:
+            summary[f"{key} 50, 95 %"] = np.round(np.percentile(values, [50, 95]), 2).tolist()
+    deep = [
+        row
+        for row in prepared
+        if row["clearance_mm"] and row["penetration_pushed_on_the_rim_mm"] > 0.5 * row["clearance_mm"]
+    ]
+    summary["deeper than half the clearance"] = len(deep)
+    summary["reasons"] = {name: row["error"] for name, row in sorted(rows.items()) if "error" in row}
+    return summary

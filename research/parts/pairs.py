@@ -1,4 +1,4 @@
-"""Pairs of meshes below a folder, found by file name: IndustReal's, Factory's, and any named plug and socket."""
+"""Pairs of meshes below a folder, found by file name: of IndustReal, of Factory, and files named plug and socket."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
         unit: Unit of all files.
 
     Raises:
-        InputError: If there are no pairs, two pairs have the same name, by which their results are stored, or a file
-            of IndustReal or Factory is in two folders.
+        InputError: If there are no pairs, two pairs have the same name (results are stored by name), or a file of
+            IndustReal or Factory is in two folders.
     """
     meshes = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in ENDINGS]
     names = {

@@ -34,8 +34,8 @@ README_COLUMNS = 5  # the README has only these first columns of the hard tasks
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
-MIN_SEEDS = 3  # number of seeds that an interval needs
-MIN_EQUAL_SEEDS = 5  # the same for an interval without width
+MIN_SEEDS = 3  # smallest number of seeds for an interval
+MIN_EQUAL_SEEDS = 5  # smallest number of seeds for an interval without width
 
 
 def task_table(task: str, tables: Path) -> str:
@@ -130,16 +130,16 @@ def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
 
 
 def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
-    """Return the held-out success of the seeds; None for too few of them, or a method that does not learn."""
+    """Return the held-out success of the seeds; None for too few seeds or a method that does not learn."""
     if not (len(seeds) >= MIN_SEEDS and _is_trained(seeds) and _is_evaluated(seeds)):
         return None
     return [seeds["success_rate"].to_numpy(dtype=float)]
 
 
 def _middle(seeds: pd.DataFrame) -> str:
-    """Return the interquartile mean of the seeds' held-out success [%]; a dash for too few seeds.
+    """Return the interquartile mean of the seeds' held-out success with its interval [%]; a dash for too few seeds.
 
-    The interval follows, unless it has no width because few seeds are equal.
+    The interval is omitted if it has no width and the seeds are few.
     """
     scores = _scores(seeds)
     if scores is None:
@@ -150,7 +150,7 @@ def _middle(seeds: pd.DataFrame) -> str:
 
 
 def _has_interval(low: float, high: float, *methods: Scores) -> bool:
-    """Return False for an interval without width of too few seeds: equal seeds are not certainty."""
+    """Return False for an interval without width of too few seeds, which would overstate the certainty."""
     return low < high or min(len(scores) for method in methods for scores in method) >= MIN_EQUAL_SEEDS
 
 
@@ -174,7 +174,7 @@ def improvements(section: Section, tables: Path) -> list[str]:
 
 
 def is_guided(row: Row) -> bool:
-    """Return True for a method of the thesis, and False for a peer that it is compared with."""
+    """Return True for a method of the thesis, and False for a method that is compared with it."""
     study = load_study(study_path(row.study))
     environment = {**study.env, **study.methods[row.method].env}
     return environment.get("guidance", GUIDED[0]) in GUIDED
@@ -183,7 +183,7 @@ def is_guided(row: Row) -> bool:
 def knowledge(section: Section, tables: Path) -> list[str]:
     """Return sentences about the demonstrated episodes of the learned methods, if there are any.
 
-    They name the number of these episodes and the methods with which none of them succeeded.
+    The sentences state the number of demonstrated episodes, and the methods without a successful training episode.
     """
     methods: dict[int, list[str]] = {}  # names by number of demonstrated episodes
     failed = []
@@ -208,13 +208,13 @@ def knowledge(section: Section, tables: Path) -> list[str]:
 
 
 def demonstrated_episodes(row: Row) -> int:
-    """Return the number of episodes of a demonstrator that a method of a study learns from.
+    """Return the number of demonstrated episodes from which a method of a study learns.
 
     The imports of the study are executed only if the default of the method's learner is needed.
     """
     study = load_study(study_path(row.study))
     choices = [study.learner, study.methods[row.method].learner]
-    # As in `Job.config`: a method may remove the study's choice by null.
+    # As in `Job.config`: the value null of a method overrides the study's choice.
     names = ("algorithm", "preset")
     given = {name: getattr(one, name) for one in choices for name in names if name in one.model_fields_set}
     algorithm, preset = given.get("algorithm"), given.get("preset")
@@ -226,7 +226,7 @@ def demonstrated_episodes(row: Row) -> int:
 
 
 def has_run_offset(row: Row) -> bool:
-    """Return True if all held-out episodes of a seed have the same hidden offset; in training they have it, too."""
+    """Return True if all held-out episodes of a seed have the same hidden offset, which is that of its training."""
     study = load_study(study_path(row.study))
     import_modules(study.imports)
     environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment
@@ -282,7 +282,7 @@ def _interval(row: Mapping[Any, Any]) -> str:
 
 
 def _violation(parts: Sequence[pd.DataFrame]) -> str:
-    """Return the largest commanded violation and its number of episodes, held out and in training together."""
+    """Return the largest commanded violation and the number of episodes with violations, held-out and training."""
     worst = max(float(part["max_commanded_violation"].max()) for part in parts)
     if worst <= TOLERANCE:
         return "none"
@@ -298,26 +298,26 @@ def _forces(parts: Sequence[pd.DataFrame]) -> str:
 def _success(seeds: pd.DataFrame) -> str:
     """Return the mean held-out success [%] with the range over several seeds; a single seed is marked."""
     rates = 100 * seeds["success_rate"].astype(float)
-    span = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
+    interval = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
     is_single = len(seeds) == 1 and _is_trained(seeds)
     is_exact = 99.5 <= rates.mean() < 100 or 0 < rates.mean() < 10  # 99.6 is not written as 100
     mean = f"{rates.mean():.1f}".removesuffix(".0") if is_exact else f"{rates.mean():.0f}"
-    return f"{mean}{' (one seed)' if is_single else span}"
+    return f"{mean}{' (one seed)' if is_single else interval}"
 
 
 def _percent(result: tuple[Row, pd.DataFrame] | None) -> str:
-    """Return the success of a row, marked if it was evaluated with the hidden offset of each run; a dash without it."""
+    """Return the success of a row, marked if evaluated with the hidden offset of each run; a dash without a result."""
     return f"{_success(result[1])}{RUN_OFFSET if has_run_offset(result[0]) else ''}" if result else "–"
 
 
 def _label(row: Row) -> str:
-    """Return the name of a row with its setting in brackets; demonstrated episodes have a column of their own."""
+    """Return the name of a row with its setting in brackets, except for the number of demonstrated episodes."""
     name, _, setting = row.name.partition(", ")
     return f"{name} ({setting})" if setting and "demonstration" not in setting else name
 
 
 def _effort(row: Row, seeds: pd.DataFrame) -> str:
-    """Return the number of training episodes, of demonstrated ones among them, and of seeds."""
+    """Return the number of training episodes, how many of them are demonstrated, and the number of seeds."""
     episodes, demonstrated = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"])), ""
     if number := demonstrated_episodes(row):
         demonstrated = f", {number} of them demonstrated"
@@ -329,7 +329,7 @@ def _compared(
     guided: Sequence[tuple[Row, pd.DataFrame]],
     residual: tuple[Row, pd.DataFrame] | None,
 ) -> str:
-    """Return a share of the guided methods, by name if they differ, and of residual RL; a dash without it."""
+    """Return a share [%] of the guided methods, by name if they differ, and of residual RL; a dash if it is missing."""
     shares = [share(seeds) for _, seeds in guided]
     named = ", ".join(f"{one} ({row.name.split(',')[0]})" for (row, _), one in zip(guided, shares, strict=True))
     return f"{named if len(set(shares)) > 1 else shares[0]} / {share(residual[1]) if residual else '–'}"
@@ -341,7 +341,7 @@ def _violated(seeds: pd.DataFrame) -> str:
 
 
 def _stopped(seeds: pd.DataFrame) -> str:
-    """Return the share of training episodes that ended in a collision or a spill [%]; a dash where it is unknown."""
+    """Return the share of training episodes that ended in a collision or a spill [%]; a dash if it is unknown."""
     columns = ["training_ended_in_collision", "training_ended_in_spill"]
     if not {*columns} <= {*seeds} or seeds[columns].isna().any(axis=None):
         return "–"

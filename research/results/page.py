@@ -59,7 +59,7 @@ def store(folders: Sequence[Path], tables: Path) -> None:
     """Copy the tables of finished studies and the numbers of figures into the folder of stored results.
 
     Args:
-        folders: Folders that studies, figures or programs wrote.
+        folders: Folders of finished studies, figures or programs.
         tables: Folder with a CSV file for each study and a JSON file for each figure.
 
     Raises:
@@ -142,9 +142,9 @@ def _figure(file: Path) -> dict[str, Any]:
     """Return the content of a figure's JSON file without the paths of its picture and table."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        kept = {key: value for key, value in content.items() if key not in ("picture", "table")}
-        float(kept["seconds"]), str(kept["command"]), str(kept["figure"])
-        return kept
+        figure = {key: value for key, value in content.items() if key not in ("picture", "table")}
+        float(figure["seconds"]), str(figure["command"]), str(figure["figure"])
+        return figure
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{file} was not written by python -m research.figures: make the figure again") from error
 
@@ -171,10 +171,10 @@ def _words(key: str) -> str:
 
 
 def _program_section(name: str, rows: pd.DataFrame) -> str:
-    shown = rows if (columns := PROGRAMS[name]) is None else rows[list(columns)]
+    selected = rows if (columns := PROGRAMS[name]) is None else rows[list(columns)]
     lines = [f"## {name}", "", f"`python -m research.{name} --out studies` writes `{name}.csv`.", ""]
-    lines += [f"| {' | '.join(map(_words, shown))} |", "|" + "---|" * len(shown.columns)]
-    lines += [f"| {' | '.join(map(cell, row))} |" for row in shown.itertuples(index=False)]
+    lines += [f"| {' | '.join(map(_words, selected))} |", "|" + "---|" * len(selected.columns)]
+    lines += [f"| {' | '.join(map(cell, row))} |" for row in selected.itertuples(index=False)]
     return "\n".join([*lines, ""])
 
 
@@ -186,7 +186,7 @@ def _study_section(study: Study, rows: pd.DataFrame) -> str:
     lines += _sweep_lines(study, rows)
     if len(evaluated := _without_sweeps(study, rows)):
         lines += ["", f"| {' | '.join(COLUMNS)} |", "|" + "---|" * len(COLUMNS)]
-    # `eval_set` is empty if a study evaluates nothing, and an empty cell is read as NaN: keep such groups.
+    # `eval_set` is empty if a study evaluates nothing. An empty cell is read as NaN, whose group is kept, too.
     for (method, after, eval_set), group in evaluated.groupby(
         ["method", "after_episodes", "eval_set"], sort=False, dropna=False
     ):
@@ -198,7 +198,7 @@ def _study_section(study: Study, rows: pd.DataFrame) -> str:
 
 
 def _missing(study: Study, rows: pd.DataFrame) -> list[str]:
-    """Return the methods of a study without results, and the methods that lack some of their seeds with these."""
+    """Return the methods of a study without results, and the methods with missing seeds, followed by these seeds."""
     missing = []
     for method, declared in study.methods.items():
         seeds, done = set(declared.seeds or study.seeds), set(rows.loc[rows["method"] == method, "seed"])
@@ -208,7 +208,7 @@ def _missing(study: Study, rows: pd.DataFrame) -> list[str]:
 
 
 def _difference_lines(study: Study, evaluated: Collection[str]) -> list[str]:
-    """Return the differences of the learned methods from the thesis: those of all methods, and then those of each."""
+    """Return the differences of the learned methods from the thesis: common ones first, then those of each method."""
     import_modules(study.imports)
     jobs = {
         method: Job(study, method, study.seeds[0], Path())
@@ -248,7 +248,7 @@ def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
 
 
 def _without_sweeps(study: Study, rows: pd.DataFrame) -> pd.DataFrame:
-    """Return the rows of evaluation sets; if a study has only sweeps, one row per run with its training results."""
+    """Return the rows of evaluation sets; if a study has only sweeps, a row per run with its training results."""
     if study.eval_set or not study.sweeps:
         return rows[~rows["eval_set"].isin([s.eval_set(value).name for s in study.sweeps for value in s.at])]
     once = rows.drop_duplicates(["method", "after_episodes", "seed"])

@@ -47,11 +47,12 @@ def _baselines(
     return [Row(name, study, method, eval_set) for name, method in zip(names, methods, strict=True)]
 
 
+# Methods of the baseline policies in most studies, in the order of `BASELINES`.
 _ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
 _ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
 _NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
 _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
-# Evaluation set of the study connector_hard_gantry, by the label of its rows in the table of methods.
+# Evaluation set of the study connector_hard_gantry by the label of its rows in the table of methods.
 _STATIONS = {"at 2.5 ms": "fresh", "MuJoCo": "MuJoCo", "iiwa": "iiwa", "Panda": "Panda", "UR5e": "UR5e"}
 
 SECTIONS: dict[str, list[Section]] = {

@@ -16,7 +16,7 @@ Scores = Sequence[np.ndarray]
 
 
 def interquartile_mean(scores: Scores) -> np.ndarray:
-    """Return the mean of the middle half of all scores, of all tasks together, (…)."""
+    """Return the mean of the middle half of the scores of all tasks together, (…)."""
     return np.asarray(stats.trim_mean(np.concatenate(scores, axis=-1), 0.25, axis=-1))
 
 

@@ -20,12 +20,12 @@ from research.action_fuzzing.campaign import (
     Campaign,
     Case,
     NonFiniteCounter,
+    RecomputedViolation,
     find_failures,
     outcome,
     run_campaign,
 )
 from research.action_fuzzing.pouring import EarlyTilt
-from research.action_fuzzing.recompute import RecomputedViolation
 from research.action_fuzzing.tasks import CAMPAIGNS, fuzz
 
 

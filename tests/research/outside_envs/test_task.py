@@ -12,7 +12,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from research.outside_envs import learn
-from research.outside_envs.table import print_table, read_rows
+from research.outside_envs.learn import print_table, read_rows
 from research.outside_envs.task import ACTION_REPEAT, LearnerSettings, OutsideTask, Part, Recording, num_steps
 
 PARTS = {

@@ -10,9 +10,8 @@ pytest.importorskip("igl")
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import write_table
-from research.parts.campaign import StepError, describe_calibration, finish
+from research.parts.campaign import StepError, describe_calibration, finish, summarize, to_table
 from research.parts.pairs import find_pairs
-from research.parts.table import summarize, to_table
 
 
 def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_path):
