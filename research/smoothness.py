@@ -78,8 +78,9 @@ def spectral_arc_length(
     frequencies = np.arange(points) / (points * period)
     spectrum = np.abs(np.fft.fft(speed, points))
     spectrum /= spectrum.max()
-    kept = np.flatnonzero((frequencies <= min(cutoff, 0.5 / period)) & (spectrum >= threshold))
-    frequencies, spectrum = frequencies[: kept[-1] + 1], spectrum[: kept[-1] + 1]
+    is_used = (frequencies <= min(cutoff, 0.5 / period)) & (spectrum >= threshold)
+    end = np.flatnonzero(is_used)[-1] + 1
+    frequencies, spectrum = frequencies[:end], spectrum[:end]
     if len(frequencies) < 2:
         return 0.0
     across = np.diff(frequencies) / (frequencies[-1] - frequencies[0])
@@ -164,7 +165,7 @@ def smoothness(
         table = load_or_compute(file, lambda: pd.DataFrame(measure(method, OUTPUTS[outputs], quiet, **settings)))  # noqa: B023
         rows += table.to_dict("records")
     for row in rows:  # compared with uniform random actions through KGRL at the same place
-        kgrl = next(one for one in rows if one["method"] == "KGRL" and one["place"] == row["place"])
+        kgrl = next(kgrl for kgrl in rows if kgrl["method"] == "KGRL" and kgrl["place"] == row["place"])
         for part in ("linear", "angular"):
             row[f"times_below_kgrl_{part}"] = kgrl[f"jerk_commanded_{part}"] / row[f"jerk_commanded_{part}"]
     return {
@@ -269,8 +270,8 @@ def _row(
         "episodes": len(episodes),
         "rms_in_deviations": float(np.sqrt(np.mean(deviations**2))),
         **{kind: float(np.mean(episodes[kind])) for kind in kinds},
-        **{f"jerk_added_{part}": float(np.mean([one[part] for one in jerks_added])) for part in jerks_added[0]},
-        **{key: float(np.mean([one[key] for one in shapes])) for key in shapes[0]},
+        **{f"jerk_added_{part}": float(np.mean([added[part] for added in jerks_added])) for part in jerks_added[0]},
+        **{key: float(np.mean([shape[key] for shape in shapes])) for key in shapes[0]},
         **summary(
             episodes, ("peak_force", "mean_force", "success_rate", "ended_in_collision", "max_commanded_violation")
         ),

@@ -52,7 +52,7 @@ class PlainTqc(OffPolicyLearner):
 PRESETS = ("tqc_contact", "sac_gridclamp", "tqc_fast", "table_4_1_simulation")
 REQUIRED_RATIO = 2.5  # smallest accepted `times_faster` of the result `REQUIRED_OF`
 REQUIRED_OF = "tqc tqc_contact"
-TURNS = 8  # timed turns of each learner, after one that is not timed
+TURNS = 8  # number of timed turns of each learner, after a turn that is not timed
 _TRANSITIONS = 2000  # transitions in the replay buffer
 
 

@@ -127,7 +127,6 @@ def _transport() -> list[Row]:
         EOFError: If the second process ends without a result.
     """
     url = f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
-    os.environ.setdefault("DRAKE_ALLOW_NETWORK", "lcm")
     context = multiprocessing.get_context("spawn")
     pipe, sender_pipe = context.Pipe()
     sender = context.Process(target=_send_statuses, args=(sender_pipe, url), daemon=True)

@@ -147,7 +147,7 @@ def env_seconds(guidance: str = "kgrl") -> float:
         while not finished:
             _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
             finished = terminated or truncated
-        if episode > 0:  # the first one also factors the primitive
+        if episode > 0:  # in the first episode, the primitive's matrices are factored
             best = min(best, (time.process_time() - start) / info["control_steps"] * NUM_STEPS)
     return best
 

@@ -259,7 +259,7 @@ def _clamp(
     size = (13.0, 4.0) if len(columns) > 1 else (7.0, 4.2)
     figure, _ = learning_curves(rows, columns, (1, len(columns)), size, lines=FORCE)
     names = {method: name for method, (name, _) in FORCE.items()}
-    ratios = {k: v for one in study.ratios for k, v in ratio(rows, one).items()} if len(columns) > 1 else {}
+    ratios = {k: v for declared in study.ratios for k, v in ratio(rows, declared).items()} if len(columns) > 1 else {}
     return {
         **save_results(out, name, figure, rows),
         **numbers_of_seeds(rows, numbers, names),

@@ -41,7 +41,7 @@ def figure_study(
     first = study.seeds[0]
     known = {m: study.methods.get(m, Method(env={"guidance": m})) for m in methods or study.methods}
     if episodes is not None:
-        known = {m: one.model_copy(update={"learner": LearnerChoice()}) for m, one in known.items()}
+        known = {m: method.model_copy(update={"learner": LearnerChoice()}) for m, method in known.items()}
         changes["learner"] = changes.get("learner", study.learner).model_copy(update={"episodes": episodes})
     changes |= {} if evaluate else {"eval_set": ()}
     return study.model_copy(update={"methods": known, "seeds": tuple(range(first, first + seeds)), **changes})

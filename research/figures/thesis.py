@@ -1,4 +1,4 @@
-"""Summary of the thesis's result in each figure and table, which is printed with the reproduced one."""
+"""Summary of the thesis's result in each figure and table, which is printed with the reproduced result."""
 
 THESIS = {
     "2.2": "three states, Translational, Tilt and Pour; three inputs",

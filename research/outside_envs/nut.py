@@ -109,7 +109,7 @@ class HiddenPeg(gymnasium.Env):
 
     @property
     def hidden(self) -> np.ndarray:
-        """Offset of the true peg from the assumed one in y (1,) [1/50 m], for a privileged critic only."""
+        """Offset of the true peg from the assumed peg in y (1,) [1/50 m], for a privileged critic only."""
         return 50.0 * (self.true_goal - self.assumed_goal)[1:2]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:

@@ -19,8 +19,8 @@ from research.outside_envs.sawyer import (
 )
 from research.outside_envs.task import LearnerSettings, OutsideTask, Part, Recording, num_steps
 
-OFFSETS = (0.025, 0.05)  # least and largest distance of the assumed hole from the true one in y [m]
-HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true one in z [m]
+OFFSETS = (0.025, 0.05)  # smallest and largest distance of the assumed hole from the true hole in y [m]
+HEIGHT_OFFSET = 0.015  # largest distance of the assumed hole from the true hole in z [m]
 MAX_LAG = 0.035  # lag of the hand that ends the first two attempts, because the peg is pressed on the box [m]
 OUTSIDE = 0.7  # fraction of an insertion after which the peg enters the hole
 MIN_HEIGHT = 0.045  # smallest commanded height of the hand above the table, for the highest assumed hole [m]

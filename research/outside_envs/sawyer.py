@@ -87,7 +87,7 @@ class HiddenGoal(gymnasium.Wrapper):
 
     @property
     def hidden(self) -> np.ndarray:
-        """Offset of the true goal from the assumed one in y and z (2,) [1/20 m], for a privileged critic only."""
+        """Offset of the true goal from the assumed goal in y and z (2,) [1/20 m], for a privileged critic only."""
         return 20.0 * (self.true_goal - self.assumed_goal)[1:]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -108,7 +108,7 @@ class HiddenGoal(gymnasium.Wrapper):
         raise NotImplementedError
 
     def observe(self) -> np.ndarray:
-        """Return the observation, scaled to order one."""
+        """Return the observation, with entries scaled to the order of 1."""
         raise NotImplementedError
 
     def _force(self) -> float:

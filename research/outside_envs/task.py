@@ -122,12 +122,13 @@ class OutsideTask:
         """Record `count` demonstrations with a seed, and return the segments of the motion."""
         recorded = [name for name, part in self.parts.items() if not part.source]
         recordings = self.record(count, seed)
-        clocks = [self.period * np.arange(len(one.path)) for one in recordings]
-        whole = Demonstrations(clocks, [one.path for one in recordings], list(self.outputs))
-        cut = dict(zip(recorded, cut_demonstrations(whole, [one.events for one in recordings]), strict=True))
+        clocks = [self.period * np.arange(len(recording.path)) for recording in recordings]
+        whole = Demonstrations(clocks, [recording.path for recording in recordings], list(self.outputs))
+        events = [recording.events for recording in recordings]
+        cut = dict(zip(recorded, cut_demonstrations(whole, events), strict=True))
         segments, local = [], {}
         for name, each in cut.items():
-            origins = [one.origins[self.parts[name].frame] for one in recordings]
+            origins = [recording.origins[self.parts[name].frame] for recording in recordings]
             outputs = [y - origin for y, origin in zip(each.outputs, origins, strict=True)]
             local[name] = Demonstrations(each.times, outputs, each.names)
         for name, part in self.parts.items():
@@ -178,7 +179,7 @@ class HeldAction(gymnasium.Wrapper):
         self._decisions = tuple(decisions)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Apply an action (A,); rewards and fallbacks are added up, and the violation is the largest one."""
+        """Apply an action (A,); return the sum of the rewards and fallbacks, and the largest violation."""
         total, worst, fallbacks, has_begun = 0.0, -np.inf, 0, False
         guide, terminated, truncated = self.env.get_wrapper_attr("guide"), False, False
         while not (has_begun or terminated or truncated):

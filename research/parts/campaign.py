@@ -53,7 +53,7 @@ def run_guiderail(log: Path, timeout: float, *arguments: object) -> str:
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
-            file.write("".join(one.decode() for one in (error.stdout, error.stderr) if isinstance(one, bytes)))
+            file.write("".join(output.decode() for output in (error.stdout, error.stderr) if isinstance(output, bytes)))
             raise StepError(f"it took more than {timeout:g} s") from None
         file.write(done.stdout + done.stderr)
     if done.returncode:

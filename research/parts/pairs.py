@@ -48,8 +48,8 @@ def find_pairs(folder: Path, unit: str = "m") -> list[Pair]:
     """Return the pairs below a folder, sorted by name.
 
     Args:
-        folder: Folder, such as `assets` of IsaacGymEnvs, or one with a subfolder of `plug.*` and `socket.*` for each
-            pair.
+        folder: Folder of meshes, such as `assets` of IsaacGymEnvs, or a folder that has a subfolder with `plug.*` and
+            `socket.*` for each pair.
         unit: Unit of all files.
 
     Raises:

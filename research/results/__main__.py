@@ -25,7 +25,7 @@ def main(arguments: list[str]) -> None:
         type=Path,
         nargs="*",
         metavar="FOLDER",
-        help="folder of finished studies or figures; without one the pages are written from what is stored",
+        help="folder of finished studies or figures; without a folder, the pages are written from the stored tables",
     )
     parser.add_argument("--out", type=Path, help="folder of tables and pages instead")
     args = parser.parse_args(arguments)

@@ -62,13 +62,14 @@ def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS)) -> st
         columns: Number of columns.
     """
     rows = []
-    for section in (one for sections in SECTIONS.values() for one in sections if ", hard" in one.title):
+    sections = [section for of_task in SECTIONS.values() for section in of_task if ", hard" in section.title]
+    for section in sections:
         named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
         guided = [named[name] for name in section.guided if name in named]
         if not guided:
             continue
         residual, scripted, random = (named.get(name) for name in ("residual RL", BASELINES[3], BASELINES[1]))
-        efforts = [*dict.fromkeys(_effort(*one) for one in guided)]
+        efforts = [*dict.fromkeys(_effort(*result) for result in guided)]
         if residual and (effort := _effort(*residual)) not in efforts:
             efforts.append(f"residual RL: {effort}")
         rows.append(
@@ -216,7 +217,7 @@ def demonstrated_episodes(row: Row) -> int:
     choices = [study.learner, study.methods[row.method].learner]
     # As in `Job.config`: the value null of a method overrides the study's choice.
     names = ("algorithm", "preset")
-    given = {name: getattr(one, name) for one in choices for name in names if name in one.model_fields_set}
+    given = {name: getattr(choice, name) for choice in choices for name in names if name in choice.model_fields_set}
     algorithm, preset = given.get("algorithm"), given.get("preset")
     settings = {**choices[0].settings, **choices[1].settings}
     if "demonstration_episodes" in settings or algorithm is None:
@@ -230,9 +231,10 @@ def has_run_offset(row: Row) -> bool:
     study = load_study(study_path(row.study))
     import_modules(study.imports)
     environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment
-    sets = [one for one in study.eval_set if row.eval_set in (None, one.name)]
     return any(
-        has_constant_offset(study.task, {**environment, **one.env}) and not one.options.get("new_run") for one in sets
+        has_constant_offset(study.task, {**environment, **eval_set.env}) and not eval_set.options.get("new_run")
+        for eval_set in study.eval_set
+        if row.eval_set in (None, eval_set.name)
     )
 
 
@@ -292,7 +294,7 @@ def _violation(parts: Sequence[pd.DataFrame]) -> str:
 
 def _forces(parts: Sequence[pd.DataFrame]) -> str:
     held_out, *training = (f"{float(part['peak_force'].max()):.1f}" for part in parts)
-    return held_out + "".join(f" ({one})" for one in training)
+    return held_out + "".join(f" ({force})" for force in training)
 
 
 def _success(seeds: pd.DataFrame) -> str:
@@ -331,7 +333,7 @@ def _compared(
 ) -> str:
     """Return a share [%] of the guided methods, by name if they differ, and of residual RL; a dash if it is missing."""
     shares = [share(seeds) for _, seeds in guided]
-    named = ", ".join(f"{one} ({row.name.split(',')[0]})" for (row, _), one in zip(guided, shares, strict=True))
+    named = ", ".join(f"{text} ({row.name.split(',')[0]})" for (row, _), text in zip(guided, shares, strict=True))
     return f"{named if len(set(shares)) > 1 else shares[0]} / {share(residual[1]) if residual else '–'}"
 
 

@@ -162,7 +162,7 @@ def _figures_section(figures: Mapping[str, Mapping[str, Any]], places: Mapping[s
         cells: list[Any] = [number, statement, "; ".join(results), figure.get("seeds")]
         cells += [f"{figure['seconds'] / 60:.1f} min" if figure else None, figure.get("condition")]
         command = figure.get("command", figure_command(number))
-        lines.append(f"| {' | '.join(cell(one or None).replace('|', '/') for one in cells)} | `{command}` |")
+        lines.append(f"| {' | '.join(cell(value or None).replace('|', '/') for value in cells)} | `{command}` |")
     return "\n".join([*lines, ""])
 
 
@@ -212,14 +212,14 @@ def _difference_lines(study: Study, evaluated: Collection[str]) -> list[str]:
     import_modules(study.imports)
     jobs = {
         method: Job(study, method, study.seeds[0], Path())
-        for method, one in study.methods.items()
-        if one.policy == LEARNED and method in evaluated
+        for method, declared in study.methods.items()
+        if declared.policy == LEARNED and method in evaluated
     }
     words = {method: describe_differences(job.config(job.after_episodes[-1])) for method, job in jobs.items()}
-    common = [one for one in next(iter(words.values()), ()) if all(one in own for own in words.values())]
+    common = [text for text in next(iter(words.values()), ()) if all(text in own for own in words.values())]
     further: dict[str, list[str]] = {}
     for method, own in words.items():
-        further.setdefault("; ".join(one for one in own if one not in common), []).append(method)
+        further.setdefault("; ".join(text for text in own if text not in common), []).append(method)
     lines = ["", f"Differences from the thesis ({', '.join(words)}): {'; '.join(common)}."] if common else []
     single = [f"- {', '.join(names)}: {sentence}." for sentence, names in further.items() if sentence]
     return [*lines, "", *single] if single else lines
@@ -243,7 +243,7 @@ def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
                 for value in sweep.at
             )
             cells = [method, *rates, format_breaking_point(values, points)]
-            lines.append(f"| {' | '.join(one or '–' for one in cells)} |")
+            lines.append(f"| {' | '.join(text or '–' for text in cells)} |")
     return lines
 
 

@@ -160,7 +160,7 @@ def choose_contact(
             f"these parts can't be simulated ({'; '.join(reasons)}): remove details without contact, such as threads "
             "and lettering, and export them again"
         )
-    best = max(choices, key=lambda one: rank(one, allowed))
+    best = max(choices, key=lambda choice: rank(choice, allowed))
     _write_pieces(folder, best.contact, surfaces)
     return replace(best, seconds=seconds)
 

@@ -231,7 +231,7 @@ def _seconds_since(start: float) -> float:
 
 
 def _describe_deviation(deviation: float, clearance: float | None) -> str:
-    """Return the deviation as text, compared with the clearance if there is one, both in millimeters."""
+    """Return the deviation as text, compared with the clearance if it is known and finite, both in millimeters."""
     text = f"deviation from the drawing at most {deviation:.4f} mm"
     if clearance is not None and np.isfinite(clearance) and deviation > 0.1 * clearance:
         text += f", which is more than a tenth of the clearance ({0.1 * clearance:.4f} mm)"

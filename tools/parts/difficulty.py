@@ -247,4 +247,4 @@ def _choose_for(folder: Path, force_limit: float, turn: float, episodes: int) ->
     """Return the setting for a task folder; run in a child process, because it registers a task."""
     task = load_task_folder(folder)
     register_task(NAME)(task)
-    return choose_setting(lambda one: score_setting(NAME, task.file, one.options(force_limit, turn), episodes))
+    return choose_setting(lambda setting: score_setting(NAME, task.file, setting.options(force_limit, turn), episodes))

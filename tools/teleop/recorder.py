@@ -171,7 +171,7 @@ class DemonstrationRecorder:
             task: Name of the task, or path of a task folder.
             environment: Options of the environment by name.
             out: File of the demonstrations, .npz or .csv; it must not exist.
-            meshcat: Page for the controls, in place of a new one. It does not show the simulation.
+            meshcat: Page for the controls, instead of a new page. This page does not show the simulation.
 
         Raises:
             InputError: If the task is no insertion, the station is hardware, or the file exists, has another ending or

@@ -80,7 +80,7 @@ class MeshcatPanel:
         self.set(np.zeros(len(self._sliders)))
 
     def apply_gamepad(self, period: float) -> None:
-        """Move the sliders for `period` [s] at speeds proportional to the gamepad's deflection, if one is connected."""
+        """Move the sliders for `period` [s] at speeds proportional to the deflection of a connected gamepad."""
         gamepad = self.meshcat.GetGamepad()
         if gamepad.index is None:
             return

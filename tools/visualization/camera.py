@@ -48,7 +48,7 @@ class Frames(EnvCallback):
     def on_step(self, transition: Transition) -> None:
         """Render a frame if it is due or the episode ends.
 
-        When `max_frames` are stored, drop every second one and double the interval.
+        When `max_frames` are stored, drop every second frame and double the interval.
         """
         self._actions += 1
         if not transition.is_last and self._actions % self._stride:

@@ -166,7 +166,7 @@ class Side:
 
 
 def default_page(run: Path, environment: Mapping[str, Any]) -> Path:
-    """Return the default path of a page: in the folder `run`, or in the current one if `run` is no folder of a run."""
+    """Return the default path of a page: in the folder `run` if it is a run's folder, otherwise in the current one."""
     name = f"replay-{environment['station']}.html" if "station" in environment else "replay.html"
     return run / name if run.is_dir() and not is_task_folder(run) else Path(name)
 
@@ -297,7 +297,7 @@ def tube(points: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the vertices (V, 3) and triangles (T, 3) of a tube with a cross section of five sides.
 
     Args:
-        points: Points of a path (n, 3) [m], at least two; the tube passes through every third one and the last.
+        points: Points of a path (n, 3) [m], at least two; the tube passes through every third point and the last.
         radius: Radius of the tube [m].
     """
     sides = 5

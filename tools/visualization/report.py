@@ -112,17 +112,17 @@ def _task(data: ReportData, task: str, describe_differences: DescribeDifferences
     curves = {"success": "success rate", "return": "return"}
     if any((run.episodes["peak_force"] > 0).any() for runs in methods.values() for run in runs):
         curves["mean_squared_force"] = "mean squared force [N²]"
-    drawn = [
+    figures = [
         _curve(data, task, name, label)
         for name, label in curves.items()
         if all(name in run.episodes for run in data.runs)
     ]
-    drawn.insert(2, _survival_curve(data, task))
+    figures.insert(2, _survival_curve(data, task))
     safety = {name: [run.safety for run in runs] for name, runs in methods.items()}
     differing, common = _configuration(methods)
     return {
         "name": task,
-        "figures": drawn,
+        "figures": figures,
         "few": "" if all(len(runs) > 1 for runs in methods.values()) else "; one seed has no band",
         "seeds": _seeds(methods),
         "safety": _safety(safety),
@@ -160,7 +160,7 @@ def _seeds(methods: dict[str, list[Run]]) -> Table:
     for name, runs in methods.items():
         after = [episodes_to_convergence(run.episodes) for run in runs]
         median = median_survival(*survival(after, [len(run.episodes) for run in runs]))
-        never = sum(one is None for one in after)
+        never = sum(number is None for number in after)
         cells = [name, str(len(runs)), "never" if median is None else f"{median:g}", f"{never} of {len(runs)}"]
         for column in columns:
             mean, interval = interquartile_mean([float(run.episodes[column].tail(10).mean()) for run in runs])
@@ -236,8 +236,8 @@ def _differences(methods: dict[str, list[Run]], describe_differences: DescribeDi
 def _configuration(methods: dict[str, list[Run]]) -> tuple[Table | None, Table]:
     """Return a table of settings that differ between methods (None if all agree) and a table of common settings."""
     settings = {name: _settings(runs) for name, runs in methods.items()}
-    keys = list(dict.fromkeys(key for one in settings.values() for key in one))
-    values = {key: [one.get(key, "–") for one in settings.values()] for key in keys}
+    keys = list(dict.fromkeys(key for options in settings.values() for key in options))
+    values = {key: [options.get(key, "–") for options in settings.values()] for key in keys}
     common = [key for key in keys if len(set(values[key])) == 1]
     rows = [Row([Cell(key.replace("_", " ")), *map(Cell, values[key])]) for key in keys if key not in common]
     differing = Table(["", *settings], rows) if rows else None
@@ -250,7 +250,7 @@ def _settings(runs: Sequence[Run]) -> dict[str, str]:
         {**flat(run.config), "preset": run.config.preset, "episodes": len(run.episodes), "seeds": run.config.seed}
         for run in runs
     ]
-    return {key: _join(cell(one.get(key)) for one in settings) for key in settings[0]}
+    return {key: _join(cell(options.get(key)) for options in settings) for key in settings[0]}
 
 
 def _join(values: Iterable[str]) -> str:
@@ -276,7 +276,7 @@ def _study_commands(counts: pd.DataFrame) -> list[str]:
     commands = []
     for name in filter(None, dict.fromkeys(counts["study"]) if len(counts) else ()):  # not of single runs
         rows = counts[counts["study"] == name]
-        methods, seeds = ([str(one) for one in dict.fromkeys(rows[column])] for column in ("method", "seed"))
+        methods, seeds = ([str(value) for value in dict.fromkeys(rows[column])] for column in ("method", "seed"))
         part_of, source = (str(rows[column].iloc[0]) for column in ("part_of", "source"))
         part = f" --methods {','.join(methods)} --seeds {','.join(seeds)}" if part_of else ""
         commands.append(f"guiderail study {source}{part} --out studies")

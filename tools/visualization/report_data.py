@@ -35,7 +35,7 @@ from guiderail.tools.visualization.style import color, label
 LEARNED = "learned"
 BASELINES = ("zero", "uniform_random", "constant")  # baseline policies evaluated together with a run's policy
 STUDY_COLUMNS = ("method", "policy", "seed", "after_episodes", "eval_set", "episodes", "success_rate")
-MAX_COUNT = 1e12  # largest number of episodes; a study's table with a larger one is refused
+MAX_COUNT = 1e12  # a study's table with this number of episodes or more is refused
 REQUIRED_COLUMNS = (
     "success", "return", "steps", "max_commanded_violation", "max_measured_violation", "peak_force", "collisions",
     "fallback_steps",
@@ -166,7 +166,7 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
         held_out += study_tables
         has_tables = has_tables or bool(study_tables)
     run_folders = {folder.resolve(): RunFolder(folder) for folder in folders}
-    runs = [Run(one.path, one.config(), _episodes(one)) for one in run_folders.values()]
+    runs = [Run(folder.path, folder.config(), _episodes(folder)) for folder in run_folders.values()]
     runs = [run for run in runs if len(run.episodes)]
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
@@ -210,7 +210,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
         InputError: If a table of a study is damaged.
     """
     tables: dict[str, pd.DataFrame] = {}
-    for file in sorted(folder.glob("*.csv"), key=lambda one: (len(one.stem), one.stem)):
+    for file in sorted(folder.glob("*.csv"), key=lambda path: (len(path.stem), path.stem)):
         if file.is_file() and not {*STUDY_COLUMNS} <= {*read_columns(file)}:
             continue
         table = read_table(file)
@@ -296,25 +296,25 @@ def _name_methods(runs: list[Run]) -> None:
         task_runs = [run for run in runs if run.config.task == task]
         settings = [flat(run.config) for run in task_runs]
         _name_sources(task_runs, settings)
-        keys = list(dict.fromkeys(key for one in settings for key in one))
-        differing = [key for key in keys if len({repr(one.get(key)) for one in settings}) > 1]
+        keys = list(dict.fromkeys(key for options in settings for key in options))
+        differing = [key for key in keys if len({repr(options.get(key)) for options in settings}) > 1]
         # The name of a guidance or an algorithm implies its options.
         by_name = [key for key in ("guidance", "algorithm") if key in differing]
-        names = {tuple(one.get(key) for key in by_name) for one in settings}
-        methods = {tuple(repr(one.get(key)) for key in differing) for one in settings}
+        names = {tuple(options.get(key) for key in by_name) for options in settings}
+        methods = {tuple(repr(options.get(key)) for key in differing) for options in settings}
         chosen = by_name if len(names) == len(methods) else differing
-        for run, one in zip(task_runs, settings, strict=True):
-            kind = str(one.get("guidance", ""))
-            words = [label(kind) if key == "guidance" else _format_setting(key, one.get(key)) for key in chosen]
+        for run, options in zip(task_runs, settings, strict=True):
+            kind = str(options.get("guidance", ""))
+            words = [label(kind) if key == "guidance" else _format_setting(key, options.get(key)) for key in chosen]
             run.method = ", ".join(words) or (label(kind) if kind else run.config.task)
 
 
 def _name_sources(runs: Sequence[Run], settings: Sequence[dict[str, Any]]) -> None:
     """Replace `init_from` by a path relative to the folder of the runs, with {seed} in place of the run's own seed."""
     paths = {
-        number: os.path.relpath(one["init_from"], run.path.resolve().parent)
-        for number, (run, one) in enumerate(zip(runs, settings, strict=True))
-        if one.get("init_from")
+        number: os.path.relpath(options["init_from"], run.path.resolve().parent)
+        for number, (run, options) in enumerate(zip(runs, settings, strict=True))
+        if options.get("init_from")
     }
     for number, path in paths.items():
         seed = runs[number].config.seed

@@ -22,7 +22,7 @@ def label(guidance: str) -> str:
 
 
 def color(guidance: str) -> str:
-    """Return the color of a guidance; brown for an unknown one."""
+    """Return the color of a guidance; brown for an unknown guidance."""
     return GUIDANCE.get(guidance).color if guidance in GUIDANCE.names() else "#8c564b"
 
 

@@ -52,7 +52,7 @@ def test_step_is_registered_by_the_plugin():
 def test_actions_of_a_policy_are_within_the_limits(shape):
     guarded, random = pipeline(), np.random.default_rng(0)
     sent = [guarded(torch.from_numpy(random.uniform(-0.5, 0.5, shape).astype("f4"))) for _ in range(40)]
-    assert all(one.shape == shape and one.dtype == torch.float32 for one in sent)
+    assert all(action.shape == shape and action.dtype == torch.float32 for action in sent)
     check(torch.cat(sent).reshape(-1, 3).numpy().astype(float))
 
 

@@ -1,6 +1,7 @@
 """The benchmark of the control loop."""
 
 import operator
+import os
 
 import numpy as np
 import pytest
@@ -44,6 +45,8 @@ def test_late_answer_belongs_to_its_own_message():
 
 
 def test_transport_raises_when_the_sender_ends_without_a_result(monkeypatch):
+    monkeypatch.delenv("DRAKE_ALLOW_NETWORK", raising=False)
     monkeypatch.setattr(loop, "_send_statuses", operator.sub)  # raises a TypeError for a pipe and a URL
     with pytest.raises(EOFError):
         loop._transport()
+    assert "DRAKE_ALLOW_NETWORK" not in os.environ  # otherwise Meshcat would be forbidden for the whole process

@@ -109,7 +109,7 @@ def read_csv_files(
     for file in files:
         like = recorded.outputs[0] if recorded.outputs else None
         columns = _table(file)
-        is_written = [one.name for one in columns[:2]] == ["demonstration", "time"]
+        is_written = [column.name for column in columns[:2]] == ["demonstration", "time"]
         first_of_kind.setdefault(is_written, file)
         if len(first_of_kind) > 1:
             raise InputError(
@@ -167,14 +167,14 @@ def _read(
             f"{file} has no columns x, y and z: name them so; a table of outputs other than a pose needs "
             "no import: guiderail reads it as it is, if its time is in seconds"
         )
-    positions = np.column_stack([one.values for one in position])
+    positions = np.column_stack([column.values for column in position])
     units = _units(file, position, UNITS, unit, "--unit")
     if None in units:
         missing = [o for o, known in enumerate(units) if known is None]
         size = float(np.ptp(positions[:, missing], axis=0).max())
         which = _listed(["xyz"[o] for o in missing])
         raise InputError(f"{file} does not state the unit of {which}, moving by {size:.4g}: give --unit m or mm")
-    positions = positions * [UNITS[str(one)] for one in units]
+    positions = positions * [UNITS[str(known)] for known in units]
     orientation, rotations = _rotations(file, columns, quaternion, angles, assumptions)
     if rotations is None:
         if target is not None:
@@ -186,7 +186,7 @@ def _read(
             "to convert them, give the pose of the task's target in it as --target"
         )
     used = (clock, *position, *orientation)
-    if left := [one.name for one in columns if one.name and not any(one is other for other in used)]:
+    if left := [column.name for column in columns if column.name and not any(column is other for other in used)]:
         assumptions.append(f"{_listed(left)} {'is' if len(left) == 1 else 'are'} left out")
     if rotations is None:
         return Recorded([times], [positions], POSE_NAMES[:3], assumptions)
@@ -199,7 +199,7 @@ def _table(file: Path) -> list[_Column]:
         data = read_bytes(file, "table", MAX_FILE_SIZE)
         text = data.decode("utf-8-sig")  # Excel writes a byte-order mark, which is not part of a name
         first = next((line for line in io.StringIO(text) if line.strip()), "")
-        delimiter = next((one for one in _DELIMITERS if one in first), ",")
+        delimiter = next((character for character in _DELIMITERS if character in first), ",")
         lines = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
         rows = ((lines.line_num, row) for row in lines if len(row) > 1 or "".join(row).strip())
         _, names = next(rows, (0, []))
@@ -207,7 +207,7 @@ def _table(file: Path) -> list[_Column]:
         for number, row in rows:
             if len(row) != len(names):
                 raise InputError(f"{file}: line {number} has {len(row)} fields, the header has {len(names)}")
-            values.extend([np.nan if one.strip().lower() in _EMPTY else parse_number(one) for one in row])
+            values.extend([np.nan if field.strip().lower() in _EMPTY else parse_number(field) for field in row])
     except InputError:
         raise
     except (ValueError, OSError, csv.Error) as error:
@@ -258,21 +258,21 @@ def _listed(names: Sequence[str]) -> str:
 def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
     """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if both are missing."""
     named = rf"{wanted}(_mm|_cm|_m|_rad|_deg)?"
-    exact = [one for one in columns if re.fullmatch(named, one.plain)]
-    ends = [one for one in columns if re.fullmatch(_PREFIX + named, one.plain)]
-    return _only(file, exact or [one for one in ends if not _NO_POSE.fullmatch(one.plain)], wanted)
+    exact = [column for column in columns if re.fullmatch(named, column.plain)]
+    ends = [column for column in columns if re.fullmatch(_PREFIX + named, column.plain)]
+    return _only(file, exact or [column for column in ends if not _NO_POSE.fullmatch(column.plain)], wanted)
 
 
 def _columns(file: Path, columns: Sequence[_Column], wanted: Sequence[str]) -> list[_Column]:
     """Return the columns `wanted`, or an empty list if one of them is missing."""
-    found = [one for name in wanted if (one := _column(file, columns, name)) is not None]
+    found = [column for name in wanted if (column := _column(file, columns, name)) is not None]
     return found if len(found) == len(wanted) else []
 
 
 def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
     """Return the only column in `found`, or None if it is empty; raise an InputError if there are several."""
     if len(found) > 1:
-        names = _listed([one.name for one in found])
+        names = _listed([column.name for column in found])
         raise InputError(f"{file} has {names}, and does not state which of them is {wanted}: keep only that one")
     return found[0] if found else None
 
@@ -281,7 +281,7 @@ def _time(
     file: Path, columns: Sequence[_Column], given: str | None, assumptions: list[str]
 ) -> tuple[_Column, np.ndarray]:
     """Return the time column, and the time since its first sample (N,) [s]."""
-    matches = [one for one in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", one.plain))]
+    matches = [column for column in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", column.plain))]
     clock = _only(file, matches, "time")
     if clock is None:
         raise InputError(f"{file} has no column t, time or timestamp: add one")
@@ -316,31 +316,31 @@ def _rotations(
     """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
     for names in _QUATERNION:
         if matches := _columns(file, columns, names):
-            places = {id(one): place for place, one in enumerate(columns)}
+            places = {id(column): place for place, column in enumerate(columns)}
             in_file = sorted(zip(matches, "xyzw", strict=True), key=lambda pair: places[id(pair[0])])
             order = "".join(letter for _, letter in in_file)
             if quaternion not in (None, order):
-                listed = ", ".join(one.name for one, _ in in_file)
+                listed = ", ".join(column.name for column, _ in in_file)
                 raise InputError(f"{file} has {listed}, which contradicts --quaternion {quaternion}: leave it out")
-            return matches, rotations_of(np.column_stack([one.values for one in matches]), str(file))
-    numbers = {one.plain for one in columns if re.fullmatch("q[0-9]+", one.plain)}
+            return matches, rotations_of(np.column_stack([column.values for column in matches]), str(file))
+    numbers = {column.plain for column in columns if re.fullmatch("q[0-9]+", column.plain)}
     for names in _UNNAMED if len(numbers) == 4 else ():
-        same = [_only(file, [one for one in columns if one.plain == name], name) for name in names]
-        matches = [one for one in same if one is not None]
+        same = [_only(file, [column for column in columns if column.plain == name], name) for name in names]
+        matches = [column for column in same if column is not None]
         if len(matches) == len(names):
             if quaternion is None:
                 raise InputError(
                     f"{file} has the quaternion {', '.join(names)} and does not state which is its scalar: give "
                     "--quaternion wxyz or xyzw"
                 )
-            values = np.column_stack([one.values for one in matches])
+            values = np.column_stack([column.values for column in matches])
             return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
     fixed = [[column for column in columns if re.fullmatch(rf"R{axis} ?\[(deg|rad)\]", column.name)] for axis in "xyz"]
     if all(len(named) == 1 for named in fixed):  # names that guiderail writes; a rotation vector has rx, ry and rz
         matches = [column for (column,) in fixed]
         scales = [_ANGLE_UNITS[str(unit)] for unit in _units(file, matches, _ANGLE_UNITS, angles, "--angles")]
         assumptions.append("Rz, Ry and Rx are ZYX Euler angles, Rz Ry Rx")
-        return matches, Rotation.from_euler("xyz", np.column_stack([one.values for one in matches]) * scales)
+        return matches, Rotation.from_euler("xyz", np.column_stack([column.values for column in matches]) * scales)
     for euler in _EULER:
         if matches := _columns(file, columns, euler):
             units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")

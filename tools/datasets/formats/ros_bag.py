@@ -162,7 +162,7 @@ def _array_names(message: Any) -> tuple[str, ...]:
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
     """Return positions (N, J) in the order of the first message's names; the order may differ between messages.
 
-    A message with other joints is refused, not skipped: the first message may be the one from the wrong device.
+    A message with other joints is refused, not skipped, because the first message may be from the wrong device.
     """
     expected = list(messages[0].name)
     if len(set(expected)) < len(expected):
@@ -212,7 +212,7 @@ def _frame(message: Any, path: Sequence[str]) -> str:
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:
     """Write a folder with one ROS 2 bag in MCAP per demonstration; return remarks.
 
-    Each message holds the outputs (O,) of one sample; the labels of its layout are the names of the outputs. The folder
+    Each message has the outputs (O,) of one sample; the labels of its layout are the names of the outputs. The folder
     must be new or empty.
 
     Raises:
