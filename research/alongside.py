@@ -32,7 +32,7 @@ from research.distillation import evaluate_in_blocks, median_time, teacher_actio
 
 TASK, SETTINGS = "BncConnector", {"symmetry": "near"}
 TEACHER = {"guidance": "kgrl", "difficulty": "hard", "reward": "aligned"}
-STUDENT = {**TEACHER, "guidance": "safe_residual", "action_scale": 1.85}  # the student reaches as far as the teacher
+STUDENT = {**TEACHER, "guidance": "safe_residual", "action_scale": 1.85}  # with the same reach as the teacher
 # Policy and environment of each row.
 VARIANTS: dict[str, tuple[str, Mapping[str, Any]]] = {
     "teacher": ("teacher", TEACHER),
@@ -130,7 +130,7 @@ def evaluate_variant(out: Path, variant: str, episodes: int, seed: int, run_seed
 def times_per_action(out: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The student's time is that of its network, the sum with the motion, and the projection onto the constraints.
+    The student's time includes its network, the sum with the motion, and the projection onto the constraints.
     """
     repeat, prior = configure(TASK, TEACHER).action_repeat, make_prior_knowledge(TASK, **STUDENT).demonstrations
     act_as_teacher, observations, _ = teacher_actions(TASK, TEACHER, repeat, Policy.load(out / "teacher"))

@@ -95,7 +95,7 @@ def run_program(main: Callable[[list[str]], int | None], arguments: list[str] | 
 
     Args:
         main: Function from the arguments to the exit code, or to None for success.
-        arguments: Arguments; those of the process by default.
+        arguments: Arguments; by default the command-line arguments of the process.
     """
     try:
         code = main(sys.argv[1:] if arguments is None else arguments) or 0

@@ -85,8 +85,8 @@ def evaluate_in_blocks(prefix: Path, evaluate: Callable[[int, int], pd.DataFrame
 def time_per_action(teacher: RunFolder, student: Path) -> dict[str, float]:
     """Return the median time of an action, with all its commands, without simulation [ms].
 
-    The teacher's time is that of its network and of a constrained primitive in every control step. The student's time
-    is that of its network.
+    The teacher's time includes its network, and a constrained primitive in every control step. The student's time
+    includes only its network.
     """
     config, policy, base = teacher.config(), Policy.load(teacher.path), find_base_policy(str(student))
     options = beyond_defaults(config.task, config.environment)

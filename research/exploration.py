@@ -1,7 +1,7 @@
 """Exploration noise of an untrained policy: one action per control step.
 
-All kinds have the same root mean square, that of uniform numbers in [−1, 1], the same limits and separate random
-generators. The motions that they excite differ only by the shape of the noise.
+All kinds have the root mean square of uniform numbers in [−1, 1], the same limits and separate random generators. The
+excited motions differ only by the shape of the noise.
 """
 
 from collections.abc import Callable, Iterator

@@ -191,7 +191,7 @@ class HiddenPeg(gymnasium.Env):
         return yaw, goal_yaw, final
 
     def _force(self) -> float:
-        """Return the largest contact force between the peg and anything else [N]."""
+        """Return the largest contact force between the peg and other bodies [N]."""
         model, data = self._sim_env.sim.model._model, self._sim_env.sim.data._data
         wrench, largest = np.zeros(6), 0.0
         for i, (first, second) in enumerate(data.contact.geom.tolist() if data.ncon else []):

@@ -112,7 +112,7 @@ class HiddenGoal(gymnasium.Wrapper):
         raise NotImplementedError
 
     def _force(self) -> float:
-        """Return the largest contact force between the obstacle and anything else [N]."""
+        """Return the largest contact force between the obstacle and other bodies [N]."""
         env, wrench, largest = self.unwrapped, np.zeros(6), 0.0
         pairs = env.data.contact.geom.tolist() if env.data.ncon else []
         for i, (first, second) in enumerate(pairs):

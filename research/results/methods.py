@@ -227,7 +227,7 @@ def demonstrated_episodes(row: Row) -> int:
 
 
 def has_run_offset(row: Row) -> bool:
-    """Return True if all held-out episodes of a seed have the same hidden offset, which is that of its training."""
+    """Return True if all held-out episodes of a seed have the hidden offset of its training."""
     study = load_study(study_path(row.study))
     import_modules(study.imports)
     environment = Job(study, row.method, study.seeds[0], Path()).config(1).environment

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from guiderail.diagrams.tasks.part.file import PartTaskFile, SearchNumbers
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
-DENSITY = 2700.0  # assumed density of the parts, that of aluminum [kg/m³]; a gantry has no gravity
+DENSITY = 2700.0  # assumed density of the parts, here of aluminum [kg/m³]; a gantry has no gravity
 START_HEIGHT = 3.0 * MM  # height of the plug above the rim at the start [m]
 MAX_GAP = 1.0 * MM  # largest gap between the bounding boxes of assembled parts [m]
 MAX_TURN = 180.0  # largest rotation at the bottom, either way [degrees]
@@ -64,7 +64,7 @@ def read_parts(
     Args:
         plug: Mesh file of the part in the tool.
         socket: Mesh file of the part in the world.
-        unit: Unit of the files whose format states none; None if the formats of both state it.
+        unit: Unit of a file whose format does not state its unit; None if both formats state the unit.
         plug_pose: Motion of the plug's mesh to the assembled pose: [x y z] in the socket's unit, and rotations
             [rx ry rz] about the fixed axes x, y and z, in this order [degrees].
         axis: Direction in which the plug is removed, in the coordinates of the socket's file; a key of `AXES`.

@@ -266,7 +266,7 @@ def _versions(runs: Sequence[Run]) -> Table | None:
 
 
 def _commands(data: ReportData) -> tuple[list[str], list[str]]:
-    """Return the commands that reproduce the report and, for a study, also those of its individual runs."""
+    """Return the commands that reproduce the report, and for a study, the commands of its individual runs."""
     of_runs = [command(run.config, f"runs/{name}") for run, name in zip(data.runs, data.folder_names, strict=True)]
     return (_study_commands(data.held_out), of_runs) if data.is_study else (of_runs, [])
 

@@ -130,7 +130,7 @@ class ReportData:
         return groups
 
     def colors(self, task: str) -> dict[str, str]:
-        """Return a color for each method: that of its guidance, or of a palette if two methods share a guidance."""
+        """Return a color for each method: its guidance's color, or a palette's if two methods share a guidance."""
         kinds = {name: str(runs[0].config.environment.get("guidance", "")) for name, runs in self.methods(task).items()}
         if len(set(kinds.values())) == len(kinds):
             return {name: color(kind) for name, kind in kinds.items()}
