@@ -183,8 +183,13 @@ class Matern52(_StationaryKernel):
     """The Matérn kernel k(ζ, ζ') = (1 + s + s²/3) exp(−s) with s = √5 ‖ζ − ζ'‖ / ℓ.
 
     Random motions with this covariance are only twice differentiable. The kernel suits motions for which the squared
-    exponential kernel is too smooth, such as motions with a contact in the middle. The argument is that of
-    `SquaredExponential`.
+    exponential kernel is too smooth, such as motions with a contact in the middle.
+
+    Args:
+        length_scale: Length scale ℓ, in the unit of the input, positive.
+
+    Raises:
+        InputError: If the length scale is not in [1e-100, 1e100].
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:

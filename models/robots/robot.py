@@ -168,7 +168,10 @@ robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot, whose name is not registered yet, to the registry and return it.
+    """Add a robot to the registry and return it.
+
+    Args:
+        robot: Robot with a name that is not registered yet.
 
     Raises:
         InputError: If `robot` is not a `Robot`, or its name is taken.
@@ -186,7 +189,10 @@ def find_robot(name: str | Robot) -> Robot:
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Add an end effector, whose name is not registered yet, to the registry and return it.
+    """Add an end effector to the registry and return it.
+
+    Args:
+        end_effector: End effector with a name that is not registered yet.
 
     Raises:
         InputError: If `end_effector` is not an `EndEffector`, or its name is taken.
