@@ -1,7 +1,7 @@
 """Dense reference solution of problem 4.5 in extended precision, independent of the implementation.
 
-Every matrix is formed as in the equations (with the errata of equations 4.7 and 4.17), and factored by a Cholesky
-decomposition in `longdouble`: slow, and accurate to about 1e-19 times the condition number.
+Matrices are formed as in the equations (with the errata of equations 4.7 and 4.17) and factored by a Cholesky
+decomposition in `longdouble`. The solution is slow, with an error of about 1e-19 times the condition number.
 """
 
 from functools import cached_property
@@ -12,7 +12,7 @@ Extended = np.longdouble
 
 
 def cholesky(A):
-    """Compute the lower factor of a symmetric positive definite A in its precision."""
+    """Compute the lower Cholesky factor of a symmetric positive definite matrix A in the precision of A."""
     n = len(A)
     L = np.zeros_like(A)
     for j in range(n):
@@ -33,6 +33,7 @@ def solve(L, B):
 
 
 def block_diagonal(blocks):
+    """Return the matrix (N·O, N·O) with the diagonal blocks (N, O, O)."""
     n, o = blocks.shape[:2]
     D = np.zeros((n * o, n * o), dtype=blocks.dtype)
     for i in range(n):
@@ -41,17 +42,16 @@ def block_diagonal(blocks):
 
 
 def cholesky_solve(A, B):
-    """Compute A⁻¹ B for a symmetric positive definite A in its precision."""
+    """Compute A⁻¹ B for a symmetric positive definite matrix A in the precision of A."""
     return solve(cholesky(A), B)
 
 
 class DenseWindow:
-    """Dense solution of one window of one problem.
+    """Dense solution of problem 4.5 in one window.
 
     Attributes:
-        y: Window of equation 4.18 without constraints (N·O,), history first.
-        S: K A Σ, computed if a constraint is active.
-        first: Index of the executed point's first output.
+        y: Outputs of equation 4.18 without constraints (N·O,), history first.
+        S: Matrix K A Σ (N·O, N·O), computed at the first use.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class DenseWindow:
         precision=Extended,
         at=None,
     ):
-        """Solve the window; `at` are the indices (J,) of the inputs with actions, the executed point by default."""
+        """Solve the window without constraints; `at` (J,) indexes the inputs with actions (default: executed)."""
         t = np.asarray(inputs, dtype=precision)
         mu = np.asarray(means, dtype=precision)
         o = mu.shape[1]
@@ -81,30 +81,29 @@ class DenseWindow:
         self._L = cholesky(K + hbar * sigma)
         xi = np.asarray(action, dtype=precision)
         if at is not None:
-            # K̲⁻¹ ξ̂ of all actions together, put where they are: the columns of K̂ follow.
-            among = np.kron(k[np.ix_(at, at)], np.eye(o, dtype=precision))
+            # K̲⁻¹ ξ̂ with the kernel K̲ between the inputs with actions; K̂ has the columns of K at these inputs.
+            K_actions = np.kron(k[np.ix_(at, at)], np.eye(o, dtype=precision))
             e = np.concatenate([np.arange(i * o, (i + 1) * o) for i in at]).astype(int)
-            xi = cholesky_solve(among, xi.reshape(-1, 1))[:, 0]
-        # (β/ħ)(K̂ − K A K̂) ξ̂: the printed form, not the cancellation-free one.
+            xi = cholesky_solve(K_actions, xi.reshape(-1, 1))[:, 0]
+        # The term of the actions is (β/ħ)(K̂ − K A K̂) ξ̂ = β Σ A K̂ ξ̂, which has no cancellation.
         A_mu_K = solve(self._L, np.column_stack([mu.ravel(), K[:, e]]))
         self.y = K @ A_mu_K[:, 0] + precision(beta) * (sigma @ (A_mu_K[:, 1:] @ xi))
-        self.first, self.outputs = executed, o
+        self.executed, self.outputs = executed, o
 
     @cached_property
     def S(self):
         A_K, o = solve(self._L, self._K), self.outputs
-        # Block by block: what Σ is zero at is nothing to add up.
+        # Multiply block by block, because Σ is block-diagonal.
         S = np.hstack([A_K[i * o : (i + 1) * o].T @ block for i, block in enumerate(self._blocks)])
         return (S + S.T) / 2
 
     def corrected(self, G, alpha):
-        """Compute y + S Ḡ α (H+1, O), for constraints on the executed point and those after it."""
-        o, start = self.outputs, self.first * self.outputs
-        push = np.einsum("nfo,nf->no", np.asarray(G, Extended), np.asarray(alpha, Extended)).ravel()
-        full = np.zeros(len(self.y), dtype=self.y.dtype)
-        full[start:] = push
-        pushed = self.y + self.S @ full if full.any() else self.y
-        return pushed[start:].reshape(-1, o)
+        """Compute y + S Ḡ α (H+1, O) with constraints on the executed point and the points after it."""
+        o, start = self.outputs, self.executed * self.outputs
+        G_alpha = np.zeros(len(self.y), dtype=self.y.dtype)
+        G_alpha[start:] = np.einsum("nfo,nf->no", np.asarray(G, Extended), np.asarray(alpha, Extended)).ravel()
+        outputs = self.y + self.S @ G_alpha if G_alpha.any() else self.y
+        return outputs[start:].reshape(-1, o)
 
 
 def squared_exponential(length_scale, t):

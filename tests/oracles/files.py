@@ -1,4 +1,4 @@
-"""Independent readers, the reference for the content of accepted files."""
+"""Independent readers of demonstrations and templates, a reference for the content of accepted files."""
 
 import csv
 from decimal import Decimal
@@ -9,7 +9,7 @@ import yaml
 
 
 def npz_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Read times and outputs of each demonstration by NumPy's own reader."""
+    """Read times (N,) and outputs (N, O) of each demonstration with `numpy.load`."""
     with np.load(path, allow_pickle=False) as file:
         times, outputs = file["times"], file["outputs"]
         if "lengths" in file:
@@ -18,28 +18,28 @@ def npz_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
             parts = [(times[a:b], outputs[a:b]) for a, b in zip(starts, ends, strict=True)]
         else:
             parts = [(times if times.ndim == 1 else times[m], outputs[m]) for m in range(len(outputs))]
-    return [_once(_doubles(t), _doubles(y)) for t, y in parts]
+    return [_drop_repeated(_doubles(t), _doubles(y)) for t, y in parts]
 
 
 def csv_demonstrations(path: Path) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Read times and outputs of each demonstration by decimal arithmetic."""
+    """Read times (N,) and outputs (N, O) of each demonstration, with numbers parsed by `decimal.Decimal`."""
     text = path.read_bytes().decode("utf-8").removeprefix("\ufeff")
     rows = list(csv.reader(text.splitlines())) if '"' in text else [line.split(",") for line in text.splitlines()]
     header, body = [name.strip() for name in rows[0]], [row for row in rows[1:] if row not in ([], [""])]
     numbers = [[float(Decimal(field.strip())) for field in row] for row in body]
     if header[:2] != ["demonstration", "time"]:
-        return [_once(np.array([row[0] for row in numbers]), np.array([row[1:] for row in numbers]))]
+        return [_drop_repeated(np.array([row[0] for row in numbers]), np.array([row[1:] for row in numbers]))]
     parts = []
     for label in sorted({row[0] for row in numbers}):
-        own = [row[1:] for row in numbers if row[0] == label]
-        parts.append(_once(np.array([row[0] for row in own]), np.array([row[1:] for row in own])))
+        samples = [row[1:] for row in numbers if row[0] == label]
+        parts.append(_drop_repeated(np.array([row[0] for row in samples]), np.array([row[1:] for row in samples])))
     return parts
 
 
 def template_numbers(text: str) -> dict[tuple[str, ...], float]:
-    """Return every number of a template by its path, read with PyYAML and evaluated with Python's `eval`."""
+    """Return every number of a template by its path of keys, read with PyYAML and evaluated with Python's `eval`."""
     data = yaml.safe_load(text)
-    parameters = {name: float(_value(value, {})) for name, value in (data.get("parameters") or {}).items()}
+    parameters = {name: float(_evaluate(value, {})) for name, value in (data.get("parameters") or {}).items()}
     result: dict[tuple[str, ...], float] = {("parameters", name): value for name, value in parameters.items()}
 
     def walk(path, entry):
@@ -52,14 +52,14 @@ def template_numbers(text: str) -> dict[tuple[str, ...], float]:
         elif isinstance(entry, int | float) and not isinstance(entry, bool):
             result[path] = float(entry)
         elif isinstance(entry, str) and path[-1] not in ("kind", "frame", "to", "name"):
-            result[path] = float(_value(entry, parameters))
+            result[path] = float(_evaluate(entry, parameters))
 
     for key in ("inputs", "max_speed_m_per_s", "max_speed_rad_per_s", "states"):
         walk((key,), data[key])
     return result
 
 
-def _value(entry, parameters):
+def _evaluate(entry, parameters):
     return eval(entry, {"__builtins__": {}}, parameters) if isinstance(entry, str) else entry
 
 
@@ -67,7 +67,7 @@ def _doubles(values: np.ndarray) -> np.ndarray:
     return np.array([float(value) for value in values.ravel().tolist()]).reshape(values.shape)
 
 
-def _once(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Drop samples that repeat their predecessor, time included."""
-    kept = [n for n in range(len(t)) if n == 0 or t[n] != t[n - 1] or (y[n] != y[n - 1]).any()]
-    return t[kept], y[kept]
+def _drop_repeated(t: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and outputs without the samples that equal the previous sample in time and outputs."""
+    indices = [n for n in range(len(t)) if n == 0 or t[n] != t[n - 1] or (y[n] != y[n - 1]).any()]
+    return t[indices], y[indices]

@@ -1,6 +1,9 @@
-"""Published limits of a Franka Emika Panda, which tests compare with."""
+"""Published Cartesian motion limits of a Franka Emika Panda."""
 
 from guiderail.models.control.motion_constraints import MotionLimits
 
 FRANKA_LIMITS = MotionLimits((1.7, 13.0, 6500.0), (2.5, 25.0, 12500.0))
-"""Limits of the Cartesian motion; an FR3 has lower accelerations and jerks."""
+"""Maximum speed, acceleration and jerk: linear [m/s, m/s², m/s³], then angular [rad/s, rad/s², rad/s³].
+
+An FR3 has lower accelerations and jerks.
+"""

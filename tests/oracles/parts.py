@@ -1,6 +1,6 @@
-"""Six plugs and sockets as STL files in millimeters, for which nothing is tuned.
+"""Plugs and sockets as STL files [mm], for which no parameter of the package is tuned.
 
-Each pair is drawn assembled, with insertion along z from above. A plug that turns is drawn locked.
+Each pair is modeled assembled, with insertion from above along z. A plug that is turned to lock is modeled locked.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ class Part:
     Attributes:
         plug: Solids of the plug.
         socket: Solids of the socket.
-        clearance: Clearance between their walls on each side [mm].
+        clearance: Clearance between the walls of plug and socket on each side [mm].
         options: Further arguments of `guiderail create-task`.
     """
 
@@ -56,7 +56,7 @@ def _prism(outline: CrossSection, low: float, high: float) -> Manifold:
     return Manifold.extrude(outline, high - low).translate((0, 0, low))
 
 
-def _grown(outline: CrossSection, by: float) -> CrossSection:
+def _offset(outline: CrossSection, by: float) -> CrossSection:
     from manifold3d import JoinType
 
     return outline.offset(by, JoinType.Miter)
@@ -64,14 +64,14 @@ def _grown(outline: CrossSection, by: float) -> CrossSection:
 
 def _shaft(outline: CrossSection, low: float, high: float, chamfer: float = CHAMFER) -> Manifold:
     """Return a convex prism with a chamfered lower end."""
-    tip = _prism(_grown(outline, -chamfer), low, low + 0.01)
+    tip = _prism(_offset(outline, -chamfer), low, low + 0.01)
     return Manifold.batch_hull([tip, _prism(outline, low + chamfer, high)])
 
 
 def _hole(outline: CrossSection, clearance: float, low: float) -> Manifold:
     """Return the volume of a hole below z = 0 with a convex outline and a chamfered mouth."""
-    wall = _grown(outline, clearance)
-    mouth = [_prism(wall, -CHAMFER, -CHAMFER + 0.01), _prism(_grown(wall, CHAMFER), 0.0, 0.01)]
+    wall = _offset(outline, clearance)
+    mouth = [_prism(wall, -CHAMFER, -CHAMFER + 0.01), _prism(_offset(wall, CHAMFER), 0.0, 0.01)]
     return _prism(wall, low, 0.01) + Manifold.batch_hull(mouth)
 
 
@@ -80,9 +80,9 @@ def _block(width: float, low: float) -> Manifold:
 
 
 def keyed_peg(clearance: float = 0.2) -> Part:
-    """A round peg with a key and a head that seats on the socket's face."""
+    """Return a round peg with a key and a head that seats on the socket's face."""
     outlines = [_disc(6.0), _square(3.0, 3.0, 6.0)]
-    shaft = Manifold.batch_hull([_prism(_grown(_disc(6.0), -CHAMFER), -15, -14.99), _prism(_disc(6.0), -14.5, 0)])
+    shaft = Manifold.batch_hull([_prism(_offset(_disc(6.0), -CHAMFER), -15, -14.99), _prism(_disc(6.0), -14.5, 0)])
     key = _shaft(outlines[1], -15.0, 0.0)
     plug = shaft + key + _prism(_disc(10.0), 0.0, 8.0)
     socket = _block(30.0, -20.0)
@@ -92,22 +92,22 @@ def keyed_peg(clearance: float = 0.2) -> Part:
 
 
 def square_peg(clearance: float = 0.1) -> Part:
-    """A square peg that seats on the hole's bottom."""
+    """Return a square peg that seats on the hole's bottom."""
     outline = _square(10.0, 10.0)
     return Part([_shaft(outline, -15.0, 10.0)], [_block(30.0, -20.0) - _hole(outline, clearance, -15.0)], clearance)
 
 
 def d_connector(clearance: float = 0.15) -> Part:
-    """A D-shaped shell around a D-shaped tongue."""
+    """Return a D-shaped shell around a D-shaped tongue."""
     outline = _disc(7.0) ^ _square(20.0, 20.0, -6.0)
-    core, wall = _grown(outline, -1.5), 1.5
+    core, wall = _offset(outline, -1.5), 1.5
     cavity = _prism(core, -8.0, -1.5) + Manifold.batch_hull(
-        [_prism(core, -7.5, -7.49), _prism(_grown(core, CHAMFER), -8.01, -8.0)]
+        [_prism(core, -7.5, -7.49), _prism(_offset(core, CHAMFER), -8.01, -8.0)]
     )
     plug = _shaft(outline, -8.0, 6.0) - cavity
-    tongue_outline = _grown(core, -clearance)
+    tongue_outline = _offset(core, -clearance)
     tongue = Manifold.batch_hull(
-        [_prism(tongue_outline, -9.0, -2.0 - CHAMFER), _prism(_grown(tongue_outline, -CHAMFER), -2.01, -2.0)]
+        [_prism(tongue_outline, -9.0, -2.0 - CHAMFER), _prism(_offset(tongue_outline, -CHAMFER), -2.01, -2.0)]
     )
     socket = _block(26.0, -12.0) - _hole(outline, clearance, -8.0) + tongue
     assert wall > 2 * clearance
@@ -115,7 +115,7 @@ def d_connector(clearance: float = 0.15) -> Part:
 
 
 def bayonet(clearance: float = 0.2) -> Part:
-    """Three lugs that come down in slots and turn by 40 degrees under a ring."""
+    """Return a round peg with three lugs that pass through slots and turn by 40 degrees under a ring."""
     lugs = [_square(3.0, 3.0, 6.0).rotate(120.0 * i) for i in range(3)]
     plug = _shaft(_disc(6.0), -12.0, 8.0)
     for lug in lugs:
@@ -133,7 +133,7 @@ def bayonet(clearance: float = 0.2) -> Part:
 
 
 def snap_fit(clearance: float = 0.2) -> Part:
-    """A square peg with two noses that give way to the socket's lips, drawn as bodies of their own."""
+    """Return a square peg with two elastic noses, which are separate bodies and snap under the socket's lips."""
     outline = _square(8.0, 8.0)
     noses = [
         Manifold.hull_points(
@@ -148,29 +148,29 @@ def snap_fit(clearance: float = 0.2) -> Part:
 
 
 def dovetail(clearance: float = 0.15) -> Part:
-    """A tongue that slides into a slot wider inside than at its mouth, its walls at 60 degrees to it."""
-    # Between such walls a lead-in catches twice as far across the slot as it is wide.
+    """Return a dovetail tongue and its slot, whose walls are at 60 degrees to the open side."""
+    # Walls at 60 degrees that are offset by w along their normal move by 2 w along y, so that half a chamfer suffices.
     chamfer = 0.5 * CHAMFER
     wide = 3.0 + 5.0 / np.sqrt(3.0)
     tongue = CrossSection([[(-3.0, 0.0), (3.0, 0.0), (wide, 5.0), (-wide, 5.0)]])
-    slot = _grown(tongue, clearance)
+    slot = _offset(tongue, clearance)
     plug = _shaft(tongue, -15.0, 8.0, chamfer) + _prism(_square(14.0, 5.0, 0.0, -2.4), -15.0, 8.0)
     # The slot is open to the side of the plug's plate.
     block = _prism(_square(24.0, 12.0, 0.0, 6.0 + 0.1 + clearance), -19.0, 0.0)
     block -= _prism(slot, -15.0, 0.01)
     block -= Manifold.batch_hull(
-        [_prism(slot, -chamfer, -chamfer + 0.01), _prism(_grown(tongue, clearance + chamfer), 0.0, 0.01)]
+        [_prism(slot, -chamfer, -chamfer + 0.01), _prism(_offset(tongue, clearance + chamfer), 0.0, 0.01)]
     )
     return Part([plug], [block], clearance)
 
 
 def screw(clearance: float = 0.3, pitch: float = 8.0) -> Part:
-    """A shaft with a quarter of a turn of a right-handed thread, which enters its groove in the last half turn."""
+    """Return a shaft with a quarter turn of a right-handed thread, which is in its groove for the last half turn."""
 
-    def ridge(start: float, end: float, grown: float) -> Manifold:
+    def ridge(start: float, end: float, offset: float) -> Manifold:
         angles = np.deg2rad(np.linspace(start, end, round((end - start) / 15.0) + 1))[:, None]
-        r = np.array([4.0, 7.0 + grown, 7.0 + grown, 4.0])
-        z = np.array([-1.2 - grown, -0.5 - grown, 0.5 + grown, 1.2 + grown]) + pitch * angles / (2.0 * np.pi)
+        r = np.array([4.0, 7.0 + offset, 7.0 + offset, 4.0])
+        z = np.array([-1.2 - offset, -0.5 - offset, 0.5 + offset, 1.2 + offset]) + pitch * angles / (2.0 * np.pi)
         vertices = np.stack([r * np.cos(angles), r * np.sin(angles), z], axis=2).reshape(-1, 3)
         a = 4 * np.arange(len(angles) - 1)[:, None] + np.arange(4)
         b = 4 * (a // 4) + (a + 1) % 4
@@ -193,4 +193,4 @@ PARTS: dict[str, Callable[[], Part]] = {
     "snap_fit": snap_fit,
     "dovetail": dovetail,
 }
-"""The six by name."""
+"""Functions that return the parts, by name; `screw` is used separately."""

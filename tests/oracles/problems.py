@@ -1,4 +1,4 @@
-"""Random problems for the primitive, with the data of their dense reference solution."""
+"""Random instances of problem 4.5, with their dense reference solution."""
 
 from dataclasses import dataclass
 
@@ -20,14 +20,14 @@ class Problem:
         return self.primitive.predict(self.step, self.action, self.history)
 
     def dense(self, precision=Extended, *, step=None, horizon=None, actions=None, at=None) -> DenseWindow:
-        """Return the dense window of this problem, or of another step, horizon or actions (J, O) at steps (J,)."""
+        """Return the dense window of this problem; arguments replace its step, horizon, or action by actions (J, O)."""
         p = self.primitive
         n, H = self.step if step is None else step, p.horizon if horizon is None else horizon
         P, N = p.history, p.num_steps
         dt = p.reference.times[1] - p.reference.times[0]
-        held = np.minimum(np.arange(n, n + H + 1), N - 1)
+        indices = np.minimum(np.arange(n, n + H + 1), N - 1)
         inputs = p.reference.times[0] + dt * np.arange(n - P, n + H + 1)
-        means, covariances = p.reference.means[held], p.reference.covariances[held]
+        means, covariances = p.reference.means[indices], p.reference.covariances[indices]
         if P:
             past = p.history_variance * np.broadcast_to(np.eye(p.num_outputs), (P, p.num_outputs, p.num_outputs))
             means, covariances = np.vstack([self.history, means]), np.concatenate([past, covariances])
@@ -49,7 +49,7 @@ def random_problem(
 ) -> Problem:
     """Return a problem with O = 1…6, F = 0…8, H = 5…60, P = 0…15, correlated covariances and active constraints.
 
-    With `box`, some of the rows are pairs of parallel planes, in any order.
+    If `box` is true, some of the rows are pairs of parallel planes, in random order.
     """
     rng = np.random.default_rng(seed)
     outputs, rows, H, P = rng.integers(1, 7), rng.integers(0, 9), rng.integers(5, 61), rng.integers(0, 16)
@@ -62,7 +62,7 @@ def random_problem(
     mix = rng.standard_normal((outputs, outputs)) * 0.4 + np.eye(outputs)
     width = scale * (0.05 + 0.3 * np.sin(np.pi * t[:, None] / t[-1]) ** 2)
     covariances = np.einsum("ni,ij,kj,nk->nik", width, mix, mix, width)
-    # Constraints that the mean violates at some steps, and that a point within a few deviations satisfies.
+    # The mean violates the constraints at some steps; a point within a few standard deviations satisfies them.
     inside = means.mean(axis=0)
     G = rng.standard_normal((rows, outputs)) / scale
     c = G @ inside - rng.uniform(0.1, 0.8, rows)
@@ -90,6 +90,7 @@ def random_problem(
 
 
 def _slabs(seed: int, rows: int, scale: np.ndarray, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows G and bounds c around a point; 70 % of the rows have an opposite row."""
     rng = np.random.default_rng([seed, 1])
     G = rng.standard_normal((rows + 1, len(scale))) / scale
     opposite = rng.uniform(size=rows + 1) < 0.7

@@ -19,10 +19,10 @@ def differences(first: Path, second: Path) -> list[str]:
 
     Tables are compared by cell without wall-clock times, checkpoints by array and value, other files by byte.
     """
-    one, two = _files(first), _files(second)
-    result = [f"{name} exists in one of them only" for name in sorted(one.keys() ^ two.keys())]
-    for name in sorted(one.keys() & two.keys()):
-        if _content(one[name]) != _content(two[name]):
+    files = _files(first), _files(second)
+    result = [f"{name} exists in one folder only" for name in sorted(files[0].keys() ^ files[1].keys())]
+    for name in sorted(files[0].keys() & files[1].keys()):
+        if _content(files[0][name]) != _content(files[1][name]):
             result.append(f"{name} differs")
     return result
 
@@ -37,7 +37,7 @@ def _content(path: Path) -> object:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
         return table.drop(columns=[name for name in CLOCKS if name in table]).to_csv()
     if path.suffix == ".md":
-        return ""  # the same table, with wall-clock times
+        return ""  # repeats the CSV table, with wall-clock times
     if path.name == "state.safetensors":
         return _checkpoint(path)
     return path.read_bytes()
@@ -49,5 +49,5 @@ def _checkpoint(path: Path) -> object:
         values = json.loads(file.metadata()["values"])
     for row in values["rows"]:
         row.pop("wall_time")
-    held = {name: (str(one.dtype), one.shape, np.ascontiguousarray(one).tobytes()) for name, one in arrays.items()}
-    return held, json.dumps(values)
+    contents = {name: (str(x.dtype), x.shape, np.ascontiguousarray(x).tobytes()) for name, x in arrays.items()}
+    return contents, json.dumps(values)

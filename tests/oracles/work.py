@@ -10,7 +10,7 @@ from guiderail.tools.experiments.engines.engine import Outcome
 
 
 def work(job):
-    """Square a number; for a path that does not exist, create it and kill this process."""
+    """Square a number; for a path, report it if it exists, or else create it and kill this process."""
     if isinstance(job, Path):
         if job.exists():
             return Outcome(({"found": str(job)},))
@@ -20,14 +20,14 @@ def work(job):
 
 
 def die(job):
-    """Square an even number; exit the worker for an odd one."""
+    """Square an even number; end the worker process for an odd number."""
     if job % 2:
         os._exit(3)
     return Outcome(({"square": job**2},))
 
 
 def wait(job):
-    """Print the process number and wait forever."""
+    """Print the process id and wait until the process is killed."""
     sys.stdout.write(f"{os.getpid()}\n")
     sys.stdout.flush()
     while True:

@@ -144,7 +144,7 @@ def test_torques_are_clipped_to_the_motor_limits(seed, share):
 
 
 @given(SEEDS)
-def test_rotated_axes_give_the_rotated_law(seed):
+def test_law_in_rotated_axes_equals_the_rotated_law(seed):
     """Stiffness and limits in rotated axes equal the law with all other quantities rotated."""
     rng = np.random.default_rng([seed, 1])
     R = Rotation.random(rng=rng).as_matrix()

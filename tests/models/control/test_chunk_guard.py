@@ -37,7 +37,7 @@ def test_every_step_is_within_the_limits_for_any_chunks(mode):
 
 
 @pytest.mark.parametrize("mode", ["projection", "slowdown"])
-def test_chunk_within_the_limits_is_hardly_changed(mode):
+def test_chunk_within_the_limits_is_reproduced(mode):
     phase = np.minimum(np.arange(1, 31) / 28, 1.0)[:, None]
     smooth = (10 * phase**3 - 15 * phase**4 + 6 * phase**5) * [0.02, -0.01]
     smooth[-3:] = smooth[-1]
@@ -56,7 +56,7 @@ def test_slowdown_preserves_the_path_of_a_fast_chunk():
     assert across(slow.outputs) < across(straight.outputs) + 1e-9
 
 
-def test_guard_is_refused_when_an_argument_is_out_of_range():
+def test_guard_refuses_invalid_arguments():
     wrong = [{"start": np.array([0.06, 0.0])}, {"mode": "brake"}, {"period": 0.0}]
     wrong += [{"tolerance": np.ones(3)}, {"tolerance": np.array([0.0, 1.0])}]
     for argument in wrong:
@@ -94,7 +94,7 @@ def test_first_step_from_a_measured_start_is_within_the_limits(velocity, reach):
             guard.reset_near(wrong)
 
 
-def test_constraint_on_two_outputs_holds_and_couples_only_them():
+def test_constraint_on_two_outputs_does_not_affect_a_third():
     slanted = LinearConstraints([[-1.0, -1.0, 0.0]], [-0.02])  # x + y <= 0.02
     limits = (np.full(3, 0.2), np.full(3, 100.0))
     coupled = ChunkGuard(slanted, *limits, period=PERIOD, start=np.zeros(3))
@@ -105,7 +105,7 @@ def test_constraint_on_two_outputs_holds_and_couples_only_them():
     np.testing.assert_allclose(outputs[:, 2:], alone.guard(np.full((30, 1), 0.03)).outputs, atol=1e-9)
 
 
-def test_guard_starts_again_at_rest_after_a_reset():
+def test_guard_is_at_rest_after_a_reset():
     guard, chunk = make(), np.tile([0.01, -0.02], (STEPS, 1))
     first = guard.guard(chunk, 4).outputs
     assert (guard.guard(chunk, 4).outputs != first).any()

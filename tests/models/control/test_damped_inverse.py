@@ -49,7 +49,7 @@ def test_velocities_are_continuous_where_damping_begins():
     np.testing.assert_allclose(*sides, rtol=1e-5)
 
 
-def test_lost_direction_follows_the_preferred_velocities():
+def test_singular_direction_follows_the_preferred_velocities():
     rng = np.random.default_rng(3)
     J = jacobian(np.array([1.0, 0.9, 0.5, 0.3, 0.2, 0.0]), 6, rng)
     lost = np.linalg.svd(J)[2][-1]

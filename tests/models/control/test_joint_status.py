@@ -66,7 +66,7 @@ NO_NUMBERS += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="dateti
 
 @pytest.mark.parametrize("part", FIELDS)
 @pytest.mark.parametrize("value", NO_NUMBERS, ids=str)
-def test_part_that_is_no_real_numbers_is_malformed(part, value):
+def test_field_of_wrong_type_is_malformed(part, value):
     wrong = replace(status(), **{part: value})
     assert check_status(wrong, LAST, 116.0, LIMITS) == Fault.MALFORMED
     assert parse_status(wrong) is MALFORMED_STATUS
@@ -74,7 +74,7 @@ def test_part_that_is_no_real_numbers_is_malformed(part, value):
 
 @pytest.mark.parametrize("part", ["time", "conflicts", "foreign_commands"])
 @pytest.mark.parametrize("value", ["now", None, 1j, True, [16.0], np.zeros(2), Unreadable()], ids=str)
-def test_scalar_that_is_no_real_number_is_malformed(part, value):
+def test_scalar_of_wrong_type_is_malformed(part, value):
     assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
@@ -85,13 +85,13 @@ def test_counter_that_is_not_finite_is_malformed(part, value):
 
 
 @pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, Unreadable()], ids=str)
-def test_object_that_is_no_status_is_malformed(value):
+def test_object_of_another_type_is_malformed(value):
     assert check_status(value, LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
 @pytest.mark.parametrize("part", FIELDS)
 @pytest.mark.parametrize("value", [0.0, np.zeros((2, 1)), np.zeros((1, 2)), np.zeros((2, 2)), []], ids=np.shape)
-def test_part_of_another_shape_has_a_wrong_size(part, value):
+def test_field_of_wrong_shape_is_a_fault(part, value):
     assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.WRONG_SIZE
 
 
@@ -119,7 +119,7 @@ def test_one_value_that_is_not_finite_is_a_fault(part, value):
 
 
 @pytest.mark.parametrize("time", [np.nan, np.inf])
-def test_first_status_is_compared_with_nothing(time):
+def test_first_status_is_not_compared(time):
     first = replace(LAST, time=time)
     assert check(now=0.0, last=first, positions=(9.0, 9.0), velocities=(9.0, 9.0)) == Fault.NONE
     assert check(now=0.0, last=first, positions=(9.0, np.nan)) == Fault.NOT_FINITE
@@ -163,12 +163,12 @@ def test_jumps_are_checked_at_their_limits(joint, sign):
     assert check(external=moved((3.0, 4.0), 1000.0)) == Fault.NONE
 
 
-def test_position_has_its_own_limit():
+def test_position_is_checked_against_the_position_jump():
     limits = replace(LIMITS, position_jump=4.0)
     assert check_status(status(positions=(3.5, -0.5)), LAST, 116.0 + ELAPSED, limits) == Fault.NONE
 
 
-def test_messages_count_from_zero():
+def test_message_counters_are_zero_by_default():
     assert (status().conflicts, status().foreign_commands, Heartbeat(1, False).sender) == (0, 0, 0)
     assert MAX_SENDERS == 8
 

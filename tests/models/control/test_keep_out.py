@@ -46,7 +46,7 @@ def test_target_inside_a_wall_slides_along_the_nearest_face(keep_out):
     assert blocked
 
 
-def test_motion_passes_the_gap(keep_out):
+def test_motion_through_the_gap_is_not_changed(keep_out):
     safe, blocked = keep_out.project(np.array([0.35, 0.45]), np.array([0.35, 0.65]))
     np.testing.assert_array_equal(safe, [0.35, 0.65])
     assert not blocked
@@ -301,7 +301,7 @@ def test_position_that_is_not_finite_is_refused(wrong):
         ([1.5, 5.0, 11.0], [0.0, 0.0, 1.0], 9.0),
     ],
 )
-def test_half_space_of_a_box_is_outside_the_face_with_most_clearance(position, face, bound):
+def test_half_space_of_a_box_is_at_the_face_of_most_clearance(position, face, bound):
     constraints = LinearConstraints(np.array([[3.0, 4.0, 0.0]]), np.array([-70.0]))
     lower, upper = [[1.0, 2.0, 5.0], [-9.0, -9.0, -9.0]], [[2.0, 4.0, 9.0], [-8.0, -8.0, -8.0]]
     G, c = KeepOut(lower, upper, constraints, 0.25).half_spaces(np.array(position))
@@ -313,19 +313,19 @@ def test_half_space_of_a_box_is_outside_the_face_with_most_clearance(position, f
 
 
 @pytest.mark.parametrize("margin", [-1e-9, np.inf, np.nan])
-def test_margin_is_refused_when_it_is_out_of_range(margin):
+def test_constructor_refuses_a_margin_out_of_range(margin):
     with pytest.raises(InputError, match="margin must be finite and 0 or more"):
         KeepOut([[0.0]], [[1.0]], LinearConstraints.none(1), margin)
 
 
 @pytest.mark.parametrize("upper", [1.0, 0.9995])
-def test_box_without_a_volume_is_refused(upper):
+def test_constructor_refuses_a_box_without_volume(upper):
     with pytest.raises(InputError, match="lower corner below its upper"):
         KeepOut([[0.0, 1.0]], [[2.0, upper]], LinearConstraints.none(2), 0.0)
     KeepOut([[0.0, 1.0]], [[2.0, np.nextafter(1.0, 2.0)]], LinearConstraints.none(2), 0.0)
 
 
-def test_projection_to_one_constraint_is_refined_if_another_is_violated():
+def test_projection_satisfies_a_second_violated_constraint():
     constraints = LinearConstraints(np.array([[-1.0, 0.0], [-2.0, -2.0]]), np.array([-1.0, -2.0]))
     nowhere = np.empty((0, 2))
     keep_out = KeepOut(nowhere, nowhere, constraints, 0.0)
@@ -339,7 +339,7 @@ def test_projection_to_one_constraint_is_refined_if_another_is_violated():
 SQUARE = ([[1.0, 1.0]], [[2.0, 2.0]])
 
 
-def test_constraints_hold_after_a_target_is_moved_out_of_a_box():
+def test_target_moved_out_of_a_box_satisfies_constraints():
     """The nearest face of the box is outside of the constraint y <= 1.9."""
     keep_out = KeepOut(*SQUARE, LinearConstraints.box([-np.inf, -np.inf], [np.inf, 1.9]), 0.0)
     safe, is_blocked = keep_out.project(np.array([0.5, 1.85]), np.array([1.5, 1.9]))
@@ -350,7 +350,7 @@ def test_constraints_hold_after_a_target_is_moved_out_of_a_box():
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize(("start", "target", "expected"), [(4.0, 1.95, 2.25 + 1e-6), (-1.0, 1.05, 0.75 - 1e-6)])
-def test_target_in_a_box_is_moved_to_the_margin_of_its_nearest_face(axis, start, target, expected):
+def test_target_in_a_box_is_moved_to_the_nearest_margin(axis, start, target, expected):
     keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.25)
     begin, desired, reached = ([1.4, 1.4], [1.6, 1.6], [1.6, 1.6])
     begin[axis], desired[axis], reached[axis] = start, target, expected
@@ -361,7 +361,7 @@ def test_target_in_a_box_is_moved_to_the_margin_of_its_nearest_face(axis, start,
 
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("face", [1.0, 2.0])
-def test_motion_along_a_face_is_free(axis, face):
+def test_motion_along_every_face_is_free_without_a_margin(axis, face):
     keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.0)
     start, desired = np.array([0.5, 0.5]), np.array([1.5, 1.5])
     start[axis] = desired[axis] = face
@@ -371,7 +371,7 @@ def test_motion_along_a_face_is_free(axis, face):
 
 
 @pytest.mark.parametrize(("shift", "is_blocked"), [(-4e-4, True), (0.0, False), (4e-4, False)])
-def test_motion_past_a_corner_is_blocked_only_if_it_cuts_the_corner(shift, is_blocked):
+def test_motion_is_blocked_when_the_path_cuts_a_corner(shift, is_blocked):
     keep_out = KeepOut(*SQUARE, LinearConstraints.none(2), 0.0)
     start = np.array([0.0, 1.0 + shift])
     desired = start + 2.0  # passes the corner (1, 2)

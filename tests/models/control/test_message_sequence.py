@@ -90,7 +90,7 @@ def test_short_intervals_far_apart_do_not_conflict(distance, is_conflict):
     assert conflicts(*(status(t, 0.0) for t in times)) == is_conflict
 
 
-def test_second_robot_conflicts_while_this_one_moves():
+def test_statuses_of_a_second_robot_at_rest_conflict():
     speed, sequence = 0.4, StatusSequence(PERIOD)
     for step in range(4):
         time = step * PERIOD
@@ -141,24 +141,24 @@ def test_time_stamps_that_return_conflict(offset):
 
 
 @pytest.mark.parametrize(("late", "is_conflict"), [(1.0, True), (1.0001, False), (-1.0, True), (-1.0001, False)])
-def test_return_is_to_a_clock_that_has_continued(late, is_conflict):
+def test_return_to_an_earlier_clock_conflicts_within_the_delay(late, is_conflict):
     elapsed = 0.25
     assert count([100.0, 3.0, 100.0 + elapsed + late * REACH], [0.0, 0.01, elapsed]) == is_conflict
 
 
 @pytest.mark.parametrize(("elapsed", "is_conflict"), [(1.0, True), (1.0 + 1e-9, False)])
-def test_return_is_attributed_for_a_while(elapsed, is_conflict):
+def test_return_to_an_earlier_clock_conflicts_for_a_second(elapsed, is_conflict):
     assert count([100.0, 3.0, 100.0 + elapsed], [0.0, 0.01, elapsed]) == is_conflict
     assert module.RETURN_TIME == 1.0
 
 
 @pytest.mark.parametrize(("jump", "is_conflict"), [(REACH, False), (REACH + 2.0**-20, True)])
-def test_jump_is_longer_than_the_delay_of_a_message(jump, is_conflict):
+def test_jump_of_the_clock_exceeds_the_delay_of_a_message(jump, is_conflict):
     assert count([1.0, 1.0 - jump, 1.0 + REACH], [0.0, 0.0, REACH]) == is_conflict
 
 
 @pytest.mark.parametrize(("gap", "is_conflict"), [(0.1, True), (0.1 + 1e-9, False)])
-def test_equal_time_stamps_conflict_when_they_recur(gap, is_conflict):
+def test_equal_time_stamps_conflict_when_repeated_within_0_1_s(gap, is_conflict):
     assert count([1.0, 1.0], [0.0, 0.0]) == 0
     assert count([1.0, 1.0, 1.005, 1.005], [0.0, 0.0, gap, gap]) == is_conflict
     assert module.EQUAL_TIME == 0.1
@@ -185,12 +185,12 @@ def test_rate_allows_a_burst(number, is_conflict):
 
 
 @pytest.mark.parametrize(("periods", "is_conflict"), [(0.999 / 1.2, True), (1.001 / 1.2, False)])
-def test_rate_allows_one_more_command_when_the_level_has_fallen_by_one(periods, is_conflict):
+def test_rate_allows_a_command_when_the_level_falls_by_one(periods, is_conflict):
     times = 1.0 + 1e-3 * np.arange(9)
     assert count(times, [*np.zeros(8), periods * PERIOD]) == is_conflict
 
 
-def test_level_falls_when_one_program_is_left():
+def test_level_falls_when_one_of_two_programs_stops():
     sequence = CommandSequence(PERIOD)
     for n in range(100):
         sequence.add(TORQUE + n, 0.5 * n * PERIOD, 0.5 * n * PERIOD)

@@ -33,7 +33,7 @@ def test_no_command_and_no_path_enters_a_spherical_obstacle():
 
 
 @pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
-def test_every_constraint_holds_for_any_desired_command(limits):
+def test_constraints_are_satisfied_for_any_desired_command(limits):
     motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
     law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
     state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
@@ -58,7 +58,7 @@ def test_every_constraint_holds_for_any_desired_command(limits):
 
 
 @pytest.mark.parametrize("size", [1e8, 1e20, 1e150, 1e300])
-def test_every_constraint_holds_for_a_huge_desired_command(size):
+def test_constraints_are_satisfied_for_huge_desired_commands(size):
     motion = MotionConstraints(LinearConstraints.none(2), OUTSIDE, INSIDE, SPEED, ACCELERATION)
     law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
     state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
@@ -70,7 +70,7 @@ def test_every_constraint_holds_for_a_huge_desired_command(size):
         assert (np.abs(state[2:] - last[2:]) <= ACCELERATION * PERIOD**2 * (1 + 1e-6)).all()
 
 
-def test_allowed_command_is_unchanged_and_another_one_is_nearest():
+def test_command_is_projected_when_constraints_are_violated():
     law = MotionConstraintFilter(MotionConstraints(LINEAR, OUTSIDE), PERIOD)
     state = law.start(np.array([0.3, 0.3]))
     allowed = np.array([0.41, 0.31])
@@ -102,7 +102,7 @@ def test_command_that_is_not_finite_brakes(desired):
     assert speeds[-1] == 0.0
 
 
-def test_only_braking_is_left_when_a_wall_is_as_near_as_braking_takes():
+def test_filter_brakes_when_the_wall_is_at_braking_distance():
     motion = MotionConstraints(LinearConstraints.box([0.0, 0.0], [0.6, 1.0]), (), (), SPEED, ACCELERATION)
     law = MotionConstraintFilter(motion, PERIOD)
     displacement, change = 0.005, PERIOD**2 * 2.0
@@ -120,7 +120,7 @@ def test_only_braking_is_left_when_a_wall_is_as_near_as_braking_takes():
 
 @pytest.mark.parametrize("dims", [1, 2, 3, 6])
 @pytest.mark.parametrize("kind", ["linear", "outside", "inside", "state"])
-def test_start_that_is_too_fast_to_brake_exceeds_only_the_acceleration(dims, kind):
+def test_start_too_fast_to_brake_exceeds_only_acceleration(dims, kind):
     """One output moves at 1 m/s and is 5 cm before its limit; at 2 m/s², it brakes within 25 cm."""
     limit = LinearConstraints(-np.eye(dims)[:1], np.array([-0.05]))
     shapes = {"outside": [Sphere(np.eye(dims)[0] * 0.15, 0.1)], "inside": [Sphere(np.zeros(dims), 0.05)]}
@@ -142,7 +142,7 @@ def test_start_that_is_too_fast_to_brake_exceeds_only_the_acceleration(dims, kin
     assert beyond == 0.02 if kind == "outside" else beyond < 2.0 * PERIOD**2
 
 
-def test_start_outside_that_would_cross_the_inside_stops():
+def test_start_that_would_cross_the_allowed_region_stops():
     law = MotionConstraintFilter(
         MotionConstraints(LinearConstraints.none(1), inside=[Sphere([0.0], 0.01)], max_acceleration=[2.0]), PERIOD
     )
@@ -150,7 +150,7 @@ def test_start_outside_that_would_cross_the_inside_stops():
         assert (law.start(np.array([-0.02]), np.array([speed]))[1] == speed) == is_kept
 
 
-def test_room_without_a_width_leaves_motion_along_it():
+def test_motion_along_a_gap_without_width_is_possible():
     """Constraints do not contradict each other at the last command, so that a next command exists."""
     walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
     law = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(2), walls), PERIOD)
@@ -161,7 +161,7 @@ def test_room_without_a_width_leaves_motion_along_it():
 
 @pytest.mark.parametrize("start", [[0.52, 0.31], [0.2, 0.55], [0.7, 0.3], [-0.3, 0.5]])
 @pytest.mark.parametrize("limits", [(None, None), (SPEED, None), (SPEED, ACCELERATION)])
-def test_start_outside_the_constraints_is_led_inside(start, limits):
+def test_start_outside_the_constraints_converges_inside(start, limits):
     motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
     law = MotionConstraintFilter(motion, PERIOD)
     state, violations = law.start(np.array(start)), [motion.violation(np.array(start))]
@@ -233,7 +233,7 @@ class AngleLimit:
         ([0.0, 0.0], (-0.1, -0.2, -0.1), -0.025),
     ],
 )
-def test_violations_of_lengths_and_angles_are_apart(output, expected, largest):
+def test_lengths_and_angles_have_separate_violations(output, expected, largest):
     """The largest of them counts an angle as its arc at 0.25 m."""
     linear = LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-0.1]))
     constraints = MotionConstraints(linear, inside=[Sphere([0.0], 0.2)], state=[AngleLimit()])
@@ -280,7 +280,7 @@ def test_limits_are_positive_and_finite(bad):
         MotionLimits((1.0, bad, 1.0), (1.0, 1.0, 1.0))
 
 
-def test_angular_acceleration_must_exceed_that_of_the_rotation_vector():
+def test_limits_refuse_a_too_small_angular_acceleration():
     with pytest.raises(InputError, match="more acceleration"):
         MotionLimits((1.0, 1.0, 1.0), (2.0, 2.0, 100.0))
     assert MotionLimits((1.0, 1.0, 1.0), (2.0, 2.1, 100.0)).rotation_vector_limits()[1] == pytest.approx(0.1)

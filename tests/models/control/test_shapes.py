@@ -32,7 +32,7 @@ def expected_distance(shape, p):
 
 
 @EACH
-def test_distance_is_that_of_the_nearest_point_of_the_shape(shape):
+def test_distance_equals_the_distance_to_the_nearest_point(shape):
     for p in points(shape):
         expected = expected_distance(shape, p)
         if expected > 0.0:
@@ -65,7 +65,7 @@ def test_linearization_error_of_a_sphere_has_its_bound():
 
 
 @EACH
-def test_half_space_contains_a_point_outside_and_no_point_of_the_shape(shape):
+def test_half_space_separates_a_point_from_the_shape(shape):
     within = [y for y in points(shape, 2000, 1) if shape.distance(y) <= 0.0]
     for p in points(shape, 100):
         n, c = shape.half_space(p)
@@ -74,7 +74,7 @@ def test_half_space_contains_a_point_outside_and_no_point_of_the_shape(shape):
 
 
 @EACH
-def test_separate_contains_a_line_that_is_outside(shape):
+def test_separating_half_space_contains_a_line_outside(shape):
     lines, bisected = 0, 0
     for p, q in zip(points(shape, 400), points(shape, 400, 1), strict=True):
         if min(shape.distance(p + t * (q - p)) for t in np.linspace(0.0, 1.0, 21)) < 0.03:
@@ -89,7 +89,7 @@ def test_separate_contains_a_line_that_is_outside(shape):
     assert bisected > 0 or isinstance(shape, Box)
 
 
-def test_normals_at_the_middle_are_unit_vectors():
+def test_normals_at_the_center_are_unit_vectors():
     assert Sphere([0.0, 0.0], 0.1).surface(np.zeros(2))[0] == -0.1
     cylinder = Cylinder([0.0, 0.0, -1.0], [0.0, 0.0, 1.0], 0.1)
     distance, normal = cylinder.surface(np.zeros(3))
@@ -102,7 +102,7 @@ def path(steps=60):
     return np.column_stack([t, 0.3 * np.sin(3.0 * t)])
 
 
-def test_linearized_constraints_hold_the_lines_between_commands_outside():
+def test_lines_between_linearized_commands_are_outside():
     disc = Sphere([0.5, 0.35], 0.12)
     constraints = linearize([disc], path(), LinearConstraints.box([-1.0, -1.0], [2.0, 1.0]))
     assert constraints.num_steps == 60
@@ -117,7 +117,7 @@ def test_linearized_constraints_hold_the_lines_between_commands_outside():
     assert 0.5 * CLEARANCE < nearest < 100 * CLEARANCE
 
 
-def test_linearized_constraints_without_shapes_are_the_given_ones():
+def test_linearize_returns_the_constraints_without_shapes():
     assert linearize([], path()).num_constraints == 0
     box = LinearConstraints.box([-1.0, -1.0], [2.0, 1.0])
     np.testing.assert_array_equal(linearize([], path(), box).c[7], box.c)

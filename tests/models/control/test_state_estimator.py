@@ -102,12 +102,12 @@ def test_fault_is_reported_during_the_settling_time():
 
 
 @pytest.mark.parametrize(("late", "fault"), [(0.0, Fault.NO_STATUS), (1e-6, Fault.DEADLINE_MISSED)])
-def test_first_check_is_due_at_time_zero(late, fault):
+def test_first_check_is_late_after_the_maximum_interval(late, fault):
     rig = Rig()
     assert rig.check(gap=LIMITS.max_check_interval + late) == fault
 
 
-def test_settling_time_is_exact():
+def test_settling_time_is_exact_within_a_period():
     rig = Rig()
     while rig.check() == Fault.NO_STATUS:
         pass
@@ -337,7 +337,7 @@ def test_clocks_are_synchronized_again_after_a_restart():
     assert rig.estimate.is_new
 
 
-def test_velocity_is_unknown_when_the_robot_restarts_after_a_timeout():
+def test_velocity_is_unknown_when_a_robot_restarts_after_timeout():
     rig = Rig().settle()
     last = rig.status()
     rig.detected(lambda status: last)
@@ -386,7 +386,7 @@ def test_lost_statuses_are_no_fault():
             assert rig.check(JointStatus(last.last_time, *np.split(last.last_values, 3))) == Fault.NONE
 
 
-def test_delay_of_the_station_is_no_fault_of_the_robot():
+def test_status_is_accepted_after_a_delay_of_the_station():
     rig = Rig(velocity=np.zeros(2)).settle()
     rig.step += 5
     assert rig.check(gap=6 * PERIOD) == Fault.NONE
@@ -454,7 +454,7 @@ def test_values_of_a_slow_joint_may_be_equal(field, speed, is_fault):
 
 @pytest.mark.parametrize(("share", "is_fault"), [(0.99, False), (1.01, True)])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_velocity_frozen_near_zero_is_a_fault_when_the_position_moves(share, is_fault, sign):
+def test_frozen_velocity_is_a_fault_when_the_position_moves(share, is_fault, sign):
     """Each of the two positions has an error of up to the resolution."""
     moved_in_a_period = module.MIN_SPEED * PERIOD + 2.0 * module.RESOLUTION
     slow = sign * share * moved_in_a_period / PERIOD
@@ -560,7 +560,7 @@ def test_residual_decays():
 
 
 @pytest.mark.parametrize(("bias", "is_fault"), [(0.0095, False), (0.0125, True)])
-def test_velocity_bias_is_detected_above_the_tolerance_over_the_window(bias, is_fault):
+def test_velocity_bias_is_detected_above_its_tolerance(bias, is_fault):
     """A bias b adds up to b T = 1e-3 rad at b = 0.01 rad/s."""
     rig = Rig().settle()
     result = rig.detected(shifted(velocities=[0.0, bias]), 400)
@@ -608,7 +608,7 @@ def test_velocity_is_restored_when_a_second_robot_is_detected(number):
 @pytest.mark.parametrize(
     ("name", "fault"), [("conflicts", Fault.CONFLICT), ("foreign_commands", Fault.SECOND_COMMANDER)]
 )
-def test_one_more_contradiction_is_a_fault_after_many(name, fault):
+def test_increase_of_a_large_counter_is_a_fault(name, fault):
     rig = Rig().settle()
     rig.state = replace(rig.state, **{name: 2000.0})
     assert rig.check(lambda true: replace(true, **{name: 2000})) == Fault.NONE
@@ -791,7 +791,7 @@ def test_accepted_velocity_is_limited_to_the_other_sources():
     np.testing.assert_allclose(other.accepted[2:4], true + [0.019, -0.019], atol=1e-6)
 
 
-def test_external_torque_of_the_prediction_follows_at_a_limited_rate():
+def test_predicted_external_torque_has_a_limited_rate():
     rig = Rig().settle()
     np.testing.assert_allclose(rig.state.external, EXTERNAL)
     rig.check(shifted(external_torque=[50.0, -50.0]))
@@ -905,7 +905,7 @@ def stop(rig, change, steps=50):
 
 @pytest.mark.parametrize("signal", SIGNALS)
 @pytest.mark.parametrize("seed", range(8))
-def test_no_single_wrong_signal_adds_energy_to_a_stop(signal, seed):
+def test_one_falsified_signal_adds_no_energy_to_a_stop(signal, seed):
     rng = np.random.default_rng(seed)
     rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
     before = 0.5 * rig.v @ M @ rig.v
@@ -916,7 +916,7 @@ def test_no_single_wrong_signal_adds_energy_to_a_stop(signal, seed):
 
 @pytest.mark.parametrize("fields", [("velocities",), ("positions",), ("positions", "velocities", "external_torque")])
 @pytest.mark.parametrize("seed", range(8))
-def test_no_frozen_signal_adds_energy_to_a_stop(fields, seed):
+def test_frozen_signals_add_no_energy_to_a_stop(fields, seed):
     rng = np.random.default_rng(seed)
     rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
     before, frozen_status = 0.5 * rig.v @ M @ rig.v, rig.status()
@@ -927,7 +927,7 @@ def test_no_frozen_signal_adds_energy_to_a_stop(fields, seed):
 
 @pytest.mark.parametrize("delay", [5, 13, 25])
 @pytest.mark.parametrize("seed", range(8))
-def test_no_old_values_add_energy_to_a_stop(delay, seed):
+def test_delayed_values_add_no_energy_to_a_stop(delay, seed):
     """All values are delayed but have current time stamps; damping with a delayed velocity could accelerate the arm."""
     rng = np.random.default_rng(seed)
     rig = Rig(velocity=rng.uniform(-1.0, 1.0, 2), external=np.zeros(2)).settle()
@@ -1078,7 +1078,7 @@ def test_age_is_infinite_before_the_first_status():
     assert rig.estimate.age == np.inf
 
 
-def test_first_status_has_no_age():
+def test_age_of_the_first_status_is_zero():
     """Before the clocks are synchronized, a difference between them is no age."""
     rig = Rig()
     rig.now = 5.0 + CLOCK
@@ -1113,6 +1113,6 @@ RECORDED = {
 
 
 @pytest.mark.parametrize("seed", RECORDED)
-def test_estimator_repeats_recorded_states(seed):
+def test_estimator_reproduces_recorded_states(seed):
     """The numbers were recorded from this estimator; a difference is a change of its behavior."""
     np.testing.assert_allclose(recorded(seed), RECORDED[seed], rtol=0.0, atol=1e-8)

@@ -30,7 +30,7 @@ def is_inside(wrench, bound=BOUND, tolerance=1e-9):
     return within_axes and force <= bound.force + tolerance and torque <= bound.torque + tolerance
 
 
-def test_wrench_is_inside_bound_for_every_spring_damper_and_speed():
+def test_wrench_is_inside_the_bound_for_any_input():
     rng = np.random.default_rng(0)
     for _ in range(3000):
         spring, damping, velocity = (10.0 ** rng.uniform(-2, 3) * rng.normal(size=size) for size in (6, 6, 3))
@@ -43,7 +43,7 @@ def test_law_is_spring_and_damper_while_both_are_small():
     np.testing.assert_allclose(bounded_wrench(spring, damping, velocity, MASS, BOUND), spring - damping, atol=1e-12)
 
 
-def test_damping_share_is_the_largest_inside():
+def test_damping_share_is_the_largest_inside_the_bound():
     rng = np.random.default_rng(1)
     shares = []
     for _ in range(500):
@@ -85,7 +85,7 @@ def test_impact_stays_inside_the_bound(axis, mass):
     assert free[0] == AXES[0]  # without a contact stiffness nothing limits the speed
 
 
-def test_no_environment_gains_energy_at_a_fixed_reference():
+def test_closed_paths_gain_no_energy_at_a_fixed_reference():
     """An adversary moves the tool along random closed paths; the bound is per axis, as `Impedance` makes it."""
     rng = np.random.default_rng(2)
     bound = WrenchBound(AXES, float(np.linalg.norm(AXES[:3])), 10.0, 2.5e4)
@@ -101,7 +101,7 @@ def test_no_environment_gains_energy_at_a_fixed_reference():
         assert gained <= 1e-5
 
 
-def test_lowering_a_bound_never_raises_it():
+def test_lowered_bound_is_never_above_the_original():
     lower = BOUND.lowered_to(np.array([20.0, 5.0, np.nan, -1.0, 1.0, np.inf, 8.0, 0.5]))
     np.testing.assert_array_equal(lower.numbers, [9.0, 5.0, 0.0, 0.0, 1.0, 3.0, 8.0, 0.5])
     assert lower.contact_stiffness == BOUND.contact_stiffness
@@ -109,13 +109,13 @@ def test_lowering_a_bound_never_raises_it():
 
 
 @pytest.mark.parametrize("numbers", [np.ones(6), np.ones(9), 1.0])
-def test_bound_is_lowered_to_eight_numbers_only(numbers):
+def test_lowered_to_refuses_other_than_eight_numbers(numbers):
     with pytest.raises(InputError, match="max_wrench must be 8 numbers, not"):
         BOUND.lowered_to(numbers)
 
 
 @pytest.mark.parametrize("wrong", [np.inf, np.nan])
-def test_bound_that_is_not_finite_is_not_approached(wrong):
+def test_approach_refuses_bounds_that_are_not_finite(wrong):
     finite, infinite = np.ones(8), np.r_[np.ones(7), wrong]
     for bounds in ((infinite, infinite), (finite, infinite), (infinite, finite)):
         with pytest.raises(InputError, match="the bounds of an approach must be finite"):
@@ -161,7 +161,7 @@ def test_force_is_the_gradient_of_the_energy():
         np.testing.assert_allclose(gradient, np.clip(STIFFNESS * error, -SPRING_LIMITS, SPRING_LIMITS), atol=1e-5)
 
 
-def test_change_stores_no_more_than_the_energy():
+def test_change_stores_no_more_than_the_available_energy():
     rng = np.random.default_rng(1)
     shares = []
     for _ in range(300):

@@ -22,7 +22,7 @@ def test_primitive_refuses_constraints_in_millimeters():
         primitive(LinearConstraints.box(*(1e3 * BOUNDS)))
 
 
-def test_primitive_refuses_constraints_in_millimeters_at_one_step():
+def test_primitive_refuses_millimeters_at_one_step():
     lower, upper = (np.tile(bound, (STEPS, 1)) for bound in BOUNDS)
     lower[7, 0], upper[7, 0] = 250.0, 450.0
     with pytest.raises(InputError, match="outside of constraint 0 at step 7"):
@@ -35,5 +35,5 @@ def test_primitive_accepts_constraints_in_its_own_unit(scale):
     primitive(LinearConstraints.box([5.0 * scale, -np.inf], [np.inf, np.inf]), scale)  # the reference is outside
 
 
-def test_primitive_at_rest_accepts_a_constraint_that_excludes_it():
+def test_constraint_may_exclude_a_constant_reference():
     primitive(LinearConstraints.box([500.0, -np.inf], [np.inf, np.inf]), means=np.full((STEPS, 2), 0.35))

@@ -1,4 +1,4 @@
-"""Explicit features of kernels, compared with their matrices in higher precision."""
+"""Explicit features of kernels, compared with kernel matrices in higher precision."""
 
 import mpmath
 import numpy as np
@@ -12,16 +12,16 @@ from guiderail.models.primitives.features import KernelBasis, window_features
 KERNELS = [SquaredExponential(0.5), SquaredExponential(0.1), Matern52(0.4)]
 
 
-def conditioned(kernel, past, future, noise):
-    """Compute K_fp (K_pp + ρI)⁻¹ and K_ff − K_fp (K_pp + ρI)⁻¹ K_pf with fifty digits."""
+def conditional_kernel(kernel, past, future, noise):
+    """Compute K_fp (K_pp + ρI)⁻¹ and K_ff − K_fp (K_pp + ρI)⁻¹ K_pf with fifty decimal digits."""
     K = kernel(*(np.r_[past, future].astype(np.longdouble),) * 2)
     P = len(past)
     with mpmath.workdps(50):
         exact = mpmath.matrix([[mpmath.mpf(np.format_float_scientific(x, 20)) for x in row] for row in K])
         Kpp = exact[:P, :P] + mpmath.mpf(noise) * mpmath.eye(P)
         W = exact[P:, :P] * Kpp**-1
-        left = exact[P:, P:] - W * exact[:P, P:]
-        return np.array(W.tolist(), dtype=float), np.array(left.tolist(), dtype=float)
+        residual_kernel = exact[P:, P:] - W * exact[:P, P:]
+        return np.array(W.tolist(), dtype=float), np.array(residual_kernel.tolist(), dtype=float)
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=repr)
@@ -29,9 +29,9 @@ def conditioned(kernel, past, future, noise):
 def test_features_equal_the_kernel_given_the_history(kernel, noise):
     past, future = 0.02 * np.arange(-6, 0), 0.02 * np.arange(9)
     features = window_features(kernel, past, future, noise)
-    W, left = conditioned(kernel, past, future, noise)
+    W, residual_kernel = conditional_kernel(kernel, past, future, noise)
     np.testing.assert_allclose(features.history_map, W, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(features.features @ features.features.T, left, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(features.features @ features.features.T, residual_kernel, rtol=0, atol=1e-13)
     assert features.features.shape[1] <= 9
 
 
@@ -54,29 +54,29 @@ def test_number_of_features_is_the_rank_of_the_kernel():
 def test_basis_represents_its_inputs_and_returns_the_residual(seed, dimensions):
     rng = np.random.default_rng(seed)
     kernel = SquaredExponential(np.sqrt(0.5 / rng.uniform(0.1, 5)))
-    inputs, elsewhere = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
+    inputs, other_inputs = rng.uniform(-1, 1, (15, dimensions)), rng.uniform(-3, 3, (7, dimensions))
     basis = KernelBasis(kernel, inputs)
     F = basis.features(inputs)
     assert F.shape == (15, basis.size)
     np.testing.assert_allclose(F @ F.T, kernel(inputs, inputs), rtol=0, atol=1e-13)
     assert np.abs(basis.residual(inputs, F)).max() < 1e-13
 
-    # At other inputs: the part of the kernel that the given inputs explain, and the rest of its diagonal.
-    G = basis.features(elsewhere)
-    np.testing.assert_allclose(G @ F.T, kernel(elsewhere, inputs), rtol=0, atol=1e-6)
-    residual = basis.residual(elsewhere, G)
+    # At other inputs, the features explain the kernel with the basis inputs; the residual is the rest of the diagonal.
+    G = basis.features(other_inputs)
+    np.testing.assert_allclose(G @ F.T, kernel(other_inputs, inputs), rtol=0, atol=1e-6)
+    residual = basis.residual(other_inputs, G)
     np.testing.assert_allclose(residual, 1 - (G**2).sum(axis=1), rtol=0, atol=1e-14)
     assert (residual >= -1e-13).all()
 
     before = basis.size
     assert not basis.extend(inputs[:5])
     assert basis.size == before
-    grew = basis.extend(elsewhere)
-    assert grew == (basis.size > before)
-    everything = np.vstack([inputs, elsewhere])
+    is_extended = basis.extend(other_inputs)
+    assert is_extended == (basis.size > before)
+    everything = np.vstack([inputs, other_inputs])
     H = basis.features(everything)
     np.testing.assert_allclose(H @ H.T, kernel(everything, everything), rtol=0, atol=1e-13)
-    # The old features are unchanged; only new ones were added.
+    # The first features are unchanged by the extension.
     np.testing.assert_allclose(H[:15, :before], F, rtol=0, atol=1e-9)
 
 

@@ -7,36 +7,29 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share, fit, motion_without_actions, share_within_spread
 from guiderail.models.primitives.mixture import information_criteria
-from oracles.handwriting import LETTERS, correlated, write
-
-
-def share_within_deviation(demonstrations, motion):
-    """Compute the share of steps with all outputs within one standard deviation of the demonstrations' mean."""
-    outputs = np.stack(demonstrations.outputs)
-    return float((np.abs(motion - outputs.mean(axis=0)) <= outputs.std(axis=0, ddof=1)).all(axis=1).mean())
-
+from oracles.handwriting import LETTERS, make_correlated, share_within_deviation, write_letter
 
 # The unit and the origin of the coordinates must not affect the fit.
 PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 
-# `letters.py` in this folder records the selection for longer letters.
+# `letters.py` in this folder prints the selection for letters with more demonstrations and steps.
 @pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
 def test_fitted_letter_stays_within_the_demonstrations(letter, page):
-    selection = fit(write(letter, count=4, steps=60, **page))
+    selection = fit(write_letter(letter, count=4, steps=60, **page))
     assert selection.is_within_spread
     assert selection.share == share_within_spread(selection.primitive()) >= MIN_SHARE
     assert f"{selection.components} components have the least information criterion" in selection.why
 
 
 def test_fitted_letter_with_corners_stays_within_the_deviation():
-    shown = write("B", count=5, steps=100)
-    assert share_within_deviation(shown, motion_without_actions(fit(shown).primitive())) >= MIN_SHARE
+    letter = write_letter("B", count=5, steps=100)
+    assert share_within_deviation(letter, motion_without_actions(fit(letter).primitive())) >= MIN_SHARE
 
 
 @pytest.fixture(scope="module")
 def demonstrations():
-    return correlated(count=4, steps=80)
+    return make_correlated(count=4, steps=80)
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +38,10 @@ def selection(demonstrations):
 
 
 def test_fit_reproduces_correlated_outputs(demonstrations, selection):
-    """At a correlation of 0.98, the standard deviation across the main direction is a seventh of that along it."""
+    """At a correlation of 0.98, the deviation across the main direction is a twelfth of that along it."""
     outputs = np.stack(demonstrations.outputs)
-    apart = outputs - outputs.mean(axis=0)
-    assert np.corrcoef(apart.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
+    deviations = outputs - outputs.mean(axis=0)
+    assert np.corrcoef(deviations.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
     assert selection.is_within_spread
     assert share_within_deviation(demonstrations, motion_without_actions(selection.primitive())) >= MIN_SHARE
 
@@ -59,9 +52,9 @@ def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
     )
     assert chosen.worse <= 1
     assert chosen.share >= MIN_SHARE
-    for other in selection.candidates:
-        if other.worse <= 1 and other.share >= MIN_SHARE:
-            assert (-other.lambda_, -other.length_scale) >= (-chosen.lambda_, -chosen.length_scale)
+    for candidate in selection.candidates:
+        if candidate.worse <= 1 and candidate.share >= MIN_SHARE:
+            assert (-candidate.lambda_, -candidate.length_scale) >= (-chosen.lambda_, -chosen.length_scale)
     assert min(c.worse for c in selection.candidates) == 0
     assert selection.beta == selection.lambda_
     assert selection.components == min(selection.criteria, key=lambda count: selection.criteria[count])
@@ -87,7 +80,7 @@ def test_unit_of_time_scales_only_the_length_scale(demonstrations, selection):
     assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
 
 
-def test_selection_passes_arguments_on_to_the_primitive(selection):
+def test_selection_accepts_arguments_of_the_primitive(selection):
     primitive = selection.primitive(history=3, history_variance=1e-5, lambda_=7.0)
     assert (primitive.history, primitive.lambda_, primitive.beta) == (3, 7.0, selection.beta)
     assert primitive.reference is selection.reference
@@ -115,23 +108,23 @@ def test_share_is_low_when_a_primitive_leaves_the_spread():
 
 
 def test_share_considers_correlations():
-    """A tenth of a deviation is far outside across two outputs with a correlation of 0.99, and inside along them."""
+    """With variances of 0.01 and a correlation of 0.99, one standard deviation is 0.141 along (1, 1), 0.01 across."""
     t = np.linspace(0, 1, 20)
     covariance = 0.01 * np.array([[1.0, 0.99], [0.99, 1.0]])
 
-    class Still(LcNsKmp):
+    class OffsetMotion(LcNsKmp):
         def predict(self, step, null_space_action=None, history=None):
             prediction = super().predict(step, null_space_action, history)
-            prediction.output = self.reference.means[step] + self.off
+            prediction.output = self.reference.means[step] + self.offset
             return prediction
 
-    primitive = Still(ReferenceTrajectory(t, np.zeros((20, 2)), np.tile(covariance, (20, 1, 1))))
-    for off, share in (((0.05, 0.05), 1.0), ((0.011, -0.011), 0.0), ((0.0995, 0.0995), 1.0), ((0.102, 0.102), 0.0)):
-        primitive.off = np.array(off)
+    primitive = OffsetMotion(ReferenceTrajectory(t, np.zeros((20, 2)), np.tile(covariance, (20, 1, 1))))
+    for offset, share in (((0.05, 0.05), 1.0), ((0.011, -0.011), 0.0), ((0.0995, 0.0995), 1.0), ((0.102, 0.102), 0.0)):
+        primitive.offset = np.array(offset)
         assert share_within_spread(primitive) == share
 
 
-def test_motion_with_a_history_follows_its_own_commands():
+def test_motion_uses_earlier_commands_as_history():
     reference = hook()
     primitive = LcNsKmp(reference, history=2, history_variance=1e-4)
     past = np.tile(reference.means[0], (2, 1))
@@ -150,13 +143,13 @@ def test_information_criteria_stop_when_not_improving():
     assert not {8, 16} & set(result)
 
 
-def test_fit_refuses_too_few_demonstrations():
+def test_fit_refuses_too_few_data_and_invalid_horizons():
     t = np.linspace(0, 1, 50)
     with pytest.raises(InputError, match="at least three"):
         fit(Demonstrations(t, [np.sin(t)[:, None], np.cos(t)[:, None]]))
-    for wrong in (-1, 2.5, np.nan, np.inf):
+    for horizon in (-1, 2.5, np.nan, np.inf):
         with pytest.raises(InputError, match="the horizon must be a whole number of steps"):
-            fit(correlated(count=4, steps=80), horizon=wrong)
+            fit(make_correlated(count=4, steps=80), horizon=horizon)
     with pytest.raises(InputError, match="at least 12 steps"):
         fit(Demonstrations(t[:5], [t[:5, None], 2 * t[:5, None], 3 * t[:5, None]]))
 

@@ -16,18 +16,19 @@ def primitive(request):
 
 
 def rollout(primitive, actions):
-    """Run the closed loop step by step, as on a robot."""
+    """Return the commands (N, O) of a closed loop, in which earlier commands are the history."""
     past = np.tile(primitive.reference.means[0], (primitive.history, 1))
-    out = []
+    outputs = []
     for n, action in enumerate(actions):
-        out.append(primitive.predict(n, action, past if primitive.history else None).output)
-        past = np.vstack([past, out[-1]])[1:] if primitive.history else past
-    return np.array(out)
+        outputs.append(primitive.predict(n, action, past if primitive.history else None).output)
+        past = np.vstack([past, outputs[-1]])[1:] if primitive.history else past
+    return np.array(outputs)
 
 
 def deviation_rms(primitive, actions):
-    moved = rollout(primitive, actions) - rollout(primitive, np.zeros_like(actions))
-    return np.sqrt((moved**2).mean(axis=0)) / np.sqrt((primitive.reference.standard_deviations**2).mean(axis=0))
+    """Return the RMS (O,) of the displacement by actions, relative to the RMS standard deviation of the reference."""
+    displacements = rollout(primitive, actions) - rollout(primitive, np.zeros_like(actions))
+    return np.sqrt((displacements**2).mean(axis=0)) / np.sqrt((primitive.reference.standard_deviations**2).mean(axis=0))
 
 
 def test_constant_actions_reach_the_authority(primitive):
@@ -75,13 +76,13 @@ def test_gains_refuse_invalid_arguments(primitive):
             residual_gains(primitive.reference, 1.0, groups)
     with pytest.raises(InputError, match="action_scale"):
         residual_gains(primitive.reference, -1.0)
-    for wrong in (0, 1.5, np.nan, np.inf):
+    for action_repeat in (0, 1.5, np.nan, np.inf):
         with pytest.raises(InputError, match="action_repeat"):
-            rms_gains(primitive, action_repeat=wrong)
+            rms_gains(primitive, action_repeat=action_repeat)
     np.testing.assert_array_equal(rms_gains(primitive, action_repeat=2.0), rms_gains(primitive, action_repeat=2))
-    deaf = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
+    without_null_space = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
     with pytest.raises(InputError, match="beta"):
-        authority_gains(deaf)
+        authority_gains(without_null_space)
 
 
 def test_exploration_rms_accepts_lists_and_defaults_to_one_step(primitive):

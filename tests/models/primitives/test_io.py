@@ -19,38 +19,40 @@ Y = np.column_stack([np.sin(T), T**2])
 
 
 def npy(description, shape, data=b"", version=b"\x01\x00", fortran_order=False):
-    """Return an array in NumPy's format, with any header."""
+    """Return the bytes of an array in NumPy's format, with a header that need not match the data."""
     header = f"{{'descr': {description!r}, 'fortran_order': {fortran_order}, 'shape': {shape}, }}".encode() + b"\n"
     size = struct.pack("<H" if version == b"\x01\x00" else "<L", len(header))
     return b"\x93NUMPY" + version + size + header + data
 
 
 def archive(path, compression=zipfile.ZIP_DEFLATED, **members):
+    """Write an NPZ archive with the bytes of its members; return its path."""
     with zipfile.ZipFile(path, "w", compression) as file:
         for key, value in members.items():
             file.writestr(f"{key}.npy", value)
     return path
 
 
-def refused(path):
-    """Return the message that refuses a file, and check the memory that reading it takes."""
+def load_error(path):
+    """Return the error message of a load_error file; check that reading needs less than 100 MB."""
     tracemalloc.start()
-    with pytest.raises(InputError) as said:
+    with pytest.raises(InputError) as error:
         Demonstrations.load(path)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
+    message = str(error.value)
     assert peak < 100e6
-    assert path.name in str(said.value)
-    assert "\n" not in str(said.value)
-    assert len(str(said.value)) < 400
-    return str(said.value)
+    assert path.name in message
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
 
 
 GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2), Y.tobytes())}
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("members", "message"),
     [
         ({"outputs": npy("<f8", "(1, 4, 9223372036854775807)", Y.tobytes())}, "claims the shape"),
         ({"outputs": npy("<f8", "(1, 4, 2, -1)", Y.tobytes())}, "claims the shape"),
@@ -82,8 +84,8 @@ GOOD = {"times": npy("<f8", (4,), T.tobytes()), "outputs": npy("<f8", (1, 4, 2),
         ({"names": npy("<U1", (3,), "abc".encode("utf-32-le"))}, "3 names for 2 outputs"),
     ],
 )
-def test_npz_reader_refuses_invalid_arrays(tmp_path, changed, said):
-    assert said in refused(archive(tmp_path / "d.npz", **{**GOOD, **changed}))
+def test_npz_reader_refuses_invalid_arrays(tmp_path, members, message):
+    assert message in load_error(archive(tmp_path / "d.npz", **{**GOOD, **members}))
 
 
 def test_npz_reader_accepts_the_valid_archive(tmp_path):
@@ -92,7 +94,7 @@ def test_npz_reader_accepts_the_valid_archive(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("lengths", "said"),
+    ("lengths", "message"),
     [
         ([-2, 6], "positive, not -2"),
         ([0, 4], "positive, not 0"),
@@ -107,35 +109,35 @@ def test_npz_reader_accepts_the_valid_archive(tmp_path):
         (np.full(1001, 2), "more than 1000"),
     ],
 )
-def test_npz_reader_refuses_invalid_lengths(tmp_path, lengths, said):
+def test_npz_reader_refuses_invalid_lengths(tmp_path, lengths, message):
     path = tmp_path / "d.npz"
     np.savez(path, lengths=np.asarray(lengths), times=np.r_[T[:2], T[:2]], outputs=Y)
-    assert said in refused(path)
+    assert message in load_error(path)
 
 
-def test_npz_reader_refuses_large_arrays_without_unpacking(tmp_path):
+def test_npz_reader_refuses_large_arrays_before_unpacking(tmp_path):
     path = tmp_path / "d.npz"
     np.savez_compressed(path, times=np.arange(2000.0), outputs=np.zeros((1, 2000, 2000)))
     assert path.stat().st_size < 100_000
-    assert "more than 2000000" in refused(path)
+    assert "more than 2000000" in load_error(path)
 
 
 def test_npz_reader_accepts_other_arrays_but_not_thousands(tmp_path):
     path = archive(tmp_path / "d.npz", **GOOD, force=npy("|O", (), b"x"))
     assert Demonstrations.load(path).num_outputs == 2
     path = archive(tmp_path / "e.npz", **GOOD, **{f"a{i}": b"" for i in range(3000)})
-    assert "too many arrays" in refused(path)
+    assert "too many arrays" in load_error(path)
 
 
 def test_npz_reader_refuses_many_demonstrations_before_splitting(tmp_path):
     path = tmp_path / "d.npz"
     np.savez(path, times=T, outputs=np.zeros((200_000, 4, 1)))
-    assert "200000 demonstrations" in refused(path)
+    assert "200000 demonstrations" in load_error(path)
     uneven = [2] * 900 + [10_000]
     np.savez(
         path, lengths=uneven, times=np.concatenate([np.arange(float(n)) for n in uneven]), outputs=np.ones((11_800, 1))
     )
-    assert "far more samples than the others" in refused(path)
+    assert "far more samples than the others" in load_error(path)
 
 
 def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
@@ -143,7 +145,7 @@ def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
     buffer = io.BytesIO()
     np.save(buffer, Y)
     renamed.write_bytes(buffer.getvalue())
-    assert "single array" in refused(renamed)
+    assert "single array" in load_error(renamed)
 
     good = archive(tmp_path / "good.npz", **GOOD).read_bytes()
     encrypted = tmp_path / "encrypted.npz"
@@ -154,23 +156,23 @@ def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
         if good[at : at + 4] == b"PK\x03\x04":
             flags[at + 6] |= 1
     encrypted.write_bytes(flags)
-    assert "encrypted" in refused(encrypted)
+    assert "encrypted" in load_error(encrypted)
 
     for compression in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         path = archive(tmp_path / "packed.npz", compression, **GOOD)
-        assert "compressed in a way" in refused(path)
+        assert "compressed in a way" in load_error(path)
 
     twice = tmp_path / "twice.npz"
     with zipfile.ZipFile(twice, "w") as file:
         for key in ("times.npy", "outputs.npy", "outputs_npy"):
             file.writestr(key, GOOD[key[:-4]])
     twice.write_bytes(twice.read_bytes().replace(b"outputs_npy", b"outputs.npy"))
-    assert "two arrays" in refused(twice)
+    assert "two arrays" in load_error(twice)
 
     (tmp_path / "empty.npz").write_bytes(b"")
-    assert "damaged" in refused(tmp_path / "empty.npz")
+    assert "damaged" in load_error(tmp_path / "empty.npz")
     (tmp_path / "text.npz").write_text("demonstration,time,x\n")
-    assert "damaged" in refused(tmp_path / "text.npz")
+    assert "damaged" in load_error(tmp_path / "text.npz")
 
 
 def test_npz_reader_detects_a_flipped_bit_anywhere(tmp_path):
@@ -202,8 +204,8 @@ def test_npz_reader_reads_every_numeric_type(tmp_path, kind):
 
 def test_csv_reader_accepts_the_clock_names_of_other_programs(tmp_path):
     path = tmp_path / "d.csv"
-    for first in ("t", "time", "Time [s]", " timestamp (Sec)", "t/s", "t [ s ]"):
-        path.write_text(f"{first},x,y [m],z\n0,1,2,3\n0.5,4,5,6\n1e0, 7,8,-9.5e-1\n\n", encoding="utf-8-sig")
+    for clock in ("t", "time", "Time [s]", " timestamp (Sec)", "t/s", "t [ s ]"):
+        path.write_text(f"{clock},x,y [m],z\n0,1,2,3\n0.5,4,5,6\n1e0, 7,8,-9.5e-1\n\n", encoding="utf-8-sig")
         loaded = Demonstrations.load(path)
         assert loaded.names == ("x", "y [m]", "z")
         np.testing.assert_array_equal(loaded.times[0], [0, 0.5, 1])
@@ -213,10 +215,10 @@ def test_csv_reader_accepts_the_clock_names_of_other_programs(tmp_path):
 @pytest.mark.parametrize("clock", ["t [ms]", "time (us)", "Timestamp/ns", "t [min]", "t []", "t (UTC)"])
 def test_csv_reader_refuses_time_in_another_unit(clock, tmp_path):
     (tmp_path / "d.csv").write_text(f"{clock},x\n0,1\n1,2\n")
-    said = refused(tmp_path / "d.csv")
-    assert "time is in seconds" in said
-    assert clock in said
-    assert "guiderail dataset import" in said
+    message = load_error(tmp_path / "d.csv")
+    assert "time is in seconds" in message
+    assert clock in message
+    assert "guiderail dataset import" in message
 
 
 def test_folder_is_read_in_the_numeric_order_of_its_files(tmp_path):
@@ -227,21 +229,21 @@ def test_folder_is_read_in_the_numeric_order_of_its_files(tmp_path):
     loaded = Demonstrations.load(tmp_path)
     assert [y[0, 0] for y in loaded.outputs] == list(range(12))
     (tmp_path / "demo_5.csv").write_text("t,y\n0,1\n1,1\n")
-    assert "demo_5.csv" in refused(tmp_path)
+    assert "demo_5.csv" in load_error(tmp_path)
     (tmp_path / "demo_5.csv").unlink()
     (tmp_path / "demo_5.csv").symlink_to(tmp_path)
-    assert "demonstration file" in refused(tmp_path)
+    assert "demonstration file" in load_error(tmp_path)
 
 
 def test_folder_with_no_or_too_many_files_is_refused(tmp_path):
-    assert "no .csv file" in refused(tmp_path)
+    assert "no .csv file" in load_error(tmp_path)
     for m in range(1001):
         (tmp_path / f"{m}.csv").touch()
-    assert "more than 1000" in refused(tmp_path)
+    assert "more than 1000" in load_error(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "first line"),
         ("\n", "first line"),
@@ -274,22 +276,22 @@ def test_folder_with_no_or_too_many_files_is_refused(tmp_path):
         ("t,x\n" + "\n" * 400_001, "more than 400000 lines"),
     ],
 )
-def test_csv_reader_refuses_invalid_tables(tmp_path, text, said):
+def test_csv_reader_refuses_invalid_tables(tmp_path, text, message):
     path = tmp_path / "d.csv"
     path.write_text(text, encoding="utf-8")
-    assert said in refused(path)
+    assert message in load_error(path)
 
 
 def test_csv_reader_refuses_invalid_utf8(tmp_path):
     (tmp_path / "d.csv").write_bytes(b"t,x\n0,\xff\n")
-    assert "not a table" in refused(tmp_path / "d.csv")
+    assert "not a table" in load_error(tmp_path / "d.csv")
 
 
 def test_read_refuses_pipes_and_devices(tmp_path):
     os.mkfifo(tmp_path / "pipe.csv")
-    assert "no demonstration file" in refused(tmp_path / "pipe.csv")
+    assert "no demonstration file" in load_error(tmp_path / "pipe.csv")
     os.symlink("/dev/zero", tmp_path / "zero.npz")
-    assert "no demonstration file" in refused(tmp_path / "zero.npz")
+    assert "no demonstration file" in load_error(tmp_path / "zero.npz")
     with pytest.raises(InputError):
         Demonstrations.load("x" * 5000 + ".npz")
     with pytest.raises(InputError):
@@ -309,16 +311,16 @@ def test_import_of_primitives_does_not_import_scikit_learn():
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_folder_of_too_large_files_is_named_as_a_whole(tmp_path, monkeypatch):
+def test_folder_is_named_when_its_files_are_too_large(tmp_path, monkeypatch):
     for name in ("a", "b"):
         (tmp_path / f"{name}.csv").write_text("time,x\n0,0\n1,1\n")
     monkeypatch.setattr("guiderail.models.primitives.io.MAX_FILE_SIZE", 25)
-    assert refused(tmp_path) == f"the files of the folder '{tmp_path}' have more than 25 bytes: thin the samples out"
+    assert load_error(tmp_path) == f"the files of the folder '{tmp_path}' have more than 25 bytes: thin the samples out"
 
 
 @pytest.mark.parametrize(("header", "number"), [("t,x", ""), ("demonstration,time,x", "7,")])
 @pytest.mark.parametrize("end", ["", "\n"])
-def test_cut_number_at_the_end_is_refused_if_the_file_may_be_cut(tmp_path, header, number, end):
+def test_truncated_last_number_is_refused_without_a_line_end(tmp_path, header, number, end):
     rows = [f"{number}{0.1 * n},{0.7 + 0.01 * n}" for n in range(6)]
     (tmp_path / "whole.csv").write_text("\n".join([header, *rows]) + end)
     assert Demonstrations.load(tmp_path / "whole.csv").num_demonstrations == 1

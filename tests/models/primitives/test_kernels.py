@@ -28,28 +28,28 @@ def test_kernel_refuses_an_invalid_length_scale(kernel, scale):
 
 
 @pytest.mark.parametrize("scale", ["a", [1.0], None])
-def test_length_scale_is_one_number(scale):
+def test_kernel_refuses_a_length_scale_of_wrong_type(scale):
     for make in (Matern52, lambda scale: make_kernel(length_scale=scale)):
         with pytest.raises(InputError, match="the kernel's length_scale must be a number, not"):
             make(scale)
 
 
-def function_kernel(law, stationary=True):
-    """Return a kernel of one input from a function of two arrays that broadcast."""
+def function_kernel(function, stationary=True):
+    """Return a kernel of scalar inputs that evaluates a function of two arrays of one shape."""
 
-    class Mine:
+    class FunctionKernel:
         def __call__(self, a, b):
-            return law(*np.broadcast_arrays(np.reshape(a, (-1, 1)), np.reshape(b, (1, -1))))
+            return function(*np.broadcast_arrays(np.reshape(a, (-1, 1)), np.reshape(b, (1, -1))))
 
-    Mine.stationary = stationary
-    return Mine()
+    FunctionKernel.stationary = stationary
+    return FunctionKernel()
 
 
 def decay(a, b):
     return np.exp(-((a - b) ** 2))
 
 
-NO_KERNELS = [
+INVALID_KERNELS = [
     (lambda a, b: np.cos(5 * (a - b)) - 0.5, "is not positive definite: the smallest eigenvalue of its matrix"),
     (lambda a, b: abs(a - b), r"is not positive definite: k\(a, a\) must be positive, and is 0"),
     (lambda a, b: -decay(a, b), r"is not positive definite: k\(a, a\) must be positive, and is -1"),
@@ -67,18 +67,18 @@ NO_KERNELS = [
 ]
 
 
-@pytest.mark.parametrize(("law", "sentence"), NO_KERNELS)
+@pytest.mark.parametrize(("function", "message"), INVALID_KERNELS)
 @pytest.mark.parametrize("history", [0, 3])
-def test_primitive_refuses_a_function_that_is_no_kernel(law, sentence, history):
+def test_primitive_refuses_invalid_kernel_functions(function, message, history):
     means, covariances = np.zeros((60, 1)), 0.1 * np.ones((60, 1, 1))
     reference = ReferenceTrajectory(np.linspace(0.0, 2.0, 60), means, covariances)
-    with pytest.raises(InputError, match=f"the kernel Mine .*{sentence}"):
-        LcNsKmp(reference, function_kernel(law), history=history)
-    with pytest.raises(InputError, match=f"the kernel Mine .*{sentence}"):
-        Kmp(reference.times, means, covariances, function_kernel(law))
+    with pytest.raises(InputError, match=f"the kernel FunctionKernel .*{message}"):
+        LcNsKmp(reference, function_kernel(function), history=history)
+    with pytest.raises(InputError, match=f"the kernel FunctionKernel .*{message}"):
+        Kmp(reference.times, means, covariances, function_kernel(function))
 
 
-def test_kernel_names_its_stationarity_when_it_is_a_kernel():
+def test_check_requires_a_declared_stationarity():
     check_kernel(function_kernel(lambda a, b: decay(a, b) * (1 + a) * (1 + b), stationary=False), np.linspace(0, 2, 60))
     for kernel in (function_kernel(decay, stationary=None), decay):
         with pytest.raises(InputError, match="has no attribute stationary, True or False"):

@@ -6,6 +6,7 @@ from guiderail.models.primitives import Kmp, Matern52, SquaredExponential
 
 
 def data(n=300, outputs=6, seed=0):
+    """Return times (n,), means (n, O) and correlated covariances (n, O, O)."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 8, n)
     means = np.column_stack([np.sin(t + o) for o in range(outputs)])
@@ -69,7 +70,7 @@ def test_via_points_equal_points_of_the_reference():
 
 
 def test_kmp_accepts_a_state_as_input():
-    """A primitive of two inputs and three outputs needs no clock."""
+    """The input of a primitive may be a state of two numbers instead of a time."""
     rng = np.random.default_rng(0)
     x = rng.uniform(-1, 1, (120, 2))
     y = np.column_stack([x[:, 0] * x[:, 1], x.sum(axis=1), np.cos(x[:, 0])])
@@ -80,15 +81,15 @@ def test_kmp_accepts_a_state_as_input():
 
 
 @pytest.mark.parametrize("inputs", [np.zeros((20, 1, 1)), ["a"] * 20, "a"])
-def test_inputs_are_rows_of_numbers(inputs):
+def test_kmp_refuses_inputs_that_are_not_rows_of_numbers(inputs):
     primitive = Kmp(*data(20, 2))
-    for refused in (lambda: Kmp(inputs, *data(20, 2)[1:]), lambda: primitive.mean(inputs)):
+    for call in (lambda: Kmp(inputs, *data(20, 2)[1:]), lambda: primitive.mean(inputs)):
         with pytest.raises(InputError, match="inputs"):
-            refused()
+            call()
 
 
 @pytest.mark.parametrize(
-    ("via", "names"),
+    ("via_point", "message"),
     [
         (([0.0, 1.0], [0.0, 0.0], np.eye(2)), "input"),
         (("a", [0.0, 0.0], np.eye(2)), "input"),
@@ -101,11 +102,11 @@ def test_inputs_are_rows_of_numbers(inputs):
         ((0.0, [0.0, 0.0], np.eye(3)), "shape"),
     ],
 )
-def test_add_via_point_refuses_invalid_points(via, names):
+def test_add_via_point_refuses_invalid_points(via_point, message):
     primitive = Kmp(*data(20, 2))
     before = primitive.mean([1.0])
-    with pytest.raises(InputError, match=names):
-        primitive.add_via_point(*via)
+    with pytest.raises(InputError, match=message):
+        primitive.add_via_point(*via_point)
     np.testing.assert_array_equal(primitive.mean([1.0]), before)
 
 
@@ -120,17 +121,17 @@ def test_kmp_refuses_unknown_via_points_and_invalid_arguments():
     with pytest.raises(InputError, match="means"):
         Kmp(np.zeros(3), np.zeros((2, 1)), np.ones((2, 1, 1)))
     t, means, covariances = data(20, 2)
-    for broken in (np.where(t == t[3], np.nan, t), means), (t, np.where(means == means[3], np.nan, means)):
+    for arguments in (np.where(t == t[3], np.nan, t), means), (t, np.where(means == means[3], np.nan, means)):
         with pytest.raises(InputError, match="finite"):
-            Kmp(*broken, covariances)
+            Kmp(*arguments, covariances)
 
 
 def test_via_point_input_must_be_finite():
     x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     primitive = Kmp(x, x, np.tile(np.eye(2), (20, 1, 1)))
-    for place in ([np.nan, 0.0], [0.0, np.inf]):
+    for via_input in ([np.nan, 0.0], [0.0, np.inf]):
         with pytest.raises(InputError, match="finite"):
-            primitive.add_via_point(place, [0.0, 0.0], np.eye(2))
+            primitive.add_via_point(via_input, [0.0, 0.0], np.eye(2))
 
 
 def test_kmp_accepts_lists():
@@ -139,19 +140,19 @@ def test_kmp_accepts_lists():
     np.testing.assert_array_equal(Kmp(t.tolist(), means.tolist(), covariances.tolist()).mean([1.0]), expected)
 
 
-def test_arrays_that_change_later_do_not_change_the_primitive():
+def test_kmp_copies_its_arguments():
     t, means, covariances = data(60, 2)
     expected = Kmp(t, means, covariances)
     target, covariance = np.array([0.4, -0.3]), 1e-4 * np.eye(2)
-    given = t.copy(), means.copy(), covariances.copy()
-    changed = Kmp(*given)
-    for array in given:
+    arguments = t.copy(), means.copy(), covariances.copy()
+    changed = Kmp(*arguments)
+    for array in arguments:
         array[:] = 1.0
     expected.add_via_point([3.0], target.copy(), covariance.copy())
     changed.add_via_point([3.0], target, covariance)
     target[:], covariance[:] = 5.0, np.eye(2)
     for primitive in (expected, changed):
-        primitive.add_via_point([20.0], [0.1, 0.2], 1e-4 * np.eye(2))  # far away: the reference is factored again
+        primitive.add_via_point([20.0], [0.1, 0.2], 1e-4 * np.eye(2))  # far away: factored again
     np.testing.assert_array_equal(changed.mean(t), expected.mean(t))
 
 

@@ -23,8 +23,8 @@ PACKAGED = [(path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.va
 PACKAGED.append((passage.demonstrations.PATH, passage.COMPONENTS))
 
 
-@pytest.mark.parametrize(("path", "components"), PACKAGED, ids=lambda one: getattr(one, "stem", None))
-def test_stored_mixtures_are_those_of_the_packaged_demonstrations(path, components):
+@pytest.mark.parametrize(("path", "components"), PACKAGED, ids=lambda value: getattr(value, "stem", None))
+def test_stored_mixtures_equal_fits_of_the_demonstrations(path, components):
     demonstrations = Demonstrations.load(path).resampled()
     arguments = demonstrations.times[0], np.stack(demonstrations.outputs), components, 0
     stored, fitted = fit_mixture(*arguments), fit_new_mixture(*arguments)
@@ -33,15 +33,15 @@ def test_stored_mixtures_are_those_of_the_packaged_demonstrations(path, componen
         np.testing.assert_allclose(getattr(stored, name), getattr(fitted, name), rtol=1e-6, atol=1e-9)
 
 
-def test_a_digest_names_all_arguments():
+def test_digest_depends_on_every_argument():
     times, outputs = np.arange(4.0), np.zeros((2, 4, 3))
-    others = [(times + 1, outputs, 2, 0), (times, outputs + 1, 2, 0), (times, outputs, 1, 0), (times, outputs, 2, 1)]
-    others.append((times, outputs.reshape(3, 4, 2), 2, 0))
-    assert len({digest(*one) for one in [(times, outputs, 2, 0), *others]}) == 6
+    variants = [(times + 1, outputs, 2, 0), (times, outputs + 1, 2, 0), (times, outputs, 1, 0), (times, outputs, 2, 1)]
+    variants.append((times, outputs.reshape(3, 4, 2), 2, 0))
+    assert len({digest(*arguments) for arguments in [(times, outputs, 2, 0), *variants]}) == 6
 
 
 def test_packaged_demonstrations_need_no_scikit_learn():
-    """Importing it takes 0.5 s and 60 MiB of every training process."""
+    """Importing scikit-learn would take 0.5 s and 60 MiB of every training process."""
     program = (
         "import sys; from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory as connector; "
         "from guiderail.diagrams.tasks.narrow_passage.task import reference_trajectory as passage; "
@@ -56,12 +56,12 @@ def test_regression_returns_the_moments_of_the_mixture():
     weights, means = np.array([0.3, 0.7]), np.array([[-0.5, 1.0], [0.8, -0.4]])
     covariances = np.array([[[0.4, 0.3], [0.3, 0.5]], [[0.2, -0.1], [-0.1, 0.3]]])
     center, scale = np.array([2.0, 0.1]), np.array([0.5, 3.0])
-    at, y = np.array([1.2, 2.0, 2.5, 5.0]), np.linspace(-30, 30, 20001)
-    regressed = regress(Mixture(weights, means, covariances, center, scale), at)
-    for t, mean, covariance in zip(at, *regressed, strict=True):
+    times, y = np.array([1.2, 2.0, 2.5, 5.0]), np.linspace(-30, 30, 20001)
+    regressed = regress(Mixture(weights, means, covariances, center, scale), times)
+    for t, mean, covariance in zip(times, *regressed, strict=True):
         joint = (np.stack([np.full_like(y, t), y], axis=1) - center) / scale
-        apart = joint[:, None] - means
-        exponent = np.einsum("ncj,cjk,nck->nc", apart, np.linalg.inv(covariances), apart)
+        differences = joint[:, None] - means
+        exponent = np.einsum("ncj,cjk,nck->nc", differences, np.linalg.inv(covariances), differences)
         density = (np.exp(-exponent / 2) / np.sqrt(np.linalg.det(covariances)) * weights).sum(axis=1)
         density /= density.sum()
         assert mean[0] == pytest.approx(density @ y, rel=1e-9)
@@ -69,11 +69,11 @@ def test_regression_returns_the_moments_of_the_mixture():
 
 
 def test_regression_extrapolates_the_most_likely_component():
-    """If every density underflows, the mean continues along the line of one component."""
-    times, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
-    fitted = fit_mixture(times, outputs, components=20, seed=0)
-    far = np.array([-300.0, 300.0, 400.0])
-    means, covariances = regress(fitted, far)
+    """If every density underflows, the mean follows the line of the most likely component."""
+    clock, outputs = np.linspace(0, 1, 40), np.stack([np.outer(np.linspace(0, 1, 40), [2.0]) + o for o in (0.0, 0.01)])
+    fitted = fit_mixture(clock, outputs, components=20, seed=0)
+    times = np.array([-300.0, 300.0, 400.0])
+    means, covariances = regress(fitted, times)
     assert np.isfinite(means).all()
     assert (covariances[:, 0, 0] > 0).all()
     assert means[2, 0] - means[1, 0] == pytest.approx((means[2, 0] - means[0, 0]) / 7, rel=0.2)
@@ -94,14 +94,14 @@ def test_fit_mixture_selects_the_better_number_of_components():
 
 
 def fit_with_criteria(monkeypatch, criteria):
-    """Replace the fit by one that only has the given criterion for each number of components."""
+    """Replace the fit by a stub with the given information criteria of 1, 2, … components."""
     fits = [
         SimpleNamespace(bic=lambda _, c=c: c, weights_=n, means_=n, covariances_=n) for n, c in enumerate(criteria, 1)
     ]
     monkeypatch.setattr(mixture, "_fit", lambda data, phase, count, seed: fits[count - 1])
 
 
-def test_search_ends_after_two_numbers_that_are_worse_than_the_best_of_all_before(monkeypatch):
+def test_search_ends_after_two_criteria_above_the_minimum(monkeypatch):
     criteria = [5.0, 4.0, 3.0, 3.5, 3.6, 1.0]
     fit_with_criteria(monkeypatch, criteria)
     found = information_criteria(np.arange(20.0), np.zeros((2, 20, 1)), range(1, 7), 0)
@@ -115,7 +115,7 @@ def test_one_to_twenty_components_are_searched(criteria, expected, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", [-1, 2**32])
-def test_seeds_of_scikit_learn_have_32_bits(seed):
+def test_seed_must_have_32_bits(seed):
     times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
     assert len(fit_mixture(times, outputs, components=1, seed=2**32 - 1).weights) == 1
     with pytest.raises(InputError, match="seed must be from 0 to"):

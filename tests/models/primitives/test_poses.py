@@ -6,19 +6,18 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import pose_demonstrations, pose_outputs, pose_rotation
 
 
-def turning(total, n=60, axis=(0.0, 0.0, 1.0), flips=True):
-    """Return a rotation about an axis, with quaternions of alternating sign."""
+def rotating_poses(total, n=60, axis=(0.0, 0.0, 1.0)):
+    """Return positions (n, 3) and quaternions (n, 4) of a rotation by `total` [rad], some with the opposite sign."""
     rotations = Rotation.from_rotvec(np.outer(np.linspace(0, total, n), axis))
     quaternions = rotations.as_quat(scalar_first=True)
-    if flips:
-        quaternions[::7] *= -1
+    quaternions[::7] *= -1
     return np.column_stack([np.linspace(0, 1, n)] * 3), quaternions
 
 
 @pytest.mark.parametrize("orientation", ["euler_zyx", "rotation_vector"])
 @pytest.mark.parametrize("total", [np.pi / 2, 1.2 * np.pi, 3.5 * np.pi])
-def test_outputs_are_continuous_and_keep_the_rotation(orientation, total):
-    positions, quaternions = turning(total)
+def test_outputs_are_continuous_and_equal_the_rotation(orientation, total):
+    positions, quaternions = rotating_poses(total)
     outputs = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], orientation)
     assert np.abs(np.diff(outputs[:, 3:], axis=0)).max() < 2 * total / 59
     difference = pose_rotation(outputs[:, 3:], orientation).inv() * Rotation.from_quat(quaternions, scalar_first=True)
@@ -26,7 +25,7 @@ def test_outputs_are_continuous_and_keep_the_rotation(orientation, total):
 
 
 def test_outputs_are_relative_to_the_target_frame():
-    """The target's pose is zero; a point one unit ahead of the target is ahead in its frame."""
+    """The outputs of the target are zero; a point 1 m along the target's x axis has the outputs (1, 0, 0)."""
     R_WT = Rotation.from_euler("z", 90, degrees=True)
     q = R_WT.as_quat(scalar_first=True)
     p_WT = np.array([1.0, 2.0, 3.0])
@@ -35,7 +34,7 @@ def test_outputs_are_relative_to_the_target_frame():
 
 
 def test_demonstrations_share_a_branch():
-    """Two recordings of one motion near a half turn, one of which starts beyond it."""
+    """Of two recordings of a motion, one starts before a half turn and one starts beyond."""
     n = 40
     position = np.zeros((n, 3))
     first = Rotation.from_rotvec(np.outer(np.linspace(3.10, 2.0, n), [0, 0, 1])).as_quat(scalar_first=True)
@@ -47,9 +46,9 @@ def test_demonstrations_share_a_branch():
         assert abs(d.outputs[0][0, column] - d.outputs[1][0, column]) < 0.1
 
 
-def test_branch_is_the_nearest_full_turn():
-    """Start a motion at angles of more than a half turn, and keep their branch."""
-    position, quaternions = turning(0.4)
+def test_branch_is_the_full_turn_nearest_to_the_given_angles():
+    """The outputs start at the number of full turns that is nearest to `near`."""
+    position, quaternions = rotating_poses(0.4)
     for turns in (-2, -1, 0, 1, 3):
         near = np.array([2 * np.pi * turns + 2.0, 0.0, 0.0])
         outputs = pose_outputs(position, quaternions, np.zeros(3), [1, 0, 0, 0], near=near)
@@ -57,7 +56,7 @@ def test_branch_is_the_nearest_full_turn():
 
 
 def test_first_demonstration_determines_the_branch():
-    """Each demonstration starts a sixth of a turn further: the fifth is more than half a turn from the first."""
+    """The starts are about a sixth of a turn apart; the fourth is more than half a turn from the first."""
     n, starts = 5, np.deg2rad([170.0, 110.0, 50.0])
     quaternions = [
         Rotation.from_rotvec(np.outer(np.linspace(start, start - 0.1, n), [0, 0, 1])).as_quat(scalar_first=True)
@@ -68,22 +67,22 @@ def test_first_demonstration_determines_the_branch():
 
 
 def test_pose_outputs_accept_lists():
-    positions, quaternions = turning(1.0)
+    positions, quaternions = rotating_poses(1.0)
     from_arrays = pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0])
     from_lists = pose_outputs(positions.tolist(), quaternions.tolist(), [0, 0, 0], [1, 0, 0, 0])
     np.testing.assert_array_equal(from_lists, from_arrays)
 
 
 def test_target_is_the_last_pose_by_default():
-    positions, quaternions = turning(1.0)
+    positions, quaternions = rotating_poses(1.0)
     d = pose_demonstrations([np.arange(60)], [positions], [quaternions])
     np.testing.assert_allclose(d.outputs[0][-1], 0, atol=1e-12)
 
 
 def test_pose_outputs_refuse_invalid_poses():
-    positions, quaternions = turning(1.0)
+    positions, quaternions = rotating_poses(1.0)
     with pytest.raises(InputError, match="singular"):
-        pose_outputs(*turning(np.pi / 2, axis=(0, 1, 0)), np.zeros(3), [1, 0, 0, 0])
+        pose_outputs(*rotating_poses(np.pi / 2, axis=(0, 1, 0)), np.zeros(3), [1, 0, 0, 0])
     with pytest.raises(InputError, match="length zero"):
         pose_outputs(positions, 0 * quaternions, np.zeros(3), [1, 0, 0, 0])
     with pytest.raises(InputError, match="choose"):
@@ -92,11 +91,11 @@ def test_pose_outputs_refuse_invalid_poses():
         pose_rotation(np.zeros(3), "quaternion")
     with pytest.raises(InputError, match="positions"):
         pose_outputs(positions[:, :2], quaternions, np.zeros(3), [1, 0, 0, 0])
-    for where in (positions, quaternions):
-        broken = [positions.copy(), quaternions.copy()]
-        broken[0 if where is positions else 1][3, 1] = np.nan
+    for array in (positions, quaternions):
+        poses = [positions.copy(), quaternions.copy()]
+        poses[0 if array is positions else 1][3, 1] = np.nan
         with pytest.raises(InputError, match="NaN"):
-            pose_outputs(*broken, np.zeros(3), [1, 0, 0, 0])
+            pose_outputs(*poses, np.zeros(3), [1, 0, 0, 0])
     for target in ([0.0, np.nan, 0.0], [1, 0, 0, 0]), (np.zeros(3), [np.nan, 0, 0, 0]):
         with pytest.raises(InputError, match="target's pose must be finite"):
             pose_outputs(positions, quaternions, *target)
@@ -108,7 +107,7 @@ def test_pose_outputs_refuse_invalid_poses():
     pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])
 
 
-def test_poses_need_a_sample():
+def test_poses_need_at_least_one_sample():
     p, q = np.zeros((0, 3)), np.zeros((0, 4))
     with pytest.raises(InputError, match="positions"):
         pose_outputs(p, q, np.zeros(3), [1.0, 0.0, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""A batch of predictions equals predictions one by one, and slack constraints are found on both sides of a bound."""
+"""A batch of predictions equals single predictions, and slack constraints are found on both sides of a bound."""
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ def primitive(history=4, outputs=3, upper=0.9):
 
 
 def arguments(p, batch, scale=3.0, seed=0):
+    """Return random steps, actions with the standard deviation `scale`, and histories near the reference."""
     rng = np.random.default_rng(seed)
     steps = rng.integers(0, STEPS + 5, batch)
     histories = np.array([p.reference.means[np.clip(np.arange(n - p.history, n), 0, STEPS - 1)] for n in steps])
@@ -27,32 +28,32 @@ def arguments(p, batch, scale=3.0, seed=0):
 
 @pytest.mark.parametrize("history", [0, 4])
 @pytest.mark.parametrize("upper", [None, 0.9])
-def test_batch_equals_predictions_one_by_one(history, upper):
+def test_batch_equals_single_predictions(history, upper):
     p = primitive(history, upper=upper)
     steps, actions, histories = arguments(p, 300)
     batch = p.predict_batch(steps, actions, histories)
     for i, step in enumerate(steps):
-        one = p.predict(step, actions[i], None if histories is None else histories[i])
-        np.testing.assert_allclose(batch.outputs[i], one.output, rtol=0, atol=1e-12)
-        assert batch.is_constrained[i] == one.constrained
+        single = p.predict(step, actions[i], None if histories is None else histories[i])
+        np.testing.assert_allclose(batch.outputs[i], single.output, rtol=0, atol=1e-12)
+        assert batch.is_constrained[i] == single.constrained
     assert batch.is_solved.all()
     assert batch.is_constrained.any() == (upper is not None)
 
 
 @pytest.mark.parametrize("history", [0, 4])
-def test_large_batch_at_one_step_equals_predictions(history):
+def test_large_batch_at_one_step_equals_single_predictions(history):
     p = primitive(history, upper=1.05)
     _, actions, histories = arguments(p, 1000, scale=300.0 if history else 30.0)
     batch = p.predict_batch(7, actions, histories)
     assert 0.05 < batch.is_constrained.mean() < 0.95
     for i in range(0, 1000, 13):
-        one = p.predict(7, actions[i], None if histories is None else histories[i])
-        np.testing.assert_allclose(batch.outputs[i], one.output, rtol=0, atol=1e-12)
-        assert batch.is_constrained[i] == one.constrained
+        single = p.predict(7, actions[i], None if histories is None else histories[i])
+        np.testing.assert_allclose(batch.outputs[i], single.output, rtol=0, atol=1e-12)
+        assert batch.is_constrained[i] == single.constrained
 
 
 @pytest.mark.parametrize("distance", [1e-14, 1e-12, 1e-9, 1e-6, 1e-3])
-def test_slack_is_decided_in_double_precision_near_a_bound(distance):
+def test_slack_is_found_in_double_precision_near_a_bound(distance):
     p = primitive()
     _, actions, histories = arguments(p, 600, scale=0.01)
     factor = p._factor(3)
@@ -86,7 +87,7 @@ def test_every_output_of_a_batch_satisfies_the_constraints():
     assert max(p.constraints.violation(y) for y in batch.outputs) <= 1e-9
 
 
-def test_unsolved_prediction_is_nan_and_the_others_are_not(monkeypatch):
+def test_only_the_unsolved_prediction_is_nan():
     p = primitive(history=0)
     actions = np.array([[0.0, 0.0, 0.0], [1e4, 0.0, 0.0]])
 
@@ -120,13 +121,13 @@ def test_actions_are_zero_and_steps_shared_by_default():
         ([0], np.zeros((1, 3)), np.full((1, 4, 3), np.inf), "finite"),
     ],
 )
-def test_wrong_argument_is_refused(steps, actions, histories, message):
+def test_predict_batch_refuses_invalid_arguments(steps, actions, histories, message):
     with pytest.raises(InputError, match=message):
         primitive().predict_batch(steps, actions, histories)
 
 
 @pytest.mark.parametrize(("size", "is_accepted"), [(1e150, True), (1e155, False), (-1e300, False)])
-def test_actions_whose_squares_overflow_are_refused_as_by_predict(size, is_accepted):
+def test_actions_are_refused_when_their_squares_overflow(size, is_accepted):
     p = primitive(upper=None)
     action, history = np.array([0.0, size, 0.0]), p.reference.means[:4]
     for predict in (
@@ -140,6 +141,6 @@ def test_actions_whose_squares_overflow_are_refused_as_by_predict(size, is_accep
                 predict()
 
 
-def test_history_without_history_is_refused():
+def test_history_is_refused_by_a_primitive_without_history():
     with pytest.raises(InputError, match="no history"):
         primitive(history=0).predict_batch([0], np.zeros((1, 3)), np.zeros((1, 4, 3)))

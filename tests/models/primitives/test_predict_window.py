@@ -15,7 +15,7 @@ def primitive():
 
 
 @pytest.mark.parametrize("step", [0, 3, 5, 9])
-def test_window_of_the_reference_gives_its_prediction(primitive, step):
+def test_predict_window_equals_predict_for_the_reference(primitive, step):
     window = np.minimum(np.minimum(step, 5) + np.arange(4), 5)
     means, covariances = primitive.reference.means[window], primitive.reference.covariances[window]
     history = np.array([[0.3, 0.1], [0.4, 0.2]])
@@ -24,7 +24,7 @@ def test_window_of_the_reference_gives_its_prediction(primitive, step):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12)
 
 
-def test_covariances_of_a_window_are_symmetric(primitive):
+def test_predict_window_refuses_asymmetric_covariances(primitive):
     covariances = np.tile(np.eye(2), (4, 1, 1))
     covariances[2, 0, 1] = 0.1
     with pytest.raises(InputError, match="the covariance of point 2 of a window is not symmetric"):
@@ -32,6 +32,6 @@ def test_covariances_of_a_window_are_symmetric(primitive):
 
 
 @pytest.mark.parametrize("step", [-1, 0.5, np.nan, "a", None])
-def test_step_must_be_a_whole_number_from_zero(primitive, step):
+def test_predict_window_refuses_an_invalid_step(primitive, step):
     with pytest.raises(InputError, match="step"):
         primitive.predict_window(step, np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1)), history=np.zeros((2, 2)))

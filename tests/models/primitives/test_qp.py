@@ -1,4 +1,4 @@
-"""Every solver meets the KKT conditions of the quadratic program or raises an error."""
+"""Every solver satisfies the KKT conditions of the quadratic program or raises an error."""
 
 import sys
 
@@ -29,7 +29,7 @@ def problems(draw):
     open_ = rng.uniform(size=rows)
     lower, upper = np.where(open_ < 0.3, -np.inf, lower), np.where(open_ > 0.7, np.inf, upper)
     if not (lower > 0).any() and not (upper < 0).any():
-        lower[0], upper[0] = abs(inside[0]) + 0.1, np.inf  # or v = 0 would do
+        lower[0], upper[0] = abs(inside[0]) + 0.1, np.inf  # otherwise v = 0 is the solution
         A[0] = np.eye(size)[0]
         lower[1:], upper[1:] = -np.inf, np.inf
     scale = draw(st.sampled_from([1.0, 1e-7, 1e5]))
@@ -43,14 +43,14 @@ def test_solution_satisfies_the_kkt_conditions(name, problem):
     size = max(lower.max(), -upper.min())
     v, multipliers = solve_least_norm(A, lower, upper, SOLVERS[name])
     assert np.maximum(lower - A @ v, A @ v - upper).max() <= VIOLATION[name] * size
-    near = 10 * DISTANCE[name] * max(size, np.linalg.norm(v))
-    # The gradient of ½‖v‖² is v: the bounds hold it, each from its own side only, and only where it is reached.
-    np.testing.assert_allclose(v, -A.T @ multipliers, rtol=0, atol=100 * near)
-    pushes_up = multipliers < -100 * near
-    pushes_down = multipliers > 100 * near
-    assert ((A @ v - lower)[pushes_up] <= 100 * near).all()
-    assert ((upper - A @ v)[pushes_down] <= 100 * near).all()
-    assert pushes_up.any() or pushes_down.any() or np.linalg.norm(v) <= 1e4 * near
+    tolerance = 10 * DISTANCE[name] * max(size, np.linalg.norm(v))
+    # Stationarity is v = −Aᵀ multipliers. Multipliers are negative only at lower and positive only at upper bounds.
+    np.testing.assert_allclose(v, -A.T @ multipliers, rtol=0, atol=100 * tolerance)
+    pushes_up = multipliers < -100 * tolerance
+    pushes_down = multipliers > 100 * tolerance
+    assert ((A @ v - lower)[pushes_up] <= 100 * tolerance).all()
+    assert ((upper - A @ v)[pushes_down] <= 100 * tolerance).all()
+    assert pushes_up.any() or pushes_down.any() or np.linalg.norm(v) <= 1e4 * tolerance
 
 
 @pytest.mark.parametrize("name", SOLVERS)
@@ -68,7 +68,7 @@ def test_infeasible_problem_raises_unsolvable_error(name, seed, gap):
     rng = np.random.default_rng(seed)
     row = rng.standard_normal(4)
     row /= np.linalg.norm(row)
-    # One direction above a bound and below a lower one, or three directions that cannot all be positive.
+    # A direction whose lower bound exceeds its upper bound, or three directions that cannot all be positive.
     A, lower, upper = np.array([row, row]), np.array([gap, -np.inf]), np.array([np.inf, 0.0])
     if seed % 2:
         angles = np.array([0, 2, 4]) * np.pi / 3
@@ -84,8 +84,8 @@ def test_solvers_print_nothing(name, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_daqp_solves_problems_of_many_bounds_at_once():
-    """A thousand nearly parallel directions are degenerate, as those of long horizons."""
+def test_daqp_solves_a_degenerate_problem_of_many_bounds():
+    """A thousand nearly parallel rows are degenerate, like the constraints of a long horizon."""
     angles = np.linspace(0, 1e-4, 1000)
     A = np.column_stack([np.cos(angles), np.sin(angles)])
     v, _ = solve_least_norm(A, np.ones(1000), np.full(1000, np.inf))
@@ -101,7 +101,7 @@ def test_find_solver_refuses_missing_solvers(monkeypatch):
         solve_least_norm(np.eye(1), np.ones(1), np.full(1, 2.0), SOLVERS["piqp"])
 
 
-def test_identity_is_made_once_for_each_size(monkeypatch):
+def test_identity_matrix_is_cached_for_each_size(monkeypatch):
     expected = _identity(3)
     monkeypatch.delattr(np, "eye")
     assert _identity(3) is expected

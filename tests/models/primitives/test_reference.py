@@ -7,7 +7,7 @@ from guiderail.models.primitives.reference import interpolate_prior
 
 
 def hourglass(num=9, n=120, seed=0):
-    """Return demonstrations that are narrow in the middle."""
+    """Return demonstrations with the smallest spread in the middle."""
     rng = np.random.default_rng(seed)
     t = np.linspace(0, 2, n)
     width = 0.1 * np.abs(t - 1) + 0.005
@@ -30,7 +30,7 @@ def test_reference_is_deterministic_for_a_seed():
     np.testing.assert_array_equal(a.covariances, b.covariances)
 
 
-def test_reference_of_equal_demonstrations_needs_floor():
+def test_floor_raises_the_deviation_of_equal_demonstrations():
     """EM's regularization keeps the covariance regular; a floor sets its scale."""
     t = np.linspace(0, 1, 50)
     same = Demonstrations(t, [np.column_stack([np.sin(t), np.zeros(50)])] * 3)
@@ -39,28 +39,28 @@ def test_reference_of_equal_demonstrations_needs_floor():
     assert (floored.standard_deviations >= [0.01, 0.02]).all()
 
 
-def test_variance_of_a_single_demonstration_is_added():
-    """The mean is the demonstration; a motion that the mixture does not resolve adds its own variance."""
+def test_prior_is_added_to_the_variance_of_one_demonstration():
+    """The mean is the demonstration; oscillations that the mixture does not resolve add their variance to the prior."""
     t = np.linspace(0, 2, 200)
     slow = Demonstrations(t, [np.column_stack([np.sin(t), t])])
     reference = ReferenceTrajectory.from_demonstrations(slow, 12, prior_std=[0.1, 0.2])
     np.testing.assert_allclose(reference.means, slow.outputs[0], atol=5e-3)
     np.testing.assert_allclose(reference.standard_deviations, np.tile([0.1, 0.2], (200, 1)), rtol=2e-3)
-    searching = Demonstrations(t, [np.column_stack([np.sin(t) + 0.3 * np.sin(100 * t), t])])
-    reference = ReferenceTrajectory.from_demonstrations(searching, 12, prior_std=[0.1, 0.2])
+    oscillating = Demonstrations(t, [np.column_stack([np.sin(t) + 0.3 * np.sin(100 * t), t])])
+    reference = ReferenceTrajectory.from_demonstrations(oscillating, 12, prior_std=[0.1, 0.2])
     np.testing.assert_allclose(reference.means[:, 0], np.sin(t), atol=0.12)
     assert np.median(reference.standard_deviations[:, 0]) == pytest.approx(np.hypot(0.1, 0.3 / np.sqrt(2)), rel=0.1)
 
 
 def test_prior_is_interpolated_between_phases():
-    rows = [0.0, 0.1, 1.0, 0.5, 0.3, 1.0]  # phases 0 and 0.5, the last row is held
+    rows = [0.0, 0.1, 1.0, 0.5, 0.3, 1.0]  # rows at phases 0 and 0.5; the second row applies until the end
     prior = interpolate_prior(rows, 5, 2)
     np.testing.assert_allclose(prior, [[0.1, 1.0], [0.2, 1.0], [0.3, 1.0], [0.3, 1.0], [0.3, 1.0]])
     np.testing.assert_array_equal(interpolate_prior(0.1, 2, 2), np.full((2, 2), 0.1))
 
 
 @pytest.mark.parametrize(
-    ("prior", "words"),
+    ("prior", "message"),
     [
         (None, "single demonstration has no variance: give prior_std"),
         ([0.1, 0.0], "positive"),
@@ -72,8 +72,8 @@ def test_prior_is_interpolated_between_phases():
         ([0.0, 0.1, 0.1, 1.1, 0.1, 0.1], "from 0 to 1"),
     ],
 )
-def test_prior_of_a_single_demonstration_is_refused(prior, words):
-    with pytest.raises(InputError, match=words):
+def test_prior_of_a_single_demonstration_is_refused(prior, message):
+    with pytest.raises(InputError, match=message):
         ReferenceTrajectory.from_demonstrations(hourglass(1), 5, prior_std=prior)
 
 
@@ -90,7 +90,7 @@ def test_inputs_are_extrapolated_beyond_the_ends():
 
 
 @pytest.mark.parametrize(
-    ("times", "means", "covariances", "names"),
+    ("times", "means", "covariances", "message"),
     [
         ([0.0], [[0.0]], [[[1.0]]], "at least two"),
         ([0.0, 0.0], [[0.0]] * 2, [[[1.0]]] * 2, "increase"),
@@ -103,8 +103,8 @@ def test_inputs_are_extrapolated_beyond_the_ends():
         ([0.0, 1.0], [[0.0, 0.0]] * 2, [[[1.0, 0.5], [0.0, 1.0]]] * 2, "symmetric"),
     ],
 )
-def test_constructor_refuses_invalid_references(times, means, covariances, names):
-    with pytest.raises(InputError, match=names):
+def test_constructor_refuses_invalid_references(times, means, covariances, message):
+    with pytest.raises(InputError, match=message):
         ReferenceTrajectory(times, means, covariances)
 
 
@@ -116,16 +116,16 @@ def test_from_demonstrations_refuses_invalid_mixtures():
 
 
 @pytest.mark.parametrize("components", [2.5, True, "8"])
-def test_number_of_components_is_whole(components):
+def test_reference_refuses_a_fractional_number_of_components(components):
     with pytest.raises(InputError, match="components must be a whole number"):
         ReferenceTrajectory.from_demonstrations(hourglass(), components)
 
 
 @pytest.mark.parametrize(
-    ("seed", "words"), [(-1, "from 0 to"), (2**32, "from 0 to"), ("a", "whole number"), (0.5, "whole")]
+    ("seed", "message"), [(-1, "from 0 to"), (2**32, "from 0 to"), ("a", "whole number"), (0.5, "whole")]
 )
-def test_seed_is_that_of_a_generator(seed, words):
-    with pytest.raises(InputError, match=f"seed must be .*{words}"):
+def test_reference_refuses_an_invalid_seed(seed, message):
+    with pytest.raises(InputError, match=f"seed must be .*{message}"):
         ReferenceTrajectory.from_demonstrations(hourglass(), 5, seed)
 
 
@@ -140,7 +140,7 @@ def test_resampled_reference_is_interpolated_over_its_clock(times):
 
 @pytest.mark.parametrize("height", [0.3, 0.5, 1.0, 0.1])
 def test_constant_output_has_a_spread_independent_of_its_value(height):
-    """The mean of many equal numbers may differ from them by rounding."""
+    """The mean of equal numbers may differ from the number by rounding."""
     rng = np.random.default_rng(0)
     t = np.linspace(0, 1, 50)
     outputs = [np.column_stack([np.sin(t + 0.05 * rng.normal()), np.full(50, height)]) for _ in range(3)]

@@ -32,40 +32,36 @@ UNIT_BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
 
 @given(st.floats(0, 1) | st.sampled_from([0.5, 1 - 1e-6, 1 - 1e-8, 1 - 5e-9]), SEEDS)
 def test_command_outside_the_constraints_is_refused(share, seed):
-    """A solver that returns a part of the correction is detected."""
+    """A command is refused if the solver returns only a share of the correction."""
 
-    def sloppy(rows, lower, upper):
+    def solve_partially(rows, lower, upper):
         v, multipliers = SOLVERS["daqp"](rows, lower, upper)
         return share * v, multipliers
 
-    SOLVERS["sloppy"] = sloppy
-    try:
-        p = primitive(UNIT_BOX, solver="sloppy")
-    finally:
-        del SOLVERS["sloppy"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SOLVERS, "partial", solve_partially)
+        p = primitive(UNIT_BOX, solver="partial")
     rng = np.random.default_rng(seed)
     action = 1e4 * rng.uniform(0.5, 1, 2) * rng.choice([-1, 1], 2)
-    free = primitive(None).predict(3, action).output
-    short = (1 - share) * (np.abs(free).max() - 1)
-    if short > 1e-8:
+    unconstrained = primitive(None).predict(3, action).output
+    violation = (1 - share) * (np.abs(unconstrained).max() - 1)
+    if violation > 1e-8:
         with pytest.raises(UnsolvableError, match="violation"):
             p.predict(3, action)
     else:
         try:
             output = p.predict(3, action).output
         except UnsolvableError:
-            assert short > 1e-10
+            assert violation > 1e-10
         else:
             assert UNIT_BOX.violation(output) <= 1e-9
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_command_with_nan_is_refused(wrong):
-    SOLVERS["wrong"] = lambda rows, lower, upper: (np.full(rows.shape[1], wrong), np.zeros(len(rows)))
-    try:
-        p = primitive(UNIT_BOX, solver="wrong")
-    finally:
-        del SOLVERS["wrong"]
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_command_that_is_not_finite_is_refused(monkeypatch, value):
+    solve = lambda rows, lower, upper: (np.full(rows.shape[1], value), np.zeros(len(rows)))  # noqa: E731
+    monkeypatch.setitem(SOLVERS, "not finite", solve)
+    p = primitive(UNIT_BOX, solver="not finite")
     with pytest.raises(UnsolvableError), np.errstate(invalid="ignore"):
         p.predict(3, np.array([1e5, 0.0]))
 
@@ -84,7 +80,7 @@ def test_infeasible_window_raises_unsolvable_error(solver):
 
 @given(SEEDS)
 def test_windows_between_parallel_planes_solve_problem_4_5(seed):
-    """The window equals the dense one, multipliers of both sides included, and satisfies the KKT conditions."""
+    """The window equals the dense solution with the same multipliers and satisfies the KKT conditions."""
     problem = random_problem(seed, box=True)
     scale = np.abs(problem.primitive.reference.means).max(axis=0)
     prediction = problem.solve()
@@ -113,7 +109,7 @@ def test_box_sides_have_separate_multipliers():
 
 
 def test_repeated_and_opposite_constraints_are_satisfied():
-    """Opposite rows, some repeated three times, some opposite at a part of the steps only."""
+    """Some rows are repeated, and some are opposite, at all or only at some of the steps."""
     G = np.array([[1.0, 0], [-1, 0], [-1, 0], [1, 0], [0, 1], [0, -1], [0.0, 0.0]])
     c = np.array([-0.4, -0.7, -0.3, -0.9, -0.5, -0.2, -1.0])
     for varying in (False, True):
@@ -130,7 +126,7 @@ def test_repeated_and_opposite_constraints_are_satisfied():
 
 @given(SEEDS)
 def test_command_scales_with_the_unit_of_the_outputs(seed):
-    """In millimeters instead of meters, a command is 1000 times as large: the law has no unit of its own."""
+    """In millimeters instead of meters, a command is 1000 times as large."""
     rng = np.random.default_rng(seed)
     t = 0.02 * np.arange(30)
     means = np.cumsum(0.01 * rng.standard_normal((30, 2)), axis=0)
@@ -140,7 +136,7 @@ def test_command_scales_with_the_unit_of_the_outputs(seed):
     past = means[2:5]
 
     def output(unit):
-        # λ and β weigh an output's square against the kernel's: they change with its unit.
+        # λ and β scale with the inverse square of the output unit.
         p = LcNsKmp(
             ReferenceTrajectory(t, unit * means, unit**2 * covariances),
             lambda_=6 / unit**2,
@@ -164,7 +160,7 @@ def test_bounds_may_leave_a_single_point():
 
 
 def test_window_at_the_end_extrapolates_the_clock():
-    """Steps past the end repeat the last one, for constraints and means."""
+    """Steps past the end have the constraints and the mean of the last step."""
     steps = 30
     lower, upper = np.full((steps, 2), -1.0), np.full((steps, 2), 1.0)
     upper[-1] = -0.5
@@ -186,14 +182,14 @@ def test_features_differ_per_window_on_an_uneven_clock():
     assert not reference.uniform
     p = LcNsKmp(reference, horizon=5)
     in_order = [p.predict(n).output for n in (0, 20)]
-    other = LcNsKmp(reference, horizon=5)
-    np.testing.assert_array_equal([other.predict(n).output for n in (20, 0)][::-1], in_order)
+    reordered = LcNsKmp(reference, horizon=5)
+    np.testing.assert_array_equal([reordered.predict(n).output for n in (20, 0)][::-1], in_order)
     direct = p.predict_at(t[20:26], means[20:26], reference.covariances[20:26]).output
     np.testing.assert_allclose(in_order[1], direct, rtol=0, atol=1e-12)
 
 
-class Moving(SquaredExponential):
-    """Nonstationary kernel."""
+class NonstationaryKernel(SquaredExponential):
+    """Squared-exponential kernel, scaled by its inputs."""
 
     stationary = False
 
@@ -205,7 +201,7 @@ def test_features_differ_per_window_for_nonstationary_kernels():
     t = 0.02 * np.arange(30)
     means = np.column_stack([np.sin(t), np.cos(t)])
     reference = ReferenceTrajectory(t, means, np.tile(1e-2 * np.eye(2), (30, 1, 1)))
-    p = LcNsKmp(reference, Moving(2.0), horizon=5)
+    p = LcNsKmp(reference, NonstationaryKernel(2.0), horizon=5)
     p.predict(0)
     direct = p.predict_at(t[20:26], means[20:26], reference.covariances[20:26]).output
     np.testing.assert_allclose(p.predict(20).output, direct, rtol=0, atol=1e-12)
@@ -224,22 +220,22 @@ def test_history_inputs_are_on_the_clock(kernel):
     np.testing.assert_allclose(prediction.output, direct.output, rtol=0, atol=1e-12)
     # Before the first step the clock is extrapolated.
     early = p.predict(1, np.ones(2), past).output
-    at = p.predict_at(t[1:6], means[1:6], covariances[1:6], np.ones(2), past, np.array([-0.2, -0.1, 0.0])).output
-    np.testing.assert_allclose(early, at, rtol=0, atol=1e-12)
+    direct = p.predict_at(t[1:6], means[1:6], covariances[1:6], np.ones(2), past, np.array([-0.2, -0.1, 0.0])).output
+    np.testing.assert_allclose(early, direct, rtol=0, atol=1e-12)
 
 
 def test_predict_at_refuses_invalid_arguments():
     p = primitive(UNIT_BOX)
     t, means, covariances = np.linspace(0, 1, 4), np.zeros((4, 2)), np.tile(np.eye(2), (4, 1, 1))
     p.predict_at(t, means, covariances)
-    for inputs, m, s, names in (
+    for inputs, m, s, message in (
         (t, means[:3], covariances, "means and covariances"),
         (t, means, covariances[:3], "means and covariances"),
         (t, means, covariances * np.nan, "finite"),
         (t, means + np.inf, covariances, "finite"),
         (t * np.nan, means, covariances, "finite"),
     ):
-        with pytest.raises(InputError, match=names):
+        with pytest.raises(InputError, match=message):
             p.predict_at(inputs, m, s)
     with pytest.raises(InputError, match="history_inputs must be of shape"):
         p.predict_at(t, means, covariances, history_inputs=np.zeros(1))
@@ -260,15 +256,15 @@ def test_linear_response_equals_the_unconstrained_prediction():
 
 
 def test_cache_counts_bytes_and_drops_the_oldest():
-    one = primitive(None)
-    one.predict(0)
-    size = one.cached_bytes
-    held = one._cache[0]
-    arrays = [held.output_map, held.output_offset, held.constraint_map, held.lower, held.upper, held.constraint_rows]
-    window = held._window
-    assert size >= sum(a.nbytes for a in (*arrays, held.correction_map, window.means, window.covariances))
-    one.predict(0)
-    assert one.cached_bytes == size
+    unlimited = primitive(None)
+    unlimited.predict(0)
+    size = unlimited.cached_bytes
+    factor = unlimited._cache[0]
+    names = "output_map output_offset constraint_map lower upper constraint_rows correction_map"
+    arrays = [getattr(factor, name) for name in names.split()] + [factor._window.means, factor._window.covariances]
+    assert size >= sum(array.nbytes for array in arrays)
+    unlimited.predict(0)
+    assert unlimited.cached_bytes == size
     p = primitive(None, cache_bytes=3 * size)
     for n in range(10):
         p.predict(n)
@@ -279,4 +275,4 @@ def test_cache_counts_bytes_and_drops_the_oldest():
     tiny.predict(0)
     tiny.predict(1)
     assert list(tiny._cache) == [1]
-    assert one.factor_all() == 30 * size
+    assert unlimited.factor_all() == 30 * size

@@ -1,4 +1,4 @@
-"""The stepper commands what the diagram of KGRL and sKGRL commands, and never a point outside the constraints."""
+"""The commands of the stepper equal those of the diagram of KGRL and sKGRL, and satisfy the constraints."""
 
 import numpy as np
 import pytest
@@ -24,6 +24,7 @@ def primitive(history=3, upper=0.5):
 
 
 def commands_of_diagram(p, action, pose, steps):
+    """Return the commands (steps, 2) of a diagram with a constant action."""
     builder = DiagramBuilder()
     kmp = builder.AddSystem(LcNsKmpSystem(p, GAIN, PERIOD))
     source = builder.AddSystem(ConstantVectorSource(action))
@@ -51,15 +52,15 @@ def test_commands_equal_those_of_the_diagram(history, action):
     np.testing.assert_array_equal(commands, commands_of_diagram(p, action, pose, STEPS + 5))
 
 
-def test_violation_is_that_of_the_command_and_never_positive():
+def test_violation_of_every_command_is_at_most_zero():
     stepper = primitive(upper=0.3).start(gain=[1e5, 1e5])
-    worst = [stepper.step([1.0, 1.0]) for _ in range(STEPS)]
-    assert max(command.violation for command in worst) <= 1e-9
-    assert worst[-1].violation == pytest.approx(0.0, abs=1e-9)
-    assert not any(command.is_fallback for command in worst)
+    commands = [stepper.step([1.0, 1.0]) for _ in range(STEPS)]
+    assert max(command.violation for command in commands) <= 1e-9
+    assert commands[-1].violation == pytest.approx(0.0, abs=1e-9)
+    assert not any(command.is_fallback for command in commands)
 
 
-def test_fallback_is_nearest_to_the_last_command_and_inside(monkeypatch):
+def test_fallback_repeats_the_last_allowed_command(monkeypatch):
     p = primitive(history=0)
     stepper = p.start()
     last = stepper.step([0.0, 0.0]).output
@@ -74,7 +75,7 @@ def test_fallback_is_nearest_to_the_last_command_and_inside(monkeypatch):
     assert stepper.num_steps == 2
 
 
-def test_a_change_of_a_command_does_not_change_the_next_one():
+def test_stepper_copies_its_commands():
     p = primitive(history=0)
     motion = MotionConstraintFilter(MotionConstraints(p.constraints, max_speed=[1.0, 1.0]), PERIOD)
     for filtered in (None, motion):
@@ -107,12 +108,12 @@ def test_measured_history_follows_the_measured_pose():
         ({"history_source": "guessed"}, "commanded or measured"),
     ],
 )
-def test_wrong_start_is_refused(keywords, message):
+def test_start_refuses_invalid_arguments(keywords, message):
     with pytest.raises(InputError, match=message):
         primitive().start(**keywords)
 
 
-def test_wrong_step_is_refused_and_the_episode_continues():
+def test_step_refuses_invalid_arguments_without_advancing():
     stepper = primitive().start(history_source="measured")
     for action in ([0.0], [np.nan, 0.0], [np.inf, 0.0]):
         with pytest.raises(InputError, match="action must be 2 finite numbers"):
@@ -126,9 +127,9 @@ def test_wrong_step_is_refused_and_the_episode_continues():
 def test_filter_of_another_type_or_size_is_refused():
     p = primitive()
     larger = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(3)), PERIOD)
-    for wrong in (5, MotionConstraints(p.constraints), larger):
+    for motion in (5, MotionConstraints(p.constraints), larger):
         with pytest.raises(InputError, match="motion is a"):
-            p.start(motion=wrong)
+            p.start(motion=motion)
     for arguments in ((p.constraints, PERIOD), (MotionConstraints(p.constraints), "0.02")):
         with pytest.raises(InputError, match=r"needs MotionConstraints|must be a number, not '0.02'"):
             MotionConstraintFilter(*arguments)
