@@ -64,7 +64,7 @@ def test_spring_wrench_is_the_gradient_of_its_potential(seed):
     motion = rng.standard_normal(6)
 
     def potential(s):
-        # The tool moves by s·motion: the error of the position shrinks, and R_desired Rᵀ is turned back.
+        # A tool displacement s·motion reduces the position error, and its rotation is removed from R_desired Rᵀ.
         _, epsilon = quaternion(R_error * Rotation.from_rotvec(-s * motion[3:]))
         e = np.concatenate([p - s * motion[:3], 2 * epsilon])
         return 0.5 * e @ K @ e
@@ -98,49 +98,49 @@ def test_every_mode_has_the_damping_ratio(seed, ratio, scale):
 
 @given(SEEDS)
 def test_torques_are_the_wrench_and_gravity_in_joint_space(seed):
-    given_ = arm(seed, posture_torque=np.zeros(7))
-    result = impedance_torques(**given_)
-    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T)
-    spring = spring_wrench(given_["K"], given_["p_error"], given_["eta"], given_["epsilon"])
-    wrench = spring - damping_matrix(given_["K"], Lambda_inverse, 0.7) @ (given_["J"] @ given_["v"])
+    arguments = arm(seed, posture_torque=np.zeros(7))
+    result = impedance_torques(**arguments)
+    Lambda_inverse = arguments["J"] @ np.linalg.solve(arguments["M"], arguments["J"].T)
+    spring = spring_wrench(arguments["K"], arguments["p_error"], arguments["eta"], arguments["epsilon"])
+    wrench = spring - damping_matrix(arguments["K"], Lambda_inverse, 0.7) @ (arguments["J"] @ arguments["v"])
     np.testing.assert_allclose(result.wrench, wrench, rtol=1e-5, atol=1e-5 * np.abs(wrench).max())
-    np.testing.assert_allclose(result.torque, given_["J"].T @ result.wrench + given_["gravity_torque"], atol=1e-9)
+    np.testing.assert_allclose(result.torque, arguments["J"].T @ result.wrench + arguments["gravity_torque"], atol=1e-9)
     assert not result.is_saturated
 
 
 @given(SEEDS)
 def test_posture_torque_does_not_accelerate_the_tool(seed):
-    given_ = arm(seed)
-    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T)
-    # Near a singular posture a part of the posture's torque acts on the tool, so that the arm leaves the posture.
+    arguments = arm(seed)
+    Lambda_inverse = arguments["J"] @ np.linalg.solve(arguments["M"], arguments["J"].T)
+    # Near a singular posture a part of the posture torque accelerates the tool, so that the arm leaves the posture.
     assume(np.allclose(reachable_inertia(Lambda_inverse) @ Lambda_inverse, np.eye(6)))
-    with_posture = impedance_torques(**given_)
+    with_posture = impedance_torques(**arguments)
     without = impedance_torques(**arm(seed, posture_torque=np.zeros(7)))
     np.testing.assert_array_equal(with_posture.wrench, without.wrench)
     added = with_posture.torque - without.torque
-    acceleration = given_["J"] @ np.linalg.solve(given_["M"], added)
-    assert np.abs(acceleration).max() < 1e-6 * np.abs(given_["posture_torque"]).max() * 100
-    # It moves the joints, because seven joints have one direction that does not move the tool.
+    acceleration = arguments["J"] @ np.linalg.solve(arguments["M"], added)
+    assert np.abs(acceleration).max() < 1e-6 * np.abs(arguments["posture_torque"]).max() * 100
+    # The posture torque acts on the joints: seven joints have one direction that does not move the tool.
     assert np.abs(added).max() > 1e-6
 
 
 @given(SEEDS, st.floats(0.01, 3.0))
 def test_wrench_is_clipped_per_axis(seed, share):
     """Spring and damper are clipped together, and each axis separately."""
-    free = impedance_torques(**arm(seed))
-    limits = share * np.abs(free.wrench).max() * np.linspace(0.2, 1, 6)
+    unlimited = impedance_torques(**arm(seed))
+    limits = share * np.abs(unlimited.wrench).max() * np.linspace(0.2, 1, 6)
     result = impedance_torques(**arm(seed, wrench_limits=limits))
-    np.testing.assert_allclose(result.wrench, np.clip(free.wrench, -limits, limits), rtol=1e-12)
-    assert result.is_saturated == bool((np.abs(free.wrench) >= limits).any())
+    np.testing.assert_allclose(result.wrench, np.clip(unlimited.wrench, -limits, limits), rtol=1e-12)
+    assert result.is_saturated == bool((np.abs(unlimited.wrench) >= limits).any())
 
 
 @given(SEEDS, st.floats(0.01, 3.0))
 def test_torques_are_clipped_to_the_motor_limits(seed, share):
-    free = impedance_torques(**arm(seed))
-    limits = share * np.abs(free.torque).max() * np.linspace(0.2, 1, 7)
+    unlimited = impedance_torques(**arm(seed))
+    limits = share * np.abs(unlimited.torque).max() * np.linspace(0.2, 1, 7)
     result = impedance_torques(**arm(seed, torque_limits=limits))
-    np.testing.assert_allclose(result.torque, np.clip(free.torque, -limits, limits), rtol=1e-12)
-    assert result.is_saturated == bool((np.abs(free.torque) > limits).any())
+    np.testing.assert_allclose(result.torque, np.clip(unlimited.torque, -limits, limits), rtol=1e-12)
+    assert result.is_saturated == bool((np.abs(unlimited.torque) > limits).any())
 
 
 @given(SEEDS)
@@ -150,21 +150,21 @@ def test_law_in_rotated_axes_equals_the_rotated_law(seed):
     R = Rotation.random(rng=rng).as_matrix()
     R6 = np.kron(np.eye(2), R)
     limits = np.abs(impedance_torques(**arm(seed)).wrench).max() * np.array([0.1, 0.5, 2, 0.1, 0.5, 2])
-    given_ = arm(seed, wrench_limits=limits)
-    turned = impedance_torques(
+    arguments = arm(seed, wrench_limits=limits)
+    rotated = impedance_torques(
         **{
-            **given_,
+            **arguments,
             "R_axes": R,
-            "p_error": R @ given_["p_error"],
-            "epsilon": R @ given_["epsilon"],
-            "J": R6 @ given_["J"],
+            "p_error": R @ arguments["p_error"],
+            "epsilon": R @ arguments["epsilon"],
+            "J": R6 @ arguments["J"],
         }
     )
-    straight = impedance_torques(**given_)
-    scale = np.abs(straight.torque).max()
-    np.testing.assert_allclose(turned.wrench, R6 @ straight.wrench, atol=1e-6 * scale)
-    np.testing.assert_allclose(turned.torque, straight.torque, atol=1e-6 * scale)
-    assert turned.is_saturated == straight.is_saturated
+    unrotated = impedance_torques(**arguments)
+    scale = np.abs(unrotated.torque).max()
+    np.testing.assert_allclose(rotated.wrench, R6 @ unrotated.wrench, atol=1e-6 * scale)
+    np.testing.assert_allclose(rotated.torque, unrotated.torque, atol=1e-6 * scale)
+    assert rotated.is_saturated == unrotated.is_saturated
 
 
 STIFF = {"contact_stiffness": 2.5e4}
@@ -179,16 +179,16 @@ BOUNDS = {
 @pytest.mark.parametrize("name", BOUNDS)
 @given(seed=SEEDS)
 def test_bound_limits_spring_and_damper_along_the_axes(name, is_turned, seed):
-    given_, bound = arm(seed), BOUNDS[name]
+    arguments, bound = arm(seed), BOUNDS[name]
     R = Rotation.random(rng=np.random.default_rng([seed, 1])).as_matrix() if is_turned else np.eye(3)
     R6 = np.kron(np.eye(2), R)
-    Lambda_inverse = given_["J"] @ np.linalg.solve(given_["M"], given_["J"].T) + 1e-9 * np.eye(6)
-    V, K = given_["J"] @ given_["v"], R6 @ given_["K"] @ R6.T
-    spring = spring_wrench(K, given_["p_error"], given_["eta"], given_["epsilon"])
+    Lambda_inverse = arguments["J"] @ np.linalg.solve(arguments["M"], arguments["J"].T) + 1e-9 * np.eye(6)
+    V, K = arguments["J"] @ arguments["v"], R6 @ arguments["K"] @ R6.T
+    spring = spring_wrench(K, arguments["p_error"], arguments["eta"], arguments["epsilon"])
     damping = damping_matrix(K, Lambda_inverse, 0.7) @ V
     mass = (V[:3] @ V[:3]) / (V[:3] @ Lambda_inverse[:3, :3] @ V[:3])
     expected = bounded_wrench(R6.T @ spring, R6.T @ damping, R.T @ V[:3], mass, bound)
-    result = impedance_torques(**given_ | {"R_axes": R if is_turned else None, "bound": bound})
+    result = impedance_torques(**arguments | {"R_axes": R if is_turned else None, "bound": bound})
     np.testing.assert_allclose(R6.T @ result.wrench, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     assert result.is_saturated == (np.abs(expected - R6.T @ (spring - damping)).max() > 1e-6)
     if name == "wide":
@@ -198,11 +198,11 @@ def test_bound_limits_spring_and_damper_along_the_axes(name, is_turned, seed):
 @pytest.mark.parametrize(("force", "is_saturated"), [(1e-9, False), (1.0005e-9, True)])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_rounding_by_a_bound_is_no_saturation(sign, force, is_saturated):
-    """At rest, where the mass of an approach is not needed."""
+    """At rest, a clipped force counts as saturation above 1e-9 N."""
     K, error = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), np.array([0.0, 0.5 * sign * force, 0.0])
-    given_ = arm(0, K=K, v=np.zeros(7), p_error=error, eta=1.0, epsilon=np.zeros(3))
+    arguments = arm(0, K=K, v=np.zeros(7), p_error=error, eta=1.0, epsilon=np.zeros(3))
     axes = np.array([1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
-    result = impedance_torques(**given_ | {"bound": WrenchBound(axes, np.inf, np.inf, **STIFF)})
+    result = impedance_torques(**arguments | {"bound": WrenchBound(axes, np.inf, np.inf, **STIFF)})
     assert result.is_saturated == is_saturated
 
 
@@ -217,8 +217,9 @@ def test_thresholds_have_their_documented_values():
 def test_wrench_at_its_limit_is_saturated(number, size):
     K = np.diag([1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
     error = 1.0 * (np.arange(6) == number)
-    given_ = arm(0, K=K, v=np.zeros(7), p_error=error[:3], eta=0.0, epsilon=error[3:], wrench_limits=np.full(6, size))
-    assert impedance_torques(**given_).is_saturated == (size == 1.0 and number < 3)
+    errors = {"p_error": error[:3], "eta": 0.0, "epsilon": error[3:]}
+    arguments = arm(0, K=K, v=np.zeros(7), wrench_limits=np.full(6, size), **errors)
+    assert impedance_torques(**arguments).is_saturated == (size == 1.0 and number < 3)
 
 
 def test_law_refuses_an_inertia_that_is_not_positive():
@@ -243,7 +244,7 @@ SCALE = np.array([1.0] * 3 + [LEVER] * 3)
 
 
 def inertia_inverse(masses, rng):
-    """Return Λ⁻¹ of the given masses, rotational ones at the lever."""
+    """Return Λ⁻¹ of six masses [kg] along random directions; a moment of inertia is that of a mass at LEVER."""
     U, _ = np.linalg.qr(rng.standard_normal((6, 6)))
     return (U / masses) @ U.T / np.outer(SCALE, SCALE)
 
@@ -274,14 +275,15 @@ def test_reachable_inertia_falls_smoothly_with_the_mass():
 
 @pytest.mark.parametrize("axis", range(6))
 def test_reachable_inertia_halves_a_mass_in_the_middle(axis):
-    """In the middle between both masses on a logarithmic scale; rotational ones are converted by the lever."""
+    """The mass is the geometric mean of LIGHT and HEAVY; a moment of inertia is that of the mass at LEVER."""
     masses = np.ones(6)
     masses[axis] = np.sqrt(LIGHT * HEAVY)
     inertia = reachable_inertia(np.diag(1.0 / (masses * SCALE**2)))
     np.testing.assert_allclose(np.diag(inertia)[axis], 0.5 * masses[axis] * SCALE[axis] ** 2, rtol=1e-6)
 
 
-def law(J, posture_torque, M=None):
+def torques_at_rest(J, posture_torque, M=None):
+    """Return the torques of an arm at rest without a pose error."""
     n = J.shape[1]
     return impedance_torques(
         K=np.diag([1500.0] * 3 + [30.0] * 3),
@@ -305,31 +307,31 @@ def test_posture_torque_has_no_effect_with_six_joints():
     for _ in range(10):
         U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
         J = (U * rng.uniform(0.2, 1.0, 6)) @ W.T / SCALE[:, None]
-        np.testing.assert_allclose(law(J, rng.standard_normal(6)), 0.0, atol=1e-6)
+        np.testing.assert_allclose(torques_at_rest(J, rng.standard_normal(6)), 0.0, atol=1e-6)
 
 
 def test_posture_torque_acts_in_the_singular_direction():
     rng = np.random.default_rng(3)
     U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
     J = (U * [1.0, 0.8, 0.6, 0.4, 0.3, 0.0]) @ W.T / SCALE[:, None]
-    lost = W[:, 5]
-    torque = law(J, 3.0 * lost + W[:, 0])
-    np.testing.assert_allclose(torque, 3.0 * lost, atol=1e-6)
+    singular = W[:, 5]
+    torque = torques_at_rest(J, 3.0 * singular + W[:, 0])
+    np.testing.assert_allclose(torque, 3.0 * singular, atol=1e-6)
 
 
 def test_posture_torque_acts_on_a_heavy_rotation():
     M = np.diag([1.0, 1.0, 1.0, 0.1, 0.1, HEAVY * LEVER**2])
-    np.testing.assert_allclose(law(np.eye(6), np.ones(6), M), [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], atol=1e-6)
+    np.testing.assert_allclose(torques_at_rest(np.eye(6), np.ones(6), M), [0.0, 0.0, 0.0, 0.0, 0.0, 1.0], atol=1e-6)
 
 
 def test_posture_torque_acts_before_the_arm_is_singular():
     rng = np.random.default_rng(3)
     U, W = (np.linalg.qr(rng.standard_normal((6, 6)))[0] for _ in range(2))
     J = (U * [1.0, 0.8, 0.6, 0.4, 0.3, (2.0 * HEAVY) ** -0.5]) @ W.T / SCALE[:, None]
-    torque = law(J, 3.0 * W[:, 5] + W[:, 0])
+    torque = torques_at_rest(J, 3.0 * W[:, 5] + W[:, 0])
     np.testing.assert_allclose(torque, 3.0 * W[:, 5], atol=1e-6)
 
 
 def test_impedance_torques_refuse_an_invalid_mass_matrix():
     with pytest.raises(np.linalg.LinAlgError, match="mass matrix"):
-        law(np.eye(6), np.zeros(6), M=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]))
+        torques_at_rest(np.eye(6), np.zeros(6), M=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]))

@@ -53,35 +53,35 @@ def test_missing_and_malformed_statuses_are_faults():
 
 class Unreadable:
     def __repr__(self):
-        return "unreadable"  # the names of tests must not depend on the process
+        return "unreadable"  # test ids must not depend on the address of the object
 
     def __array__(self, *arguments, **keywords):
         raise OSError("cable unplugged")
 
 
 FIELDS = ("positions", "velocities", "external_torque")
-NO_NUMBERS = [["a", "b"], "text", None, [None, 0.0], [0.5j, 0.0], [True, False], [[0.0], [0.0, 0.0]], Unreadable()]
-NO_NUMBERS += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="datetime64[s]")]
+INVALID_VALUES = [["a", "b"], "text", None, [None, 0.0], [0.5j, 0.0], [True, False], [[0.0], [0.0, 0.0]], Unreadable()]
+INVALID_VALUES += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="datetime64[s]")]
 
 
-@pytest.mark.parametrize("part", FIELDS)
-@pytest.mark.parametrize("value", NO_NUMBERS, ids=str)
-def test_field_of_wrong_type_is_malformed(part, value):
-    wrong = replace(status(), **{part: value})
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", INVALID_VALUES, ids=str)
+def test_field_of_wrong_type_is_malformed(field, value):
+    wrong = replace(status(), **{field: value})
     assert check_status(wrong, LAST, 116.0, LIMITS) == Fault.MALFORMED
     assert parse_status(wrong) is MALFORMED_STATUS
 
 
-@pytest.mark.parametrize("part", ["time", "conflicts", "foreign_commands"])
+@pytest.mark.parametrize("field", ["time", "conflicts", "foreign_commands"])
 @pytest.mark.parametrize("value", ["now", None, 1j, True, [16.0], np.zeros(2), Unreadable()], ids=str)
-def test_scalar_of_wrong_type_is_malformed(part, value):
-    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+def test_scalar_of_wrong_type_is_malformed(field, value):
+    assert check_status(replace(status(), **{field: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
-@pytest.mark.parametrize("part", ["conflicts", "foreign_commands"])
+@pytest.mark.parametrize("field", ["conflicts", "foreign_commands"])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_counter_that_is_not_finite_is_malformed(part, value):
-    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
+def test_counter_that_is_not_finite_is_malformed(field, value):
+    assert check_status(replace(status(), **{field: value}), LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
 @pytest.mark.parametrize("value", [{"time": 1.0}, "status", 0, False, Unreadable()], ids=str)
@@ -89,10 +89,10 @@ def test_object_of_another_type_is_malformed(value):
     assert check_status(value, LAST, 116.0, LIMITS) == Fault.MALFORMED
 
 
-@pytest.mark.parametrize("part", FIELDS)
-@pytest.mark.parametrize("value", [0.0, np.zeros((2, 1)), np.zeros((1, 2)), np.zeros((2, 2)), []], ids=np.shape)
-def test_field_of_wrong_shape_is_a_fault(part, value):
-    assert check_status(replace(status(), **{part: value}), LAST, 116.0, LIMITS) == Fault.WRONG_SIZE
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", [np.zeros(n) for n in ((), 0, 1, 3, (2, 1), (1, 2), (2, 2))], ids=np.shape)
+def test_field_of_wrong_shape_is_a_fault(field, value):
+    assert check_status(replace(status(), **{field: value}), LAST, 116.0, LIMITS) == Fault.WRONG_SIZE
 
 
 def test_parsed_status_has_the_same_numbers_in_its_own_arrays():
@@ -106,16 +106,10 @@ def test_parsed_status_has_the_same_numbers_in_its_own_arrays():
     assert parse_status(None) is None
 
 
-@pytest.mark.parametrize("part", ["positions", "velocities", "external"])
-@pytest.mark.parametrize("size", [0, 1, 3])
-def test_wrong_size_of_each_part_is_a_fault(part, size):
-    assert check(**{part: np.zeros(size)}) == Fault.WRONG_SIZE
-
-
-@pytest.mark.parametrize("part", ["positions", "velocities", "external"])
+@pytest.mark.parametrize("field", ["positions", "velocities", "external"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_one_value_that_is_not_finite_is_a_fault(part, value):
-    assert check(**{part: (0.25, value)}) == Fault.NOT_FINITE
+def test_one_value_that_is_not_finite_is_a_fault(field, value):
+    assert check(**{field: (0.25, value)}) == Fault.NOT_FINITE
 
 
 @pytest.mark.parametrize("time", [np.nan, np.inf])
@@ -145,22 +139,23 @@ def test_repeated_status_is_not_compared():
     assert check(now=116.0, time=16.0, positions=(9.0, 9.0)) == Fault.NONE
 
 
-REACH = (0.015625 + ELAPSED, 0.015625 + 2.0 * ELAPSED)
+# Maximum change of each position [rad]: position_jump plus the maximum velocity times ELAPSED.
+MAX_CHANGE = (0.015625 + ELAPSED, 0.015625 + 2.0 * ELAPSED)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("joint", [0, 1])
 def test_jumps_are_checked_at_their_limits(joint, sign):
-    def moved(start, by):
+    def changed(start, by):
         values = np.array(start)
         values[joint] += sign * by
         return values
 
-    assert check(positions=moved((0.5, -0.5), REACH[joint])) == Fault.NONE
-    assert check(positions=moved((0.5, -0.5), REACH[joint] + EPSILON)) == Fault.POSITION_JUMP
-    assert check(velocities=moved((0.25, -0.25), 1.5)) == Fault.NONE
-    assert check(velocities=moved((0.25, -0.25), 1.5 + EPSILON)) == Fault.VELOCITY_JUMP
-    assert check(external=moved((3.0, 4.0), 1000.0)) == Fault.NONE
+    assert check(positions=changed((0.5, -0.5), MAX_CHANGE[joint])) == Fault.NONE
+    assert check(positions=changed((0.5, -0.5), MAX_CHANGE[joint] + EPSILON)) == Fault.POSITION_JUMP
+    assert check(velocities=changed((0.25, -0.25), 1.5)) == Fault.NONE
+    assert check(velocities=changed((0.25, -0.25), 1.5 + EPSILON)) == Fault.VELOCITY_JUMP
+    assert check(external=changed((3.0, 4.0), 1000.0)) == Fault.NONE
 
 
 def test_position_is_checked_against_the_position_jump():

@@ -29,7 +29,7 @@ def test_no_command_and_no_path_enters_a_spherical_obstacle():
     results = attack(2400, seed=5)
     for kind in KINDS:
         assert not is_violated(kind, results[kind]), (kind, results[kind])
-    assert sum(result.touching for result in results.values()) > 50  # or the adversary would show nothing
+    assert sum(result.touching for result in results.values()) > 50  # the adversary reaches the obstacles
 
 
 @pytest.mark.parametrize("limits", LIMITS.values(), ids=LIMITS)
@@ -37,7 +37,7 @@ def test_constraints_are_satisfied_for_any_desired_command(limits):
     motion = MotionConstraints(LINEAR, OUTSIDE, INSIDE, *limits)
     law, rng = MotionConstraintFilter(motion, PERIOD), np.random.default_rng(0)
     state, desired = law.start(np.array([0.3, 0.1])), np.zeros(2)
-    worst, between, displacements = -np.inf, np.inf, [np.zeros(2)]
+    worst, clearance, displacements = -np.inf, np.inf, [np.zeros(2)]
     for k in range(700):
         last = state[:2]
         if rng.uniform() < 0.1:
@@ -47,14 +47,14 @@ def test_constraints_are_satisfied_for_any_desired_command(limits):
         state, _ = law.apply(state, desired)
         worst = max(worst, motion.violation(state[:2]))
         shares = np.linspace(0.0, 1.0, 5)
-        between = min(between, *(s.distance(last + t * (state[:2] - last)) for s in OUTSIDE for t in shares))
+        clearance = min(clearance, *(s.distance(last + t * (state[:2] - last)) for s in OUTSIDE for t in shares))
         displacements.append(state[:2] - last)
-    assert -1e-4 < worst <= 1e-9  # constraints were reached, and not passed
-    assert between >= 0.0
+    assert -1e-4 < worst <= 1e-9  # constraints are reached and satisfied
+    assert clearance >= 0.0
     moves = np.array(displacements)
     for limit, actual in ((limits[0], moves / PERIOD), (limits[1], np.diff(moves, axis=0) / PERIOD**2)):
         if limit is not None:
-            np.testing.assert_allclose(np.abs(actual).max(axis=0), limit, rtol=1e-6)  # reached, and not exceeded
+            np.testing.assert_allclose(np.abs(actual).max(axis=0), limit, rtol=1e-6)  # limits are reached and satisfied
 
 
 @pytest.mark.parametrize("size", [1e8, 1e20, 1e150, 1e300])
@@ -77,7 +77,7 @@ def test_command_is_projected_when_constraints_are_violated():
     after, is_braking = law.apply(state, allowed)
     np.testing.assert_array_equal(after, [*allowed, *(allowed - state[:2])])
     assert not is_braking
-    # The plane is that of the last command, at 0.42 along x.
+    # The half space of the sphere at the last command ends at x = 0.42.
     np.testing.assert_allclose(law.apply(state, np.array([0.5, 0.35]))[0][:2], [0.42, 0.35], atol=2e-8)
     np.testing.assert_allclose(law.apply(state, np.array([0.3, -0.2]))[0][:2], [0.3, 0.0], atol=1e-9)
 
@@ -121,7 +121,7 @@ def test_filter_brakes_when_the_wall_is_at_braking_distance():
 @pytest.mark.parametrize("dims", [1, 2, 3, 6])
 @pytest.mark.parametrize("kind", ["linear", "outside", "inside", "state"])
 def test_start_too_fast_to_brake_exceeds_only_acceleration(dims, kind):
-    """One output moves at 1 m/s and is 5 cm before its limit; at 2 m/s², it brakes within 25 cm."""
+    """One output moves at 1 m/s, 5 cm before its limit; its braking distance at 2 m/s² is 25 cm."""
     limit = LinearConstraints(-np.eye(dims)[:1], np.array([-0.05]))
     shapes = {"outside": [Sphere(np.eye(dims)[0] * 0.15, 0.1)], "inside": [Sphere(np.zeros(dims), 0.05)]}
     shapes["state"] = [FirstOutputLimit(limit)]
@@ -135,23 +135,23 @@ def test_start_too_fast_to_brake_exceeds_only_acceleration(dims, kind):
         state, _ = law.apply(state, goal)
         positions.append(state[0])
         assert motion.violation(state[:dims]) <= 1e-9
-    assert 0.0 < positions[0] < 0.02 - 2.0 * PERIOD**2  # more than the largest acceleration
+    assert 0.0 < positions[0] < 0.02 - 2.0 * PERIOD**2  # brakes by more than the maximum acceleration
     assert max(positions) == pytest.approx(0.05, abs=1e-4)
     assert np.abs(np.diff(positions, 2)).max() <= 2.0 * PERIOD**2 * (1 + 1e-6)
-    beyond = law.start(goal, fast)[dims]  # farther outside, or away from the obstacle
-    assert beyond == 0.02 if kind == "outside" else beyond < 2.0 * PERIOD**2
+    displacement = law.start(goal, fast)[dims]  # from a start beyond the limit, or behind the obstacle
+    assert displacement == 0.02 if kind == "outside" else displacement < 2.0 * PERIOD**2
 
 
 def test_start_that_would_cross_the_allowed_region_stops():
     law = MotionConstraintFilter(
         MotionConstraints(LinearConstraints.none(1), inside=[Sphere([0.0], 0.01)], max_acceleration=[2.0]), PERIOD
     )
-    for speed, is_kept in ((0.004, True), (0.02, False)):
-        assert (law.start(np.array([-0.02]), np.array([speed]))[1] == speed) == is_kept
+    for speed, is_unchanged in ((0.004, True), (0.02, False)):
+        assert (law.start(np.array([-0.02]), np.array([speed]))[1] == speed) == is_unchanged
 
 
 def test_motion_along_a_gap_without_width_is_possible():
-    """Constraints do not contradict each other at the last command, so that a next command exists."""
+    """The half spaces of both walls contain the last command, so that a next command exists."""
     walls = Box([-np.inf, -np.inf], [0.2, np.inf]), Box([0.2 + 1e-9, -np.inf], [np.inf, np.inf])
     law = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(2), walls), PERIOD)
     state, is_braking = law.apply(law.start(np.array([0.2 + 5e-10, 0.1])), np.array([0.4, 0.3]))
@@ -234,7 +234,7 @@ class AngleLimit:
     ],
 )
 def test_lengths_and_angles_have_separate_violations(output, expected, largest):
-    """The largest of them counts an angle as its arc at 0.25 m."""
+    """The violation as one number is the largest violation, with an angle as the arc at a radius of 0.25 m."""
     linear = LinearConstraints(np.array([[-1.0, 0.0]]), np.array([-0.1]))
     constraints = MotionConstraints(linear, inside=[Sphere([0.0], 0.2)], state=[AngleLimit()])
     np.testing.assert_allclose(constraints.violations(np.array(output)), expected, atol=1e-12)

@@ -21,7 +21,7 @@ def points(shape, count=300, seed=0):
 
 
 def expected_distance(shape, p):
-    """Distance by minimization over points of the shape without its margin; zero inside."""
+    """Return the distance from a point to a shape without its margin [m], zero inside."""
     if isinstance(shape, Sphere):
         return max(np.linalg.norm(p - shape.center) - shape.radius, 0.0)
     if isinstance(shape, Box):
@@ -66,27 +66,27 @@ def test_linearization_error_of_a_sphere_has_its_bound():
 
 @EACH
 def test_half_space_separates_a_point_from_the_shape(shape):
-    within = [y for y in points(shape, 2000, 1) if shape.distance(y) <= 0.0]
+    inside = [y for y in points(shape, 2000, 1) if shape.distance(y) <= 0.0]
     for p in points(shape, 100):
         n, c = shape.half_space(p)
         assert (n @ p >= c - 1e-12) == (shape.distance(p) >= -1e-12)
-        assert max(n @ y - c for y in within) <= 1e-12
+        assert max(n @ y - c for y in inside) <= 1e-12
 
 
 @EACH
 def test_separating_half_space_contains_a_line_outside(shape):
-    lines, bisected = 0, 0
+    num_lines, num_excluded = 0, 0
     for p, q in zip(points(shape, 400), points(shape, 400, 1), strict=True):
         if min(shape.distance(p + t * (q - p)) for t in np.linspace(0.0, 1.0, 21)) < 0.03:
             continue
-        lines += 1
+        num_lines += 1
         n, c = shape.separate(p, q)
         assert min(n @ p, n @ q) >= c - 1e-12
         n_p, c_p = shape.half_space(p)
         n_q, c_q = shape.half_space(q)
-        bisected += n_p @ q < c_p and n_q @ p < c_q
-    assert lines > 20
-    assert bisected > 0 or isinstance(shape, Box)
+        num_excluded += n_p @ q < c_p and n_q @ p < c_q
+    assert num_lines > 20
+    assert num_excluded > 0 or isinstance(shape, Box)
 
 
 def test_normals_at_the_center_are_unit_vectors():
@@ -107,14 +107,14 @@ def test_lines_between_linearized_commands_are_outside():
     constraints = linearize([disc], path(), LinearConstraints.box([-1.0, -1.0], [2.0, 1.0]))
     assert constraints.num_steps == 60
     assert constraints.num_constraints == 6
-    rng, last, nearest = np.random.default_rng(0), None, np.inf
+    rng, previous, clearance = np.random.default_rng(0), None, np.inf
     for n in range(60):
         command = constraints.nearest(disc.center + 0.1 * rng.standard_normal(2), n)
-        if last is not None:
+        if previous is not None:
             for share in np.linspace(0.0, 1.0, 11):
-                nearest = min(nearest, disc.distance(last + share * (command - last)))
-        last = command
-    assert 0.5 * CLEARANCE < nearest < 100 * CLEARANCE
+                clearance = min(clearance, disc.distance(previous + share * (command - previous)))
+        previous = command
+    assert 0.5 * CLEARANCE < clearance < 100 * CLEARANCE
 
 
 def test_linearize_returns_the_constraints_without_shapes():

@@ -1,4 +1,4 @@
-"""Bounded wrench of an impedance: within its bound for every input, passive, and with a limited approach speed."""
+"""Bounded wrench of an impedance law: inside its bound for any input, passive, with a limited approach speed."""
 
 import itertools
 from dataclasses import replace
@@ -61,7 +61,7 @@ def test_damping_share_is_the_largest_inside_the_bound():
 @pytest.mark.parametrize("mass", [1.5, 8.0])
 @pytest.mark.parametrize("axis", [9.0, 18.0])
 def test_impact_stays_inside_the_bound(axis, mass):
-    """A mass that is pulled to a far reference hits a stop of the contact stiffness with at most the bound's force."""
+    """A mass that is pulled to a distant reference hits a stiff stop; the contact force is at most the force bound."""
     bound = replace(BOUND, axes=np.full(6, axis))
     damping, impedance = 2.0 * np.sqrt(K * mass), approach_impedance(bound.contact_stiffness, mass)
 
@@ -82,23 +82,23 @@ def test_impact_stays_inside_the_bound(axis, mass):
     free = bounded_wrench(
         np.r_[100.0, np.zeros(5)], np.zeros(6), np.array([1.0, 0, 0]), mass, WrenchBound(AXES, 18.0, 4.0)
     )
-    assert free[0] == AXES[0]  # without a contact stiffness nothing limits the speed
+    assert free[0] == AXES[0]  # without a contact stiffness the speed is not limited
 
 
 def test_closed_paths_gain_no_energy_at_a_fixed_reference():
-    """An adversary moves the tool along random closed paths; the bound is per axis, as `Impedance` makes it."""
+    """The tool moves along random closed paths; the force bound follows from the bounds per axis, as in `Impedance`."""
     rng = np.random.default_rng(2)
     bound = WrenchBound(AXES, float(np.linalg.norm(AXES[:3])), 10.0, 2.5e4)
     for _ in range(40):
         corners = np.vstack([np.zeros(3), rng.normal(scale=0.02, size=(4, 3)), np.zeros(3)])
-        gained = 0.0
+        energy = 0.0
         for start, end in itertools.pairwise(corners):
             velocity = (end - start) / np.linalg.norm(end - start) * 10.0 ** rng.uniform(-3, 0)
             points = np.linspace(start, end, 400)
             for point in 0.5 * (points[1:] + points[:-1]):
                 wrench = bounded_wrench(np.r_[-K * point, 0, 0, 0], np.r_[D * velocity, 0, 0, 0], velocity, MASS, bound)
-                gained += float(wrench[:3] @ (end - start)) / 399.0
-        assert gained <= 1e-5
+                energy += float(wrench[:3] @ (end - start)) / 399.0
+        assert energy <= 1e-5
 
 
 def test_lowered_bound_is_never_above_the_original():
@@ -138,10 +138,10 @@ def test_governed_error_leaves_room_for_an_implicit_damper():
         implicit = (stiffness * step + damping) * velocity
         spring = stiffness * governed
         for after in (implicit, -implicit, 0.0 * implicit, rng.uniform(-1, 1, 6) * implicit):
-            room = np.maximum(BOUND.axes, np.abs(implicit))
+            bounds = np.maximum(BOUND.axes, np.abs(implicit))
             force = max(BOUND.force, np.linalg.norm(implicit[:3]))
             torque = max(BOUND.torque, np.linalg.norm(implicit[3:]))
-            assert is_inside(spring - after, WrenchBound(room, force, torque))
+            assert is_inside(spring - after, WrenchBound(bounds, force, torque))
     np.testing.assert_allclose(
         governed_error(stiffness, damping, np.full(6, 1e-3), np.zeros(6), MASS, step, BOUND), 1e-3, atol=1e-15
     )
