@@ -20,7 +20,7 @@ class Problem:
         return self.primitive.predict(self.step, self.action, self.history)
 
     def dense(self, precision=Extended, *, step=None, horizon=None, actions=None, at=None) -> DenseWindow:
-        """Return the dense window of this problem; arguments replace its step, horizon, or action by actions (J, O)."""
+        """Return the dense window of this problem, or with another step, horizon, or actions (J, O) at steps (J,)."""
         p = self.primitive
         n, H = self.step if step is None else step, p.horizon if horizon is None else horizon
         P, N = p.history, p.num_steps

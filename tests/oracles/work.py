@@ -10,7 +10,7 @@ from guiderail.tools.experiments.engines.engine import Outcome
 
 
 def work(job):
-    """Square a number; for a path, report it if it exists, or else create it and kill this process."""
+    """Square a number; for a path, report an existing file, or create the file and kill this process."""
     if isinstance(job, Path):
         if job.exists():
             return Outcome(({"found": str(job)},))

@@ -57,9 +57,9 @@ def test_slowdown_preserves_the_path_of_a_fast_chunk():
 
 
 def test_guard_refuses_invalid_arguments():
-    wrong = [{"start": np.array([0.06, 0.0])}, {"mode": "brake"}, {"period": 0.0}]
-    wrong += [{"tolerance": np.ones(3)}, {"tolerance": np.array([0.0, 1.0])}]
-    for argument in wrong:
+    arguments = [{"start": np.array([0.06, 0.0])}, {"mode": "brake"}, {"period": 0.0}]
+    arguments += [{"tolerance": np.ones(3)}, {"tolerance": np.array([0.0, 1.0])}]
+    for argument in arguments:
         with pytest.raises(InputError):
             make_guard(**argument)
     make_guard(start=np.array([0.05, 0.0]))
@@ -89,9 +89,9 @@ def test_first_step_from_a_measured_start_is_within_the_limits(velocity, margin)
     assert (np.abs(np.diff(motion, n=3, axis=0)) <= JERK * PERIOD**3 * (1 + 1e-9)).all()
     assert (np.abs(outputs) <= BOUND + 1e-9).all()
     guard.reset_near(start)
-    for wrong in (BOUND + [1.01 * np.min(margin), 0.0], np.full(2, np.nan), np.zeros(3)):
+    for start in (BOUND + [1.01 * np.min(margin), 0.0], np.full(2, np.nan), np.zeros(3)):
         with pytest.raises(InputError, match="measured start"):
-            guard.reset_near(wrong)
+            guard.reset_near(start)
 
 
 def test_constraint_on_two_outputs_does_not_affect_a_third():

@@ -67,9 +67,9 @@ INVALID_VALUES += [b"ab", {}, [10**400, 0.0], np.array(["NaT", "NaT"], dtype="da
 @pytest.mark.parametrize("field", FIELDS)
 @pytest.mark.parametrize("value", INVALID_VALUES, ids=str)
 def test_field_of_wrong_type_is_malformed(field, value):
-    wrong = replace(status(), **{field: value})
-    assert check_status(wrong, LAST, 116.0, LIMITS) == Fault.MALFORMED
-    assert parse_status(wrong) is MALFORMED_STATUS
+    changed = replace(status(), **{field: value})
+    assert check_status(changed, LAST, 116.0, LIMITS) == Fault.MALFORMED
+    assert parse_status(changed) is MALFORMED_STATUS
 
 
 @pytest.mark.parametrize("field", ["time", "conflicts", "foreign_commands"])
@@ -176,7 +176,7 @@ POSITIVE = ("max_age", "max_lead", "position_jump", "velocity_jump", "position_t
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "changes",
     [
         {"velocity": ()},
         *({name: value} for name in (*POSITIVE, "max_check_interval") for value in (0.0, np.nan, np.inf)),
@@ -185,9 +185,9 @@ POSITIVE = ("max_age", "max_lead", "position_jump", "velocity_jump", "position_t
     ],
     ids=str,
 )
-def test_limits_refuse_values_out_of_range(wrong):
+def test_limits_refuse_values_out_of_range(changes):
     with pytest.raises(InputError):
-        StatusLimits(**({"velocity": (1.0,)} | wrong))
+        StatusLimits(**({"velocity": (1.0,)} | changes))
 
 
 def test_limits_accept_the_ends_of_their_ranges():

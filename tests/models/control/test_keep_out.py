@@ -33,7 +33,7 @@ def test_motion_stops_before_constraints_without_a_box(keep_out):
     assert not blocked
 
 
-def test_step_through_a_wall_stops_before_it(keep_out):
+def test_step_through_a_wall_stops_before_the_margin(keep_out):
     safe, blocked = keep_out.project(np.array([0.2, 0.3]), np.array([0.2, 0.9]))
     np.testing.assert_allclose(safe, [0.2, 0.48], atol=1e-5)
     assert blocked
@@ -59,7 +59,7 @@ def test_motion_stops_before_the_margin_for_any_length():
 
 
 @pytest.mark.parametrize("start", [[0.2, 0.505], [0.2, 0.59]])
-def test_robot_in_a_wall_leaves_on_its_side(keep_out, start):
+def test_robot_in_a_wall_leaves_on_the_nearer_side(keep_out, start):
     start = np.array(start)
     through = np.array([0.2, 0.9 if start[1] < 0.55 else 0.2])
     safe, blocked = keep_out.project(start, through)
@@ -69,7 +69,7 @@ def test_robot_in_a_wall_leaves_on_its_side(keep_out, start):
     np.testing.assert_array_equal(keep_out.project(start, retreat)[0], retreat)
 
 
-def test_random_commands_keep_the_margin(keep_out):
+def test_random_commands_stay_outside_the_margin(keep_out):
     rng = np.random.default_rng(0)
     position = np.array([0.3, 0.05])
     for _ in range(3000):
@@ -82,7 +82,7 @@ def test_random_commands_keep_the_margin(keep_out):
         position = safe
 
 
-def test_two_active_constraints_give_the_nearest_corner():
+def test_target_beyond_two_constraints_moves_to_the_corner():
     corner = KeepOut([[5, 5]], [[6, 6]], LinearConstraints([[-1.0, 0.0], [0.0, -1.0]], [-1.0, -1.0]), margin=0.0)
     safe, _ = corner.project(np.zeros(2), np.array([3.0, 2.0]))
     np.testing.assert_allclose(safe, [1.0, 1.0], atol=1e-9)
@@ -116,7 +116,7 @@ def scene(seed, dimensions=2, boxes=2, planes=0):
 
 
 @given(SEEDS, st.integers(1, 3), st.integers(1, 2))
-def test_path_keeps_the_margin(seed, dimensions, boxes):
+def test_path_stays_outside_the_margin(seed, dimensions, boxes):
     keep_out, lower, upper, start, desired = scene(seed, dimensions, boxes)
     assert keep_out.num_outputs == dimensions
     safe, blocked = keep_out.project(start, desired)
@@ -181,7 +181,6 @@ def test_projection_to_constraints_is_the_nearest_point(seed, planes):
     assert not blocked
     distances = (G @ safe - c) / norms
     assert distances.min() >= DISTANCE - 1e-9
-    # No allowed point is nearer: moving towards the desired point would violate an active constraint.
     tightened = LinearConstraints(G, c + DISTANCE * norms)
     np.testing.assert_allclose(safe, tightened.nearest(desired), rtol=0, atol=1e-8)
     if ((G @ desired - c) / norms).min() >= DISTANCE:
@@ -256,10 +255,10 @@ def test_constructor_refuses_invalid_arguments():
     assert KeepOut([[0, 0]], [[1, 1]], none, 0.0).margin == 0.0
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, -np.inf])
-def test_position_that_is_not_finite_is_refused(wrong):
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_position_that_is_not_finite_is_refused(value):
     wall = KeepOut([[0.4, -9.0]], [[0.6, 9.0]], LinearConstraints.none(2), 0.02)
-    positions = np.array([0.2, 0.2]), np.array([wrong, 0.2])
+    positions = np.array([0.2, 0.2]), np.array([value, 0.2])
     for position, desired in (positions, positions[::-1]):
         with pytest.raises(UnsolvableError, match="finite"):
             wall.project(position, desired)

@@ -134,7 +134,7 @@ def test_restart_does_not_conflict():
 
 
 @pytest.mark.parametrize("offset", [-50.0, 50.0, 2.0 * MAX_DELAY])
-def test_time_stamps_that_return_conflict(offset):
+def test_returning_time_stamps_conflict(offset):
     receipt_times = PERIOD * np.repeat(np.arange(10), 2)
     times = receipt_times + np.tile([0.0, offset], 10)
     assert command_conflicts(times[:2], receipt_times[:2]) == 0

@@ -53,7 +53,7 @@ def test_linearization_error_is_not_negative_inside_and_outside(shape):
     assert inside > 0
 
 
-def test_linearization_error_of_a_sphere_has_its_bound():
+def test_linearization_error_of_a_sphere_is_bounded():
     sphere = SHAPES["sphere"]
     largest = 0.0
     for p, y in zip(points(sphere), points(sphere, seed=1), strict=True):

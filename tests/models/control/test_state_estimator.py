@@ -34,7 +34,7 @@ class Rig:
         self.estimator = StateEstimator(limits, TOLERANCE, period=PERIOD)
         self.state = EstimatorState.initial(2)
         self.q, self.v, self.external, self.step = np.zeros(2), np.array(velocity), np.array(external), 0
-        self.balance = DAMPING * self.v - self.external  # torque that keeps the velocity
+        self.balance = DAMPING * self.v - self.external  # torque at a constant velocity [N m]
         self.now, self.torque = 0.0, np.zeros(2)
 
     def status(self, **changed):
@@ -57,7 +57,7 @@ class Rig:
 
     def settle(self):
         for _ in range(SETTLED):
-            self.torque = self.balance  # also before the first command
+            self.torque = self.balance  # before the first command as well
             self.check()
         assert self.estimate.fault == Fault.NONE
         assert self.estimate.is_new
@@ -118,7 +118,7 @@ def test_settling_time_is_exact_within_a_period():
 @pytest.mark.parametrize(("share", "is_over"), [(1.0, False), (1.0005, True)])
 def test_fault_and_doubt_end_after_the_settling_time(share, is_over):
     rig = Rig().settle()
-    since = rig.now + 2.0 * PERIOD - share * LIMITS.settling_time  # at the check after the next check
+    since = rig.now + 2.0 * PERIOD - share * LIMITS.settling_time  # [s], at the check after the next check
     rig.state = replace(rig.state, fault=float(Fault.FUTURE), fault_time=since, doubt_time=since)
     rig.check()
     assert (rig.state.fault == Fault.NONE, np.isnan(rig.state.doubt_time)) == (is_over, is_over)
@@ -314,7 +314,7 @@ def test_sum_of_early_statuses_is_checked_at_its_limit(share, fault):
 
 @pytest.mark.parametrize(("share", "is_late"), [(1.0, True), (1.0005, False)])
 def test_clocks_are_synchronized_again_after_the_maximum_age(share, is_late):
-    """A stale status belongs to the same clock if the last one was received within the maximum age."""
+    """A stale status belongs to the same clock if the last status was received within the maximum age."""
     rig = Rig(velocity=np.zeros(2), limits=replace(LIMITS, max_age=8 * PERIOD)).settle()
     before, gap = rig.state, share * 8 * PERIOD
     assert rig.check(lambda true: replace(true, time=before.last_time - PERIOD), gap=gap) == Fault.STALE
@@ -492,7 +492,7 @@ def test_joint_at_rest_is_not_frozen_when_one_value_changes(name):
     assert rig.detected(lambda status: frozen(frozen_status, 0, **{name: 1e-9 * rig.step})(status), 20) is None
 
 
-def test_counter_of_equal_values_restarts_when_one_changes():
+def test_counter_of_equal_values_restarts_after_a_change():
     rig = Rig(velocity=[0.0, 0.1]).settle()
     frozen_status, counts = rig.status(), []
     for offset in (0.0, 0.0, 1e-9, 1e-9, 1e-9):
@@ -554,7 +554,7 @@ def test_residual_decays():
 
 @pytest.mark.parametrize(("bias", "is_fault"), [(0.0095, False), (0.0125, True)])
 def test_velocity_bias_is_detected_above_its_tolerance(bias, is_fault):
-    """A bias b adds up to b T = 1e-3 rad at b = 0.01 rad/s."""
+    """A bias of 0.01 rad/s adds up to 1e-3 rad, the position tolerance, over the window of 0.1 s."""
     rig = Rig().settle()
     result = rig.detected(shifted(velocities=[0.0, bias]), 400)
     assert (result is not None) == is_fault
@@ -651,7 +651,7 @@ def test_joint_that_does_not_react_is_a_fault(joint):
 
 @pytest.mark.parametrize(("share", "is_fault"), [(0.95, False), (1.05, True)])
 def test_reaction_is_checked_at_its_tolerance(share, is_fault):
-    """In the limit T |M⁻¹ τ| exceeds Δv_noise + T |M⁻¹| (tolerance + 0.3 |τ| + 0.1 |τ_external|)."""
+    """The limit of T |M⁻¹ τ| at constant τ is Δv_noise + T |M⁻¹| (tolerance + 0.3 |τ| + 0.1 |τ_external|)."""
     inverse = np.linalg.inv(M)
     decay = np.exp(-PERIOD / module.MOMENTUM_WINDOW)
     window = PERIOD * decay / (1.0 - decay)
@@ -669,7 +669,7 @@ def test_reaction_is_checked_at_its_tolerance(share, is_fault):
 @pytest.mark.parametrize(("share", "fault"), [(0.9995, Fault.NONE), (1.0005, Fault.NOT_REACTING)])
 @pytest.mark.parametrize("joint", [0, 1])
 def test_momentum_is_checked_at_its_tolerance(joint, share, fault):
-    """After one status |M⁻¹ (p − m)| may be Δv_noise + |M⁻¹| h tolerance."""
+    """After one status, the limit of |M⁻¹ (p − m)| is Δv_noise + |M⁻¹| h tolerance."""
     rig, zero = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle(), np.zeros(2)
     decay = np.exp(-PERIOD / module.MOMENTUM_WINDOW)
     allowed = LIMITS.velocity_noise + decay * PERIOD * np.abs(np.linalg.inv(M)) @ TOLERANCE
@@ -763,7 +763,7 @@ def test_velocity_is_the_median_of_three_sources():
         np.testing.assert_allclose(rig.estimate.state.velocity, true, atol=1e-6)
 
 
-def test_velocity_is_the_median_when_no_torque_is_missing():
+def test_velocity_is_the_median_without_commanded_torque():
     """Without commanded torque the momentum sums are zero, so that a frozen position does not change the median."""
     rig = Rig(velocity=np.zeros(2), external=np.zeros(2)).settle()
     last = np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0])
@@ -813,7 +813,7 @@ def rig_in_doubt(**arguments):
     ],
     ids=str,
 )
-def test_status_in_doubt_is_accepted_when_it_agrees(change, is_accepted):
+def test_status_in_doubt_is_accepted_when_in_agreement(change, is_accepted):
     rig = rig_in_doubt()
     rig.check(shifted(**change))
     assert rig.estimate.is_new == is_accepted
@@ -840,7 +840,7 @@ def test_status_in_doubt_must_agree_up_to_the_tolerances(index, share, is_accept
     assert rig.estimate.is_new == is_accepted
 
 
-def test_repeated_accepted_status_is_compared_with_the_last_one():
+def test_accepted_status_is_compared_with_the_last_status():
     rig = Rig().settle()
     accepted = rig.status()
     assert rig.check(shifted(time=-1.0)) == Fault.OUT_OF_ORDER
@@ -964,14 +964,14 @@ def test_state_is_restored_from_its_vector():
 
 def test_torque_that_is_not_finite_counts_as_zero():
     rig = Rig().settle()
-    for wrong in (np.nan, np.inf, -np.inf):
-        np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([wrong, 2.0])).torque, [0.0, 2.0])
+    for value in (np.nan, np.inf, -np.inf):
+        np.testing.assert_array_equal(rig.estimator.advance(rig.estimate, np.array([value, 2.0])).torque, [0.0, 2.0])
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf])
-def test_estimator_is_finite_when_its_state_is_not(wrong):
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_estimate_is_finite_when_the_state_is_not_finite(value):
     rig = Rig().settle()
-    state = replace(rig.state, velocity=np.array([wrong, 0.1]))
+    state = replace(rig.state, velocity=np.array([value, 0.1]))
     estimate = rig.estimator.evaluate(state, None, rig.now + PERIOD, M, np.zeros(2))
     np.testing.assert_array_equal(estimate.state.velocity, 0.0)
 
@@ -1079,15 +1079,15 @@ def test_age_of_the_first_status_is_zero():
 @pytest.mark.parametrize(("share", "is_old"), [(0.9995, False), (1.0005, True)])
 @pytest.mark.parametrize("joint", [0, 1])
 def test_inconsistent_status_is_old_beyond_the_agreement(joint, share, is_old):
-    """Positions and velocity of one joint contradict each other, and both contradict the prediction."""
+    """Positions and velocity of one joint contradict each unit, and both contradict the prediction."""
     rig = Rig().settle()
-    predicted, other = rig.state.velocity, np.eye(2)[joint]
-    wrong = share * module.AGREEMENT * other
+    predicted, unit = rig.state.velocity, np.eye(2)[joint]
+    error = share * module.AGREEMENT * unit
     fault = rig.check(
-        lambda true: replace(true, positions=true.positions + 0.5 * PERIOD * other, velocities=CRUISE + wrong)
+        lambda true: replace(true, positions=true.positions + 0.5 * PERIOD * unit, velocities=CRUISE + error)
     )
     assert fault == Fault.INCONSISTENT
-    np.testing.assert_allclose(rig.state.velocity, predicted if is_old else predicted + wrong, atol=2e-3)
+    np.testing.assert_allclose(rig.state.velocity, predicted if is_old else predicted + error, atol=2e-3)
 
 
 RECORDED = {

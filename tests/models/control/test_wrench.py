@@ -37,7 +37,7 @@ def test_wrench_is_inside_the_bound_for_any_input():
         assert is_inside(bounded_wrench(spring, damping, velocity, rng.uniform(0.5, 20.0), BOUND))
 
 
-def test_law_is_spring_and_damper_while_both_are_small():
+def test_law_is_spring_and_damper_at_small_wrenches():
     spring, velocity = np.array([2.0, -1.0, 3.0, 0.1, 0.2, -0.1]), np.array([0.004, 0.0, -0.003])
     damping = np.r_[D * velocity, 0.0, 0.0, 0.0]
     np.testing.assert_allclose(bounded_wrench(spring, damping, velocity, MASS, BOUND), spring - damping, atol=1e-12)
@@ -114,9 +114,9 @@ def test_lowered_to_refuses_other_than_eight_numbers(numbers):
         BOUND.lowered_to(numbers)
 
 
-@pytest.mark.parametrize("wrong", [np.inf, np.nan])
-def test_approach_refuses_bounds_that_are_not_finite(wrong):
-    finite, infinite = np.ones(8), np.r_[np.ones(7), wrong]
+@pytest.mark.parametrize("value", [np.inf, np.nan])
+def test_approach_refuses_bounds_that_are_not_finite(value):
+    finite, infinite = np.ones(8), np.r_[np.ones(7), value]
     for bounds in ((infinite, infinite), (finite, infinite), (infinite, finite)):
         with pytest.raises(InputError, match="the bounds of an approach must be finite"):
             approach_bound(*bounds, np.ones(8))

@@ -208,7 +208,7 @@ VECTOR, EULER = ("r_x", "r_y", "r_z"), ("Rz [rad]", "Ry [rad]", "Rx [rad]")
 @pytest.mark.parametrize("names", [VECTOR, ("rx [rad]", "ry [rad]", "rz [rad]"), EULER, ("a", "theta [rad]")])
 @pytest.mark.parametrize("half_turn", [np.pi, -np.pi])
 def test_angles_are_unwrapped_at_half_turns(names, half_turn):
-    """The demonstrations begin unwrapped or after the half turn; the first demonstration determines the branch."""
+    """The demonstrations begin before or after the half turn; the first demonstration determines the branch."""
     is_pose, column = len(names) == 3, 0 if names == EULER else 1
     axis = np.eye(len(names))[column]
     paths = [np.outer(half_turn + np.linspace(start, start + 0.6, 40), axis) for start in (-0.3, 0.1, -0.1)]

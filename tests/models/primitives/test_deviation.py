@@ -30,7 +30,7 @@ def test_primitive_refuses_millimeters_at_one_step():
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e3])
-def test_primitive_accepts_constraints_in_its_own_unit(scale):
+def test_primitive_accepts_constraints_in_the_same_unit(scale):
     primitive(LinearConstraints.box(*(scale * BOUNDS)), scale)
     primitive(LinearConstraints.box([5.0 * scale, -np.inf], [np.inf, np.inf]), scale)  # the reference is outside
 

@@ -38,7 +38,7 @@ def selection(demonstrations):
 
 
 def test_fit_reproduces_correlated_outputs(demonstrations, selection):
-    """At a correlation of 0.98, the deviation across the main direction is a twelfth of that along it."""
+    """At a correlation of 0.98, the deviation is twelve times as large along the main direction as across."""
     outputs = np.stack(demonstrations.outputs)
     deviations = outputs - outputs.mean(axis=0)
     assert np.corrcoef(deviations.reshape(-1, 3).T)[np.triu_indices(3, 1)].min() > 0.97
@@ -134,7 +134,7 @@ def test_motion_uses_earlier_commands_as_history():
 
 
 def test_information_criteria_stop_when_not_improving():
-    """A straight line needs one or two components; the search stops long before sixty."""
+    """A straight line needs one or two components; the search stops before eight."""
     t = np.linspace(0, 1, 100)
     rng = np.random.default_rng(0)
     outputs = np.stack([t[:, None] + 0.05 * rng.standard_normal((100, 1)) for _ in range(4)])

@@ -34,7 +34,7 @@ def archive(path, compression=zipfile.ZIP_DEFLATED, **members):
 
 
 def load_error(path):
-    """Return the error message of a load_error file; check that reading needs less than 100 MB."""
+    """Return the error message of a refused file; check that reading needs less than 100 MB."""
     tracemalloc.start()
     with pytest.raises(InputError) as error:
         Demonstrations.load(path)
@@ -176,7 +176,7 @@ def test_npz_reader_refuses_archives_not_written_by_numpy(tmp_path):
 
 
 def test_npz_reader_detects_a_flipped_bit_anywhere(tmp_path):
-    """Flip one bit in every byte of an archive: if it still loads, the content is unchanged."""
+    """Flip one bit in every byte of an archive: if the archive still loads, the content is unchanged."""
     good = archive(tmp_path / "good.npz", **GOOD).read_bytes()
     path = tmp_path / "d.npz"
     loaded = 0

@@ -157,9 +157,9 @@ def test_kmp_copies_its_arguments():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"lambda_": "1"}, {"lambda_": [1.0, 2.0]}, {"means": "text"}, {"inputs": [[0], [1, 2]]}]
+    "changes", [{"lambda_": "1"}, {"lambda_": [1.0, 2.0]}, {"means": "text"}, {"inputs": [[0], [1, 2]]}]
 )
-def test_arguments_of_another_type_are_refused(wrong):
+def test_arguments_of_wrong_type_are_refused(changes):
     t, means, covariances = data(20, 2)
     with pytest.raises(InputError, match=r"must be a number|is not an array of numbers"):
-        Kmp(**({"inputs": t, "means": means, "covariances": covariances} | wrong))
+        Kmp(**({"inputs": t, "means": means, "covariances": covariances} | changes))

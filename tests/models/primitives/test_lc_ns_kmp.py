@@ -61,7 +61,7 @@ def test_predict_solves_problem_4_5(seed):
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_predict_is_accurate_where_a_dense_cholesky_is_not(seed):
+def test_predict_is_at_least_as_accurate_as_dense_cholesky(seed):
     problem = random_problem(seed, history_variance=1e-8, history_noise=1e-3)
     prediction = problem.solve()
     dense = problem.dense()
@@ -174,7 +174,7 @@ def arguments_of(p: LcNsKmp) -> dict:
 
 
 def test_special_cases_equal_kmp_and_ns_kmp():
-    """KMP (2.17) is the case of β = 0 without constraints, NS-KMP (4.4) that without constraints."""
+    """KMP (2.17) has β = 0 and no constraints; NS-KMP (4.4) has no constraints."""
     problem = random_problem(3)
     p, n = problem.primitive, problem.step
     arguments = {**arguments_of(p), "history": 0, "constraints": None, "lambda_": p.lambda_ + p.beta, "beta": 0.0}
@@ -293,7 +293,7 @@ def test_predict_repeats_the_last_mean_at_the_end():
     np.testing.assert_allclose(p.predict(19).output, p.reference.means[-1], atol=0.06)
 
 
-def test_predict_passes_through_its_history():
+def test_predict_continues_the_history():
     """For ρ → 0 the first point of the window continues a history that is 0.05 away from the mean."""
     p = LcNsKmp(**small(history=5, history_variance=1e-8, constraints=None))
     offset_history = p.reference.means[5:10] + np.array([0.05, 0])
@@ -413,7 +413,7 @@ def test_predict_does_not_leak_memory():
         ({"constraints": LinearConstraints(np.zeros((7, 1, 2)), np.zeros((7, 1)))}, "7 steps"),
         ({"solver": "magic"}, "magic"),
         ({"history": -1}, "numbers of steps"),
-        *(({name: wrong}, "numbers of steps") for name in ("horizon", "history") for wrong in (np.nan, np.inf)),
+        *(({name: value}, "numbers of steps") for name in ("horizon", "history") for value in (np.nan, np.inf)),
         ({"lambda_": "6"}, "lambda_ must be a number, not '6'"),
         ({"beta": [1.0, 2.0]}, "beta must be a number"),
         ({"history": 2, "history_variance": None}, "history_variance must be a number, not None"),

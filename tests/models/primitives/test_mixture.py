@@ -87,7 +87,7 @@ def test_components_are_limited_to_half_the_steps():
 
 
 def test_fit_mixture_selects_the_better_number_of_components():
-    """Four steps allow one or two components; two separate levels need two."""
+    """Four steps allow one or two components; two separate levels need two components."""
     rng = np.random.default_rng(0)
     outputs = np.array([0.0, 0.0, 10.0, 10.0])[:, None] + 0.01 * rng.standard_normal((30, 4, 1))
     assert len(fit_mixture(np.arange(4.0), outputs, components=None, seed=0).weights) == 2

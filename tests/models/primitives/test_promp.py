@@ -29,7 +29,7 @@ def test_promp_has_the_moments_of_its_demonstrations():
     np.testing.assert_allclose(covariances, sample, atol=0.02 * np.abs(sample).max())
 
 
-def test_conditioning_is_that_of_the_joint_gaussian():
+def test_conditioning_equals_conditioning_of_the_joint_gaussian():
     """Compare with the textbook formula for two outputs at two phases, without weights."""
     promp = ProMp.fit(bundle(), 8)
     at, second_phase, target, accuracy = 0.3, 0.8, np.array([0.7, 0.5]), np.diag([1e-4, 4e-4])
@@ -127,9 +127,9 @@ def test_blend_of_share_zero_and_one_is_exact():
     for share, expected in ((0.0, first), (1.0, second)):
         np.testing.assert_allclose(first.blended(second, share).means, expected.means, rtol=1e-9)
         np.testing.assert_allclose(first.blended(second, share).covariances, expected.covariances, rtol=1e-9)
-    for wrong in (-0.1, np.nan, np.zeros(3)):
+    for share in (-0.1, np.nan, np.zeros(3)):
         with pytest.raises(InputError, match="share"):
-            first.blended(second, wrong)
+            first.blended(second, share)
     with pytest.raises(InputError, match="same times"):
         first.blended(ReferenceTrajectory(2.0 * T, first.means, first.covariances), 0.5)
 

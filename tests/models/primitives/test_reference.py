@@ -31,7 +31,7 @@ def test_reference_is_deterministic_for_a_seed():
 
 
 def test_floor_raises_the_deviation_of_equal_demonstrations():
-    """EM's regularization keeps the covariance regular; a floor sets its scale."""
+    """The regularization of EM makes the covariance regular; the floor is the least standard deviation."""
     t = np.linspace(0, 1, 50)
     same = Demonstrations(t, [np.column_stack([np.sin(t), np.zeros(50)])] * 3)
     assert (ReferenceTrajectory.from_demonstrations(same, 5).standard_deviations > 0).all()
@@ -149,7 +149,7 @@ def test_constant_output_has_a_spread_independent_of_its_value(height):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("changes", "message"),
     [
         ({"components": 61}, "components must be between 1 and half the number of steps, 60: 61"),
         ({"components": "6"}, "components must be a whole number, not '6'"),
@@ -158,6 +158,6 @@ def test_constant_output_has_a_spread_independent_of_its_value(height):
         ({"demonstrations": hourglass(1), "prior_std": "small"}, "prior_std is not an array of numbers"),
     ],
 )
-def test_arguments_of_another_type_are_refused(wrong, message):
+def test_arguments_of_wrong_type_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
-        ReferenceTrajectory.from_demonstrations(**({"demonstrations": hourglass(3), "components": 4} | wrong))
+        ReferenceTrajectory.from_demonstrations(**({"demonstrations": hourglass(3), "components": 4} | changes))

@@ -209,7 +209,7 @@ def test_features_differ_per_window_for_nonstationary_kernels():
 
 @pytest.mark.parametrize("kernel", [SquaredExponential(0.5), Matern52(0.5)])
 def test_history_inputs_are_on_the_clock(kernel):
-    """A history of three equals the same points given to `predict_at`."""
+    """The result equals that of `predict_at` with the times of the history as inputs."""
     t = 0.1 * np.arange(12)
     means = np.column_stack([np.sin(t), np.cos(t)])
     covariances = np.tile(1e-2 * np.eye(2), (12, 1, 1))

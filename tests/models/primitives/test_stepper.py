@@ -45,7 +45,7 @@ def commands_of_diagram(p, action, pose, steps):
 
 @pytest.mark.parametrize("history", [0, 3])
 @pytest.mark.parametrize("action", [[0.0, 0.0], [1.0, -1.0]])
-def test_commands_equal_those_of_the_diagram(history, action):
+def test_commands_equal_the_commands_of_the_diagram(history, action):
     p, pose = primitive(history), np.array([0.01, -0.02])
     stepper = p.start(pose, GAIN)
     commands = np.array([stepper.step(action).output for _ in range(STEPS + 5)])
