@@ -213,7 +213,7 @@ def test_violation_is_the_largest_row_violation_of_a_step(seed):
 
 @given(SEEDS)
 def test_constructor_refuses_a_slab_of_negative_width(seed):
-    """A row and its opposite form a slab: a positive width is accepted, a negative one is refused."""
+    """A row and its opposite form a slab: a positive width is accepted, and a negative width is refused."""
     rng, G, c, inside = polytope(seed)
     LinearConstraints(G, c)
     row = int(rng.integers(len(G)))

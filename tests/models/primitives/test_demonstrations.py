@@ -181,9 +181,15 @@ def test_compute_bounds_refuses_invalid_arguments(arguments, message):
         compute_bounds(make_demonstrations(), **arguments)
 
 
-@pytest.mark.parametrize("band", [None, "a", [0.2], 0.0, 1.1])
-def test_alignment_refuses_an_invalid_band(band):
-    with pytest.raises(InputError, match="band"):
+@pytest.mark.parametrize(
+    ("band", "message"),
+    [
+        *((value, "band must be a number, not") for value in (None, "a", [0.2])),
+        *((value, "band of an alignment is a share") for value in (0.0, 1.1)),
+    ],
+)
+def test_alignment_refuses_an_invalid_band(band, message):
+    with pytest.raises(InputError, match=message):
         align_demonstrations(make_demonstrations(), band)
 
 
