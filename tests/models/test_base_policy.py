@@ -1,4 +1,4 @@
-"""Base policies: what they may return, the window of their chunks, and how they are found."""
+"""Base policies: accepted results, the window of their chunks, and their sources."""
 
 import numpy as np
 import pytest
@@ -7,25 +7,25 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BASE_POLICIES, FORMAT, Policy, chunk_samples, find_base_policy, mean_and_variance
 
 
-def chunk_policy(ensemble=2, points=3, outputs=2, seed=0):
+def make_chunk_policy(ensemble=2, points=3, outputs=2, seed=0):
     size, random = ensemble * points * outputs, np.random.default_rng(seed)
     layers = [(random.normal(size=(size, 4)).astype(np.float32), np.zeros(size, np.float32))]
     description = {"observation_shape": [4], "action_low": [-9.0] * size, "action_high": [9.0] * size}
     return Policy(layers, description | {"format": FORMAT, "squash": "clip", "chunk": [ensemble, points, outputs]})
 
 
-def test_samples_of_an_array_of_any_accepted_shape_agree():
+def test_chunk_samples_accepts_arrays_with_and_without_batch():
     chunks = np.arange(12.0).reshape(2, 3, 2)
     for returned in (chunks, chunks[None], chunks.tolist()):
-        assert (chunk_samples(lambda observation, r=returned: r, np.zeros(4), 2) == chunks).all()
+        assert (chunk_samples(lambda observation, returned=returned: returned, np.zeros(4), 2) == chunks).all()
     for returned in (chunks[0], chunks[0].ravel()):
-        assert (chunk_samples(lambda observation, r=returned: r, np.zeros(4), 2) == chunks[:1]).all()
+        assert (chunk_samples(lambda observation, returned=returned: returned, np.zeros(4), 2) == chunks[:1]).all()
 
 
 @pytest.mark.parametrize(
     "returned", [np.zeros((3, 3)), np.zeros(5), np.full((1, 3, 2), np.nan), np.zeros((0, 3, 2)), 1.0]
 )
-def test_samples_are_refused_when_they_are_no_finite_chunks(returned):
+def test_chunk_samples_refuses_arrays_that_are_no_chunks(returned):
     with pytest.raises(ValueError, match="finite chunks"):
         chunk_samples(lambda observation: returned, np.zeros(4), 2)
 
@@ -34,20 +34,20 @@ def test_window_repeats_the_last_point_of_a_short_chunk():
     samples = np.arange(12.0).reshape(2, 3, 2)
     mean, variance = mean_and_variance(samples, 5)
     assert (mean == samples.mean(axis=0)[[0, 1, 2, 2, 2]]).all()
-    assert np.allclose(variance, 18.0)  # of two samples that differ by 6
+    assert np.allclose(variance, 18.0)  # the two samples differ by 6
     assert (mean_and_variance(samples[:1], 2)[1] == 0.0).all()
 
 
-def test_folder_of_a_chunk_policy_is_a_base_policy(tmp_path):
-    policy, observation = chunk_policy(), np.ones(4, np.float32)
+def test_find_base_policy_loads_the_folder_of_a_chunk_policy(tmp_path):
+    policy, observation = make_chunk_policy(), np.ones(4, np.float32)
     policy.save(tmp_path)
     samples = chunk_samples(find_base_policy(str(tmp_path)), observation, 2)
     assert samples.shape == (2, 3, 2)
     assert (samples.ravel() == policy(observation)).all()
 
 
-def test_source_is_refused_when_it_predicts_no_chunks(tmp_path):
-    policy = chunk_policy()
+def test_find_base_policy_refuses_a_policy_without_chunks(tmp_path):
+    policy = make_chunk_policy()
     del policy.description["chunk"]
     policy.save(tmp_path)
     with pytest.raises(InputError, match="predicts no chunks"):
@@ -56,8 +56,8 @@ def test_source_is_refused_when_it_predicts_no_chunks(tmp_path):
         find_base_policy("nothing")
 
 
-def test_registered_function_is_found_by_its_name(monkeypatch):
+def test_find_base_policy_returns_a_registered_function(monkeypatch):
     monkeypatch.setattr(BASE_POLICIES, "_entries", {})
     monkeypatch.setattr(BASE_POLICIES, "_origins", {})
-    function = BASE_POLICIES.register("still", lambda observation: np.zeros((1, 2, 6)))
-    assert find_base_policy("still") is function
+    function = BASE_POLICIES.register("rest", lambda observation: np.zeros((1, 2, 6)))
+    assert find_base_policy("rest") is function

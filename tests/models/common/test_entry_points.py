@@ -1,4 +1,4 @@
-"""Entry points of installed packages: a broken one is refused where it is used, and left out elsewhere."""
+"""Entry points of installed packages: a broken entry point is refused when it is used, and is not usable."""
 
 import sys
 
@@ -13,27 +13,27 @@ def install(tmp_path, monkeypatch):
     """Return a function that installs a package of one module with entry points of the group "shapes"."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
-    def install(package, source, **points):
+    def install(package, source, **entry_points):
         if source is not None:
             (tmp_path / f"{package}.py").write_text(source)
         information = tmp_path / f"{package}-1.0.dist-info"
         information.mkdir()
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-        lines = [f"{name} = {package}:{value}" for name, value in points.items()]
+        lines = [f"{name} = {package}:{value}" for name, value in entry_points.items()]
         (information / "entry_points.txt").write_text("\n".join(["[shapes]", *lines, ""]))
 
     yield install
-    for name, module in list(sys.modules.items()):  # no others: modules of this package stay registered
+    for name, module in list(sys.modules.items()):  # only modules of the temporary folder
         if (getattr(module, "__file__", None) or "").startswith(str(tmp_path)):
             del sys.modules[name]
 
 
-def shapes(**arguments):
+def make_registry(**arguments):
     return Registry("shape", entry_points="shapes", check=check_callable, **arguments)
 
 
 @pytest.mark.parametrize(
-    ("source", "sentence"),
+    ("source", "reason"),
     [
         ("def broken(:\n", "importing lab_broken:Cone failed: SyntaxError"),
         ("raise RuntimeError('no licence')\n", r"failed: lab_broken\.py, line 1: RuntimeError: no licence"),
@@ -44,47 +44,47 @@ def shapes(**arguments):
         (None, "No module named 'lab_broken'"),
     ],
 )
-def test_broken_entry_point_is_refused_only_where_it_is_used(install, source, sentence):
+def test_broken_entry_point_is_refused_only_when_used(install, source, reason):
     install("lab_broken", source, cone="Cone")
     install("lab_sound", "def Cube():\n    pass\n", cube="Cube")
-    registry = shapes()
+    registry = make_registry()
     registry.register("sphere", install)
     assert registry.get("sphere") is install
     assert registry.get("cube").__module__ == "lab_sound"
     for _ in range(2):
-        with pytest.raises(InputError, match=f"the shape 'cone' of the installed package lab_broken .*{sentence}"):
+        with pytest.raises(InputError, match=f"the shape 'cone' of the installed package lab_broken .*{reason}"):
             registry.get("cone")
     assert registry.names() == ["cone", "cube", "sphere"]
     assert registry.usable() == ["cube", "sphere"]
     assert list(registry.broken) == ["cone"]
 
 
-def test_two_packages_with_one_name_are_refused(install):
+def test_entry_points_of_two_packages_with_one_name_are_refused(install):
     install("lab_one", "def Cone():\n    pass\n", cone="Cone")
     install("lab_two", "def Cone():\n    pass\n", cone="Cone")
-    registry = shapes()
+    registry = make_registry()
     with pytest.raises(InputError, match=r"the shape 'cone' of the installed package .* there is another shape 'cone'"):
         registry.get("cone")
     assert registry.usable() == []
 
 
-def test_entry_point_with_the_name_of_another_entry_is_refused(install):
+def test_entry_point_is_refused_when_its_name_is_registered(install):
     install("lab_one", "def Cone():\n    pass\n", cone="Cone")
-    registry = shapes()
-    registry.register("cone", test_two_packages_with_one_name_are_refused)
+    registry = make_registry()
+    registry.register("cone", test_entry_points_of_two_packages_with_one_name_are_refused)
     with pytest.raises(InputError, match=r"lab_one cannot be used: there is another shape 'cone', from \S+\.py"):
         registry.get("cone")
 
 
 @pytest.mark.parametrize("decorator", ["register_shape", None])
-def test_built_in_is_kept_when_an_entry_point_has_its_name(decorator, install, tmp_path, caplog):
+def test_built_in_is_returned_when_an_entry_point_has_its_name(decorator, install, tmp_path, caplog):
     (tmp_path / "own").mkdir()
     (tmp_path / "own" / "cones.py").write_text(
         "import lab_shapes\n\nregister_shape = lab_shapes.REGISTRY.register\n"
         "@register_shape('cone')\ndef Cone():\n    pass\n"
     )
     install("lab_broken", "raise RuntimeError\n", cone="Cone")
-    registry = shapes(package="own", decorator=decorator)
+    registry = make_registry(package="own", decorator=decorator)
     sys.modules["lab_shapes"] = type(sys)("lab_shapes")
     sys.modules["lab_shapes"].REGISTRY = registry
     for _ in range(2):
@@ -97,10 +97,10 @@ def test_built_in_is_kept_when_an_entry_point_has_its_name(decorator, install, t
     ]
 
 
-def test_module_of_an_entry_point_may_register_its_object_itself(install):
+def test_entry_point_is_found_when_its_module_registers_it(install):
     source = "import lab_shapes\n\n\n@lab_shapes.REGISTRY.register('cone')\ndef Cone():\n    pass\n"
     install("lab_one", source, cone="Cone")
-    registry = shapes()
+    registry = make_registry()
     sys.modules["lab_shapes"] = type(sys)("lab_shapes")
     sys.modules["lab_shapes"].REGISTRY = registry
     cone = registry.get("cone")
@@ -108,9 +108,9 @@ def test_module_of_an_entry_point_may_register_its_object_itself(install):
     assert registry.broken == {}
 
 
-def test_name_of_an_object_is_found_without_loading_it(install):
+def test_name_of_finds_an_entry_point_without_loading_it(install):
     install("lab_one", "class Cone:\n    pass\n", cone="Cone")
-    registry = shapes()
+    registry = make_registry()
     assert registry.name_of(Registry) is None
     import lab_one
 

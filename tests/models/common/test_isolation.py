@@ -1,4 +1,4 @@
-"""An isolated function returns its result, or an error with the reason."""
+"""An isolated function returns its result or raises an error with the reason."""
 
 import os
 import resource
@@ -14,22 +14,23 @@ def fail():
     raise ValueError("no volume")
 
 
-def spin():
+def loop_forever():
     while True:
         pass
 
 
-def spin_on():
+def loop_forever_without_signal():
     signal.signal(signal.SIGXCPU, signal.SIG_IGN)
-    spin()
+    loop_forever()
 
 
-def limit_and_isolate():
+def cpu_limit_inside_a_limit_of_100_s():
+    """Return the CPU limits [s] of an isolated function whose parent process has a limit of 100 s."""
     resource.setrlimit(resource.RLIMIT_CPU, (100, 100))
     return run_isolated(lambda: resource.getrlimit(resource.RLIMIT_CPU), cpu_seconds=1000)
 
 
-def kill():
+def kill_own_process():
     os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -38,26 +39,26 @@ def test_run_isolated_returns_the_result():
 
 
 @pytest.mark.parametrize(
-    ("function", "words"),
+    ("function", "reason"),
     [
         (fail, "ValueError: no volume"),
         (os.abort, "aborted"),
-        (spin, "more than 1 s of CPU time"),
-        (spin_on, "more than 1 s of CPU time"),
-        (kill, "was killed, maybe for lack of memory"),
+        (loop_forever, "more than 1 s of CPU time"),
+        (loop_forever_without_signal, "more than 1 s of CPU time"),
+        (kill_own_process, "was killed, maybe for lack of memory"),
     ],
 )
-def test_run_isolated_gives_the_reason_when_a_function_fails(function, words):
-    with pytest.raises(IsolatedError, match=words):
+def test_run_isolated_raises_the_reason_when_a_function_fails(function, reason):
+    with pytest.raises(IsolatedError, match=reason):
         run_isolated(function, cpu_seconds=1)
 
 
-def test_run_isolated_keeps_a_lower_limit_of_the_system():
-    assert run_isolated(limit_and_isolate, cpu_seconds=1000) == (100, 100)
+def test_run_isolated_does_not_raise_an_existing_cpu_limit():
+    assert run_isolated(cpu_limit_inside_a_limit_of_100_s, cpu_seconds=1000) == (100, 100)
 
 
 @pytest.mark.parametrize("seconds", [1.5, 0, "1", None])
-def test_run_isolated_refuses_a_limit_that_is_not_whole_seconds(seconds):
+def test_run_isolated_refuses_cpu_limits_that_are_not_whole(seconds):
     with pytest.raises(InputError, match="cpu_seconds must be a whole number of at least 1"):
         run_isolated(os.getpid, cpu_seconds=seconds)
 

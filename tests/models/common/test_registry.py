@@ -1,4 +1,4 @@
-"""Registries refuse unknown and duplicate names, and read declarations without an import."""
+"""Registries refuse unknown and duplicate names, and read declarations without importing their modules."""
 
 import sys
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from guiderail.models.common.registry import Registry
 
 
 @pytest.mark.parametrize("name", [{}, [], None, 3, ["sphere"]])
-def test_name_must_be_a_string(name):
+def test_get_refuses_names_that_are_not_text(name):
     shapes = Registry("shape")
     shapes.register("sphere", object())
     with pytest.raises(InputError, match=r"a shape is named by a word, not .*: choose one of sphere"):
@@ -22,13 +22,13 @@ def test_name_must_be_a_string(name):
 
 
 @pytest.mark.parametrize("task", [5, None, ["NarrowPassage"]])
-def test_task_of_an_environment_must_be_a_string(task):
+def test_make_env_refuses_tasks_that_are_not_text(task):
     with pytest.raises(InputError, match="a task is named by a word"):
         guiderail.make_env(task)
 
 
 @pytest.mark.parametrize("name", [object, "", 3, None])
-def test_register_needs_a_name(name):
+def test_register_refuses_names_that_are_not_text(name):
     shapes = Registry("shape")
     with pytest.raises(InputError, match=r"a shape is registered by a name, as in @register_\.\.\.\("):
         shapes.register(name)
@@ -37,14 +37,14 @@ def test_register_needs_a_name(name):
     assert shapes.names() == []
 
 
-def test_unknown_name_is_refused_with_the_closest_name():
+def test_get_suggests_the_closest_name_when_a_name_is_unknown():
     shapes = Registry("shape")
     shapes.register("sphere", object())
     with pytest.raises(InputError, match="there is no shape 'spere': did you mean sphere"):
         shapes.get("spere")
 
 
-def test_unknown_name_is_refused_when_none_is_registered():
+def test_get_refuses_all_names_when_no_entry_is_registered():
     with pytest.raises(InputError, match="there is no shape 'sphere': none is registered"):
         Registry("shape").get("sphere")
 
@@ -54,46 +54,46 @@ class _Kind:
     build: object
 
 
-def _from(file):
+def _function_from(file):
     """Return a function whose source file is `file`."""
     module = {"__file__": str(file)}
     exec("def build():\n    pass", module)
     return module["build"]
 
 
-def test_register_accepts_reimport_and_refuses_another_file(tmp_path):
+def test_register_replaces_an_entry_of_the_same_file_only(tmp_path):
     shapes = Registry("shape")
-    shapes.register("sphere", _Kind(_from(tmp_path / "one.py")))
-    second = _Kind(_from(tmp_path / "one.py"))
+    shapes.register("sphere", _Kind(_function_from(tmp_path / "one.py")))
+    second = _Kind(_function_from(tmp_path / "one.py"))
     shapes.register("sphere", second)
     assert shapes.get("sphere") is second
     with pytest.raises(InputError, match=r"there is a shape 'sphere' already, from \S*one\.py: choose another name"):
-        shapes.register("sphere", _Kind(_from(tmp_path / "two.py")))
+        shapes.register("sphere", _Kind(_function_from(tmp_path / "two.py")))
     assert shapes.get("sphere") is second
 
 
-def test_declared_reads_literals_without_importing(tmp_path, monkeypatch):
-    (tmp_path / "shapes_of_mine").mkdir()
-    (tmp_path / "shapes_of_mine/__init__.py").touch()
-    (tmp_path / "shapes_of_mine/some.py").write_text(
+def test_declared_reads_literals_without_an_import(tmp_path, monkeypatch):
+    (tmp_path / "local_shapes").mkdir()
+    (tmp_path / "local_shapes/__init__.py").touch()
+    (tmp_path / "local_shapes/polygons.py").write_text(
         'SIDES = 4\n\n\n@register_shape("triangle", sides=3)\ndef triangle():\n    raise AssertionError\n\n\n'
         '@register_shape("square", sides=SIDES)\ndef square():\n    pass\n'
     )
     monkeypatch.syspath_prepend(tmp_path)
-    shapes = Registry("shape", package="shapes_of_mine", decorator="register_shape")
+    shapes = Registry("shape", package="local_shapes", decorator="register_shape")
     assert shapes.names() == ["square", "triangle"]
     assert shapes.declared("triangle", "sides") == 3
-    with pytest.raises(NameError, match="register_shape"):  # no literal: the module is imported
+    with pytest.raises(NameError, match="register_shape"):  # `sides` is not a literal: the module is imported
         shapes.declared("square", "sides")
-    own = _from(tmp_path / "shapes_of_mine/some.py")
-    shapes.register("triangle", SimpleNamespace(sides=30, build=own))
+    triangle = _function_from(tmp_path / "local_shapes/polygons.py")
+    shapes.register("triangle", SimpleNamespace(sides=30, build=triangle))
     assert shapes.declared("triangle", "sides") == 30
 
 
 def test_register_refuses_a_declared_name_before_its_import(tmp_path, monkeypatch):
     (tmp_path / "lazy_shapes").mkdir()
     (tmp_path / "lazy_shapes/__init__.py").touch()
-    (tmp_path / "lazy_shapes/some.py").write_text(
+    (tmp_path / "lazy_shapes/polygons.py").write_text(
         'from lazy_shapes.kinds import register_shape\n\n\n@register_shape("triangle")\ndef triangle():\n    pass\n'
     )
     (tmp_path / "lazy_shapes/kinds.py").write_text(
@@ -103,11 +103,11 @@ def test_register_refuses_a_declared_name_before_its_import(tmp_path, monkeypatc
     )
     monkeypatch.syspath_prepend(tmp_path)
     shapes = import_module("lazy_shapes.kinds").SHAPES
-    with pytest.raises(InputError, match=r"there is a shape 'triangle' already, from lazy_shapes\.some: choose"):
-        shapes.register("triangle", _from(tmp_path / "other.py"))
-    assert "lazy_shapes.some" not in sys.modules  # a refusal imports nothing
+    with pytest.raises(InputError, match=r"there is a shape 'triangle' already, from lazy_shapes\.polygons: choose"):
+        shapes.register("triangle", _function_from(tmp_path / "other.py"))
+    assert "lazy_shapes.polygons" not in sys.modules
     triangle = shapes.get("triangle")
-    assert triangle.__module__ == "lazy_shapes.some"
+    assert triangle.__module__ == "lazy_shapes.polygons"
     with pytest.raises(InputError, match="there is a shape 'triangle' already"):
-        shapes.register("triangle", _from(tmp_path / "other.py"))
+        shapes.register("triangle", _function_from(tmp_path / "other.py"))
     assert shapes.get("triangle") is triangle

@@ -8,6 +8,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.yaml import check_yaml, load_yaml, parse_yaml
 
+# Aliases inside aliases, which expand to 9**10 entries.
 BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
 )
@@ -36,9 +37,9 @@ BOMB = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
     ],
 )
 def test_plain_scalars_follow_the_core_schema(text, value):
-    read = parse_yaml(f"entry: {text}")["entry"]
-    assert read == value
-    assert type(read) is type(value)
+    result = parse_yaml(f"entry: {text}")["entry"]
+    assert result == value
+    assert type(result) is type(value)
 
 
 def test_aliases_and_merges_are_resolved():
@@ -49,18 +50,18 @@ def test_aliases_and_merges_are_resolved():
     }
 
 
-def test_alias_of_a_text_is_a_key():
+def test_alias_of_a_text_is_accepted_as_a_key():
     assert parse_yaml("a: &x b\n*x : 2") == {"a": "b", "b": 2}
 
 
-def test_reused_anchor_is_that_of_its_last_node_without_a_warning():
+def test_alias_of_a_reused_anchor_is_its_last_node():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert parse_yaml("a: &x 1\nb: &x 2\nc: *x") == {"a": 1, "b": 2, "c": 2}
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reason"),
     [
         (BOMB, "more than 10000 entries"),
         (
@@ -96,23 +97,23 @@ def test_reused_anchor_is_that_of_its_last_node_without_a_warning():
         ("a: 'x", "end of stream"),
     ],
 )
-def test_invalid_document_is_refused_in_one_line(text, said):
+def test_invalid_document_is_refused_in_one_line(text, reason):
     tracemalloc.start()
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as error:
         parse_yaml(text, "template.yaml")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert said in str(refused.value)
-    assert str(refused.value).startswith("template.yaml")
-    assert "\n" not in str(refused.value)
-    assert len(str(refused.value)) < 300
+    assert reason in str(error.value)
+    assert str(error.value).startswith("template.yaml")
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 300
     assert peak < 30e6
 
 
 @pytest.mark.parametrize(
     "text", ["a: 1\nb: 2\na: 3", "- {a: 1, 'a': 2}", "x: &k a\ny: {a: 1, *k : 2}", "a: 1\n---\nb: {c: 1, c: 1}"]
 )
-def test_duplicate_key_is_refused_before_another_reader_reads_the_text(text):
+def test_check_yaml_refuses_a_duplicate_key(text):
     with pytest.raises(InputError, match=r'duplicate key "[ac]": leave one of the two out'):
         check_yaml(text, "scenario.yaml", ())
     check_yaml("a: {b: &x {d: 1}}\nc: {<<: *x, d: 2}", "scenario.yaml", ())
@@ -126,8 +127,13 @@ def test_file_with_a_byte_order_mark_is_read(tmp_path):
 def test_load_refuses_files_that_are_not_text_or_too_large(tmp_path):
     (tmp_path / "latin.yaml").write_bytes(b"name: \xe9")
     (tmp_path / "large.yaml").write_bytes(b"#" * 100_001)
-    for name, said in [("latin", "UTF-8"), ("large", "larger"), ("missing", "there is no study"), ("x" * 300, "study")]:
-        with pytest.raises(InputError, match=said):
+    for name, reason in [
+        ("latin", "UTF-8"),
+        ("large", "larger"),
+        ("missing", "there is no study"),
+        ("x" * 300, "study"),
+    ]:
+        with pytest.raises(InputError, match=reason):
             load_yaml(tmp_path / f"{name}.yaml", "study")
     with pytest.raises(InputError, match="there is no study"):
         load_yaml("/dev/zero", "study")

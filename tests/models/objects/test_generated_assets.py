@@ -1,4 +1,4 @@
-"""Generated files of objects with other dimensions than the shipped ones."""
+"""Files generated for objects whose dimensions differ from those of the shipped files."""
 
 import dataclasses
 import re
@@ -17,7 +17,8 @@ from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDim
 from guiderail.models.objects.sdf import TriangleMesh
 
 
-def vertices(path):
+def read_vertices(path):
+    """Return the vertices (V, 3) of an OBJ file [m]."""
     return np.array([line.split()[1:] for line in path.read_text().splitlines() if line.startswith("v ")], float)
 
 
@@ -28,7 +29,7 @@ def vertices(path):
         (grid_clamp_sdf.folder_of, GridClampDimensions(), GRID_CLAMP_FOLDER),
     ],
 )
-def test_folder_of_returns_the_shipped_folder_when_unchanged(folder_of, dimensions, folder):
+def test_folder_of_returns_the_shipped_folder_by_default(folder_of, dimensions, folder):
     assert folder_of(dimensions) == folder
     assert folder_of(dataclasses.replace(dimensions)) == folder
 
@@ -37,20 +38,23 @@ def test_generated_connector_has_the_given_dimensions():
     dimensions = dataclasses.replace(BncDimensions().with_bore_clearance(0.07 * MM), mouth_chamfer=0.25 * MM)
     folder = bnc_sdf.folder_of(dimensions, 0.35)
     assert bnc_sdf.folder_of(dimensions, 0.35) == folder != FOLDER
-    bore = vertices(folder / "bnc_bore.obj")
+    bore = read_vertices(folder / "bnc_bore.obj")
     inner = np.hypot(*bore[bore[:, 2] > 1.0 * MM, :2].T) * np.cos(np.pi / 24)
     np.testing.assert_allclose(inner, 4.825 * MM + 0.07 * MM, atol=1e-8)
-    # The chamfer begins where the bore ends, as wide as it is deep.
+    # The chamfer is as wide as it is deep.
     assert np.isclose(bore[:, 2], 0.25 * MM).any()
     mouth = np.hypot(*bore[bore[:, 2] < 1e-9, :2].T).min() * np.cos(np.pi / 24)
     assert mouth == pytest.approx(4.825 * MM + 0.07 * MM + 0.25 * MM, abs=1e-8)
-    for name, numbers in (("bnc_jack.sdf", {"0.35", "0.05"}), ("bnc_plug.sdf", {"0.35", "0.05"})):
-        assert set(re.findall(r"<drake:mu_static>([\d.]+)<", (folder / name).read_text())) == numbers
+    for name in ("bnc_jack.sdf", "bnc_plug.sdf"):
+        frictions = re.findall(r"<drake:mu_static>([\d.]+)<", (folder / name).read_text())
+        assert set(frictions) == {"0.35", "0.05"}
 
 
 def test_generated_slot_has_the_given_width():
-    wider = dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM)
-    wide, standard = (vertices(bnc_sdf.folder_of(d) / "bnc_slots.obj") for d in (wider, BncDimensions()))
+    standard, wide = (
+        read_vertices(bnc_sdf.folder_of(dimensions) / "bnc_slots.obj")
+        for dimensions in (BncDimensions(), dataclasses.replace(BncDimensions(), slot_clearance=0.2 * MM))
+    )
     assert wide[:, 2].max() - standard[:, 2].max() == pytest.approx(0.075 * MM, abs=1e-6)
 
 
@@ -59,12 +63,12 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
         GridClampDimensions().with_clearance(0.1 * MM), hole_chamfer=0.3 * MM, peg_chamfer=0.2 * MM
     )
     folder = grid_clamp_sdf.folder_of(dimensions, 0.3)
-    inside = np.cos(np.pi / NUM_SIDES)
-    hole, peg = vertices(folder / "grid_clamp_hole.obj"), vertices(folder / "grid_clamp_peg.obj")
-    assert np.hypot(*hole[:, :2].T).min() * inside == pytest.approx(4.1 * MM, abs=1e-8)
+    inradius_ratio = np.cos(np.pi / NUM_SIDES)  # distance of a polygon's sides over that of its corners
+    hole, peg = read_vertices(folder / "grid_clamp_hole.obj"), read_vertices(folder / "grid_clamp_peg.obj")
+    assert np.hypot(*hole[:, :2].T).min() * inradius_ratio == pytest.approx(4.1 * MM, abs=1e-8)
     assert np.isclose(hole[:, 2], -0.3 * MM).any()
     tip = peg[(peg[:, 2] < 1e-9) & (np.hypot(*peg[:, :2].T) > 1.0 * MM)]
-    np.testing.assert_allclose(np.hypot(*tip[:, :2].T) * inside, 3.8 * MM, atol=1e-8)
+    np.testing.assert_allclose(np.hypot(*tip[:, :2].T) * inradius_ratio, 3.8 * MM, atol=1e-8)
     clearance = dimensions.hole_radius - dimensions.peg_radius
     assert clearance + dimensions.hole_chamfer + dimensions.peg_chamfer == pytest.approx(0.6 * MM)
     assert "<drake:mu_static>0.3<" in (folder / "grid_table.sdf").read_text()
@@ -72,7 +76,7 @@ def test_generated_clamp_and_table_have_the_given_dimensions():
 
 
 @pytest.mark.parametrize("face", ["f -1 -2 -3", "f 0 1 2", "f 1/1 2/2 4/4"])
-def test_mesh_is_refused_when_a_face_has_no_such_vertex(face, tmp_path):
+def test_mesh_is_refused_when_a_face_has_an_unknown_vertex(face, tmp_path):
     path = tmp_path / "part.obj"
     path.write_text(f"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1//1 2//1 3//1\n{face}\n")
     with pytest.raises(InputError, match=r"part\.obj has a vertex outside 1 … 3"):
@@ -82,7 +86,7 @@ def test_mesh_is_refused_when_a_face_has_no_such_vertex(face, tmp_path):
 @pytest.mark.parametrize(
     "lines", ["f 1 2 3 4", "f 1 2 3\nf 1 2 3 4", "f a b c", f"f 1 2 {2**70}", "", "v 0 0\nf 1 2 3"]
 )
-def test_mesh_is_refused_unless_it_has_triangles_only(lines, tmp_path):
+def test_mesh_is_refused_unless_all_faces_are_triangles(lines, tmp_path):
     path = tmp_path / "part.obj"
     path.write_text(f"v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n{lines}\n")
     with pytest.raises(InputError, match=r"part\.obj must hold vertices of three numbers, and triangles only"):

@@ -1,3 +1,5 @@
+"""Demonstrations of the BNC connector: shipped files, their covariances, and recording again."""
+
 import os
 from dataclasses import replace
 
@@ -17,7 +19,7 @@ from research.generate.bnc_connector import TIMES as TIMES_RECORDED
 TIMES = 0.02 * np.arange(NUM_STEPS)
 
 
-def test_load_returns_five_times_400_poses():
+def test_load_returns_five_demonstrations_of_400_poses():
     loaded = Demonstrations.load(demonstrations.PATH)
     assert loaded.num_demonstrations == NUM_DEMONSTRATIONS
     assert all(output.shape == (NUM_STEPS, 6) for output in loaded.outputs)
@@ -25,61 +27,61 @@ def test_load_returns_five_times_400_poses():
     np.testing.assert_allclose(loaded.times[0], TIMES, atol=1e-9)
 
 
-def test_file_holds_measured_poses_and_wrenches():
-    everything = np.load(demonstrations.PATH)
+def test_file_contains_measured_poses_and_wrenches():
+    arrays = np.load(demonstrations.PATH)
     shape = (NUM_DEMONSTRATIONS, NUM_STEPS)
-    assert everything["measured"].shape == everything["wrench"].shape == (*shape, 6)
-    assert everything["contact_force"].shape == shape
-    assert "locked plug" in str(everything["frame"])
+    assert arrays["measured"].shape == arrays["wrench"].shape == (*shape, 6)
+    assert arrays["contact_force"].shape == shape
+    assert "locked plug" in str(arrays["frame"])
 
 
-def test_demonstrations_end_locked():
-    """The measured poses end at the locked frame's origin."""
-    final = np.load(demonstrations.PATH)["measured"][:, -1]
-    assert np.abs(final[:, 2]).max() < 0.6 * MM
-    assert np.abs(np.rad2deg(final[:, 3])).max() < 4.0
+@pytest.mark.parametrize("path", [demonstrations.PATH, demonstrations.SEARCH_PATH], ids=["insertion", "search"])
+def test_demonstrations_end_locked(path):
+    measured = np.load(path)["measured"]
+    assert measured.shape == (NUM_DEMONSTRATIONS, NUM_STEPS, 6)
+    assert np.abs(measured[:, -1, 2]).max() < 0.6 * MM
+    assert np.abs(np.rad2deg(measured[:, -1, 3])).max() < 4.0
 
 
-def test_push_is_the_difference_of_command_and_measurement():
-    """While the plug is turned, the stiffness times commanded minus measured is the force along z."""
-    everything = np.load(demonstrations.PATH)
+def test_stiffness_times_pose_error_is_the_measured_force():
+    """While the plug turns, the force along z is the stiffness times the difference of measured and commanded pose."""
+    arrays = np.load(demonstrations.PATH)
     turning = slice(260, 320)
-    command, measured = everything["outputs"][:, turning, 2], everything["measured"][:, turning, 2]
-    push = everything["stiffness"][2] * (measured - command)
-    assert push.mean() > 8.0
-    np.testing.assert_allclose(push.mean(), everything["wrench"][:, turning, 2].mean(), rtol=0.1)
+    command, measured = arrays["outputs"][:, turning, 2], arrays["measured"][:, turning, 2]
+    force = arrays["stiffness"][2] * (measured - command)
+    assert force.mean() > 8.0  # [N]
+    np.testing.assert_allclose(force.mean(), arrays["wrench"][:, turning, 2].mean(), rtol=0.1)
 
 
-def test_deviations_are_wide_at_the_rim_and_small_when_seated():
+def test_deviations_are_large_at_the_rim_and_small_when_seated():
     outputs = np.stack(Demonstrations.load(demonstrations.PATH).outputs)
-    spread = outputs.std(axis=0)[:, :2].mean(axis=1)
-    assert spread[80:170].mean() > 4.0 * spread[240:].mean()
+    deviations = outputs.std(axis=0)[:, :2].mean(axis=1)
+    assert deviations[80:170].mean() > 4.0 * deviations[240:].mean()
 
 
 def test_motions_differ_and_repeat_with_a_seed():
-    session, second, other = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(session, second)
-    assert np.abs(session[0] - session[1])[:, :2].max() > 0.5 * MM
-    assert np.abs(session[0] - other[0])[:, :2].max() > 0.5 * MM
+    motions, again, different = (demonstrator_motions(seed, TIMES) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(motions, again)
+    assert np.abs(motions[0] - motions[1])[:, :2].max() > 0.5 * MM
+    assert np.abs(motions[0] - different[0])[:, :2].max() > 0.5 * MM
 
 
-def test_mean_of_the_motions_has_no_search_offset():
-    """The mean of the demonstrations leads to the expected position of the jack without a search."""
+def test_mean_of_the_demonstrations_has_no_search_offset():
     mean = np.mean(Demonstrations.load(demonstrations.PATH).outputs, axis=0)
     assert np.abs(mean[:, :2]).max() < 0.3 * MM
 
 
-def test_recording_again_reproduces_the_file():
-    """Rounding may differ between machines, and contact amplifies it."""
-    everything = np.load(demonstrations.PATH)
-    recording, is_locked = record_one(demonstrator_motions(int(everything["seed"]), TIMES_RECORDED)[0])
+def test_record_one_reproduces_the_insertion_file():
+    """The tolerance of the last pose is larger, because contact amplifies rounding, which differs between machines."""
+    arrays = np.load(demonstrations.PATH)
+    recording, is_locked = record_one(demonstrator_motions(int(arrays["seed"]), TIMES_RECORDED)[0])
     assert is_locked
-    np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
-    np.testing.assert_allclose(recording["pose"][:60], everything["measured"][0, :60], atol=1e-6)
-    np.testing.assert_allclose(recording["pose"][-1, :3], everything["measured"][0, -1, :3], atol=0.1 * MM)
+    np.testing.assert_allclose(recording["desired_pose"], arrays["outputs"][0], atol=1e-9)
+    np.testing.assert_allclose(recording["pose"][:60], arrays["measured"][0, :60], atol=1e-6)
+    np.testing.assert_allclose(recording["pose"][-1, :3], arrays["measured"][0, -1, :3], atol=0.1 * MM)
 
 
-def test_shipped_file_is_kept_when_writing_is_interrupted(tmp_path, monkeypatch):
+def test_generator_leaves_the_file_when_writing_is_interrupted(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
@@ -93,15 +95,7 @@ def test_shipped_file_is_kept_when_writing_is_interrupted(tmp_path, monkeypatch)
     np.testing.assert_array_equal(np.load(session.path)["times"], np.arange(3.0))
 
 
-SEARCHING = slice(0, round(demonstrations.SEARCH[1] / 0.02))
-
-
-def test_search_file_holds_five_times_400_poses_that_end_locked():
-    with np.load(demonstrations.SEARCH_PATH, allow_pickle=False) as file:
-        measured = file["measured"]
-    assert measured.shape == (NUM_DEMONSTRATIONS, NUM_STEPS, 6)
-    assert np.abs(measured[:, -1, 2]).max() < 0.6 * MM
-    assert np.abs(np.rad2deg(measured[:, -1, 3])).max() < 4.0
+SEARCHING = slice(0, round(demonstrations.SEARCH[1] / 0.02))  # steps until the end of the search
 
 
 def test_covariance_is_isotropic_until_the_plug_drops_in():
@@ -119,22 +113,22 @@ def test_deviations_are_small_after_the_insertion():
     assert reference.standard_deviations[seated, :2].max() < 0.3 * MM
 
 
-def test_firm_search_commands_four_times_the_depth():
+def test_firm_search_commands_a_deeper_pose_than_a_light_search():
     searching = slice(round(demonstrations.SEARCH[0] / 0.02), SEARCHING.stop)
     light, firm = (reference_trajectory(name).means[searching, 2] for name in ("search", "firm_search"))
     assert np.abs(light - firm).mean() == pytest.approx(
         demonstrations.FIRM_PUSH - demonstrations.LIGHT_PUSH, abs=0.7 * MM
     )
     with np.load(demonstrations.FIRM_SEARCH_PATH, allow_pickle=False) as file:
-        assert file["contact_force"].max() < 15.0  # inside the force bound of the task
+        assert file["contact_force"].max() < 15.0  # [N], the force bound of the task
 
 
 @pytest.mark.parametrize("session", [SEARCH_SESSION, FIRM_SEARCH_SESSION], ids=["gantry", "arm"])
-def test_recording_a_search_again_reproduces_the_file(session):
+def test_record_one_reproduces_the_search_files(session):
     with np.load(session.path, allow_pickle=False) as file:
-        everything = dict(file)
-    motion = session.motions(int(everything["seed"]), TIMES_RECORDED)[0]
+        arrays = dict(file)
+    motion = session.motions(int(arrays["seed"]), TIMES_RECORDED)[0]
     recording, is_locked = record_one(motion, session.station)
     assert is_locked
-    np.testing.assert_allclose(recording["desired_pose"], everything["outputs"][0], atol=1e-9)
-    assert recording["pose"][-1, :3] == pytest.approx(everything["measured"][0, -1, :3], abs=0.1 * MM)
+    np.testing.assert_allclose(recording["desired_pose"], arrays["outputs"][0], atol=1e-9)
+    assert recording["pose"][-1, :3] == pytest.approx(arrays["measured"][0, -1, :3], abs=0.1 * MM)

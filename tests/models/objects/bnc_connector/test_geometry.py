@@ -1,3 +1,5 @@
+"""Meshes and model files of the BNC connector."""
+
 import dataclasses
 import re
 
@@ -28,7 +30,7 @@ from research.generate import generate
 DIMENSIONS = BncDimensions()
 
 
-def centers(mesh):
+def triangle_centers(mesh):
     return mesh.vertices[mesh.triangles].mean(axis=1)
 
 
@@ -49,33 +51,32 @@ def test_files_change_with_the_dimensions():
     assert files(wider)["bnc_bore.obj"] == files(DIMENSIONS)["bnc_bore.obj"]
 
 
-def test_bore_encloses_the_true_barrel():
-    """The polygon encloses the circle and its faces point at the barrel."""
+def test_polygon_of_the_bore_encloses_its_circle():
+    """The faces of the polygon are at least the bore's radius from the axis and point at it."""
     mesh = bore_mesh(DIMENSIONS)
-    wall = centers(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
-    outward = centers(mesh)[wall] * [1, 1, 0]
+    wall = triangle_centers(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
+    outward = triangle_centers(mesh)[wall] * [1, 1, 0]
     distance_of_planes = np.abs(np.einsum("ij,ij->i", mesh.normals()[wall], mesh.vertices[mesh.triangles[wall, 0]]))
     assert distance_of_planes.min() >= DIMENSIONS.bore_radius - 1e-8
     assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
 
 
 def test_equal_area_polygons_have_the_area_of_their_circles():
-    """The barrel is the polygon that Drake makes of the cylinder."""
     bore = bore_mesh(DIMENSIONS, equal_area=True)
     corners = bore.vertices[bore.vertices[:, 2] > DIMENSIONS.mouth_chamfer + 1e-9, :2]
     area = 0.5 * len(corners) * np.hypot(*corners.T).max() ** 2 * np.sin(2 * np.pi / len(corners))
     assert area == pytest.approx(np.pi * DIMENSIONS.bore_radius**2, rel=1e-6)
 
     radius = float(re.findall(r"<radius>([\d.]+)<", jack_sdf(DIMENSIONS, equal_area=True))[0])
-    sides = len(barrel_circle(radius))
+    sides = len(barrel_polygon(radius))
     assert sides == barrel_sides(DIMENSIONS)
     area = 0.5 * sides * radius**2 * np.sin(2 * np.pi / sides)
     assert area == pytest.approx(np.pi * DIMENSIONS.barrel_radius**2, rel=1e-4)
     assert radius < DIMENSIONS.bore_radius
 
 
-def barrel_circle(radius: float) -> np.ndarray:
-    """Return the corners of the polygon that Drake makes of a barrel."""
+def barrel_polygon(radius: float) -> np.ndarray:
+    """Return the corners (N, 3) of the polygon with which Drake approximates a barrel of the given radius [m]."""
     scene_graph = SceneGraph()
     source, properties = scene_graph.RegisterSource(), ProximityProperties()
     AddCompliantHydroelasticProperties(BARREL.resolution, BARREL.modulus, properties)
@@ -87,8 +88,7 @@ def barrel_circle(radius: float) -> np.ndarray:
     return corners[(corners[:, 2] > 0) & np.isclose(np.hypot(*corners[:, :2].T), radius)]
 
 
-def test_slot_has_clearance_along_the_lugs_path():
-    """The slot is wider than the lug along z at every point of the path."""
+def test_slot_is_wider_than_the_lug_along_its_path():
     columns = slot_columns(DIMENSIONS)
     width = columns.upper - columns.lower
     ramp = (columns.angles > 0.2) & (columns.angles < DIMENSIONS.detent_angle)
@@ -97,7 +97,7 @@ def test_slot_has_clearance_along_the_lugs_path():
 
 def test_slot_walls_face_the_slot():
     mesh = slot_mesh(DIMENSIONS)
-    middle = centers(mesh)
+    middle = triangle_centers(mesh)
     angle = np.arctan2(middle[:, 1], middle[:, 0])
     on_ramp = (np.abs(np.rad2deg(angle) - 45) < 20) & (middle[:, 2] > 1.5 * MM)
     is_upper = middle[on_ramp, 2] > 4.5 * MM
@@ -106,14 +106,14 @@ def test_slot_walls_face_the_slot():
     np.testing.assert_allclose(mesh.normals()[on_mouth], [[0, 0, -1]] * on_mouth.sum(), atol=1e-9)
 
 
-def test_meshes_repeat_after_half_a_turn():
+def test_meshes_are_symmetric_under_half_a_turn():
     for mesh in (slot_mesh(DIMENSIONS), ring_mesh(DIMENSIONS)):
         points = {tuple(point) for point in np.round(mesh.vertices, 8) + 0.0}
-        turned = {tuple(point) for point in np.round(mesh.vertices * [-1, -1, 1], 8) + 0.0}
-        assert points == turned
+        rotated = {tuple(point) for point in np.round(mesh.vertices * [-1, -1, 1], 8) + 0.0}
+        assert points == rotated
 
 
-def test_from_quads_merges_corners_and_drops_slivers():
+def test_from_quads_merges_corners_and_removes_slivers():
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], dtype=float)
     sliver = np.array([[1, 0, 0], [2, 0, 0], [1, 1, 0], [1, 1, 0]], dtype=float)
     mesh = TriangleMesh.from_quads(np.stack([square, sliver]))

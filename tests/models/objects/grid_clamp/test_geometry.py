@@ -1,3 +1,5 @@
+"""Meshes and model files of the grid clamp."""
+
 import dataclasses
 
 import numpy as np
@@ -20,10 +22,15 @@ DIMENSIONS = GridClampDimensions()
 
 
 def plane_distances(mesh, select):
-    """Return the distances of triangles' planes from the z axis; `select` accepts the heights of their centers."""
+    """Return the distances [m] of the planes of triangles from the origin, which is on the axis of rotation.
+
+    Args:
+        mesh: Mesh with the triangles.
+        select: Function that returns the mask of the triangles for the heights of their centers [m].
+    """
     corners = mesh.vertices[mesh.triangles]
-    chosen = select(corners[:, :, 2].mean(axis=1))
-    return np.abs(np.einsum("ij,ij->i", mesh.normals()[chosen], corners[chosen, 0]))
+    selected = select(corners[:, :, 2].mean(axis=1))
+    return np.abs(np.einsum("ij,ij->i", mesh.normals()[selected], corners[selected, 0]))
 
 
 @pytest.mark.parametrize("name", files(DIMENSIONS))
@@ -43,8 +50,7 @@ def test_files_change_with_the_dimensions():
     assert wider["grid_clamp_peg.obj"] == files(DIMENSIONS)["grid_clamp_peg.obj"]
 
 
-def test_polygons_have_the_full_clearance():
-    """The clearance between flat sides equals that of the circles."""
+def test_flat_sides_have_the_clearance_of_the_circles():
     d = DIMENSIONS
     wall = plane_distances(hole_mesh(d), lambda z: z < -d.hole_chamfer)
     shaft = plane_distances(peg_mesh(d), lambda z: (z > d.peg_chamfer) & (z < d.peg_length - 1e-6))
@@ -61,24 +67,21 @@ def test_compliant_meshes_are_closed_convex_solids(mesh):
     assert (heights <= planes[:, None] + 1e-8).all()
 
 
-def test_only_the_bead_has_interference():
-    """Every peg passes its hole and the lip; the bead passes the lip only by compression."""
+def test_bead_alone_is_wider_than_the_lip():
+    """The peg passes its hole and the lip; the bead passes the lip only if it is compressed."""
     d = DIMENSIONS
     assert d.peg_radius < min(d.hole_radius, d.lip_radius)
     assert d.bead_radius > d.lip_radius
-    assert d.bead_depth > d.lip_depth + d.lip_land  # beyond the lip when it has snapped in
+    assert d.bead_depth > d.lip_depth + d.lip_land  # below the lip when the peg is inserted
     assert np.hypot(*lip_mesh(d).vertices[:, :2].T).min() >= d.lip_radius
 
 
-def test_holes_face_upwards_below_the_pegs():
-    d = DIMENSIONS
-    mesh = hole_mesh(d)
-    face = np.isclose(mesh.vertices[mesh.triangles][:, :, 2], 0.0).all(axis=1)
-    np.testing.assert_allclose(mesh.normals()[face], [[0, 0, 1]] * face.sum(), atol=1e-9)
-    visible = slab_mesh(d)
-    upper = np.isclose(visible.vertices[visible.triangles][:, :, 2], 0.0).all(axis=1)
-    np.testing.assert_allclose(visible.normals()[upper], [[0, 0, 1]] * upper.sum(), atol=1e-9)
-    a, b, c = (visible.vertices[visible.triangles[upper, i]] for i in range(3))
+def test_upper_faces_point_up_and_leave_out_the_holes():
+    d, slab = DIMENSIONS, slab_mesh(DIMENSIONS)
+    for mesh in (hole_mesh(d), slab):
+        upper = np.isclose(mesh.vertices[mesh.triangles][:, :, 2], 0.0).all(axis=1)
+        np.testing.assert_allclose(mesh.normals()[upper], [[0, 0, 1]] * upper.sum(), atol=1e-9)
+    a, b, c = (slab.vertices[slab.triangles[upper, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     mouth = 6 * np.sin(np.pi / 6) * (d.hole_radius + d.hole_chamfer) ** 2
     assert area == pytest.approx(d.table_width**2 - 5 * mouth, rel=1e-6)

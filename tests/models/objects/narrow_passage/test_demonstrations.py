@@ -1,4 +1,4 @@
-"""The nine demonstrations have the properties that the task needs."""
+"""The nine demonstrations of the narrow passage have the properties that the task requires."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from guiderail.models.objects.narrow_passage import demonstrations as narrow_passage
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
-WORLD = PassageGeometry()
+GEOMETRY = PassageGeometry()
 
 
 @pytest.fixture(scope="module")
@@ -16,13 +16,13 @@ def paths():
 
 
 def test_generate_reproduces_the_shipped_file(paths):
-    second = narrow_passage.generate()
-    # Another BLAS may round the Cholesky factor differently.
-    np.testing.assert_allclose(np.stack(second.outputs), paths, atol=1e-8)
-    np.testing.assert_array_equal(second.times[0], narrow_passage.load().times[0])
+    generated = narrow_passage.generate()
+    # The tolerance allows for BLAS libraries that round the Cholesky factor differently.
+    np.testing.assert_allclose(np.stack(generated.outputs), paths, atol=1e-8)
+    np.testing.assert_array_equal(generated.times[0], narrow_passage.load().times[0])
 
 
-def test_load_returns_nine_times_400_points(paths):
+def test_load_returns_nine_demonstrations_of_400_points(paths):
     assert paths.shape == (9, 400, 2)
     np.testing.assert_allclose(np.diff(narrow_passage.load().times[0]), narrow_passage.PERIOD)
 
@@ -35,31 +35,29 @@ def test_demonstrations_are_smooth(paths):
 
 
 def test_demonstrations_agree_only_in_the_passage(paths):
-    middle = (paths[..., 1] > WORLD.wall_y[0]) & (paths[..., 1] < WORLD.wall_y[1])
-    in_passage = [path[m, 0] for path, m in zip(paths, middle, strict=True)]
-    assert np.std([x.mean() for x in in_passage]) < 0.005
-    widest = paths.std(axis=0)[:, 0].max()
-    assert widest > 0.07
-    pairs = np.abs(paths[:, None] - paths[None]).max(axis=(2, 3)) + 9 * np.eye(9)
-    assert pairs.min() > 0.02
+    in_passage = (paths[..., 1] > GEOMETRY.wall_y[0]) & (paths[..., 1] < GEOMETRY.wall_y[1])
+    assert np.std([x[mask].mean() for x, mask in zip(paths[..., 0], in_passage, strict=True)]) < 0.005
+    assert paths.std(axis=0)[:, 0].max() > 0.07
+    differences = np.abs(paths[:, None] - paths[None]).max(axis=(2, 3)) + 9 * np.eye(9)  # no path with itself
+    assert differences.min() > 0.02
 
 
 def test_demonstrations_touch_no_wall(paths):
-    lower, upper = WORLD.walls
+    lower, upper = GEOMETRY.walls
     points = paths.reshape(-1, 1, 2)
     assert not ((points > lower - 0.01) & (points < upper + 0.01)).all(axis=2).any()
 
 
 def test_mean_crosses_the_obstacle(paths):
     mean = paths.mean(axis=0)
-    assert np.hypot(*(mean - WORLD.obstacle).T).min() < 0.6 * WORLD.obstacle_radius
+    assert np.hypot(*(mean - GEOMETRY.obstacle).T).min() < 0.6 * GEOMETRY.obstacle_radius
 
 
-def test_two_demonstrations_enter_the_zone_and_the_mean_does_not(paths):
-    assert (paths[..., 0] > WORLD.zone_x).any(axis=1).sum() == 2
-    assert paths.mean(axis=0)[:, 0].max() < WORLD.zone_x
+def test_two_demonstrations_enter_the_zone_but_not_the_mean(paths):
+    assert (paths[..., 0] > GEOMETRY.zone_x).any(axis=1).sum() == 2
+    assert paths.mean(axis=0)[:, 0].max() < GEOMETRY.zone_x
 
 
-def test_demonstrations_start_and_end_where_the_task_does(paths):
-    assert np.hypot(*(paths[:, 0] - WORLD.start).T).max() < 0.03
-    assert np.hypot(*(paths[:, -1] - WORLD.goal).T).max() < WORLD.goal_radius
+def test_demonstrations_start_and_end_near_start_and_goal(paths):
+    assert np.hypot(*(paths[:, 0] - GEOMETRY.start).T).max() < 0.03
+    assert np.hypot(*(paths[:, -1] - GEOMETRY.goal).T).max() < GEOMETRY.goal_radius

@@ -33,7 +33,7 @@ def test_walls_leave_only_the_gap():
     assert upper[1, 0] - lower[1, 0] >= 5
 
 
-def test_start_and_goal_are_on_different_sides_of_the_walls():
+def test_at_goal_and_in_passage_are_true_inside_only():
     assert not GEOMETRY.at_goal(np.array(GEOMETRY.start))
     assert GEOMETRY.at_goal(np.array(GEOMETRY.goal))
     assert not GEOMETRY.in_passage(np.array(GEOMETRY.start))
