@@ -1,4 +1,4 @@
-"""Contradictions of active constraints are found, and only those."""
+"""Contradictions of active constraints are found, and consistent constraints are accepted."""
 
 from pathlib import Path
 
@@ -22,11 +22,11 @@ UPRIGHT = ac.FixedOrientation()
 
 
 @pytest.mark.parametrize(
-    ("constraints", "found"),
+    ("constraints", "indices"),
     [
         ([BOX, ac.FixedOrientation((90.0, 0.0, 0.0)), UPRIGHT], (1, 2)),
         ([UPRIGHT, ac.TiltLimits("world", 30.0, 60.0)], (0, 1)),
-        ([ac.FixedOrientation((0.0, 0.0, 20.0)), ac.TiltLimits("world", -10.0, 10.0)], (0, 1)),  # turned about z
+        ([ac.FixedOrientation((0.0, 0.0, 20.0)), ac.TiltLimits("world", -10.0, 10.0)], (0, 1)),  # rotated about z
         ([ac.TiltLimits("world", 0.0, 20.0), ac.TiltByDistance("world", (0.1, 0.2), (40.0, 30.0))], (0, 1)),
         ([ac.TiltLimits("world", 10.0, 20.0), ac.TiltLimits("world", -20.0, -10.0)], (0, 1)),
         ([ac.TiltLimits("world", 10.0, 20.0), ac.Arc("world", 0.1)], (0, 1)),
@@ -44,32 +44,35 @@ UPRIGHT = ac.FixedOrientation()
         ([ac.Funnel("world", 0.1, 0.1, 0.5), ac.KeepAbove(0.3), ac.Cylinder("world", 0.0, 0.2)], (0, 1, 2)),
     ],
 )  # fmt: skip
-def test_contradictory_constraints_are_found(constraints, found):
-    assert find_contradiction(constraints) == found
+def test_find_contradiction_returns_contradictory_constraints(constraints, indices):
+    assert find_contradiction(constraints) == indices
 
 
 @pytest.mark.parametrize(
     "constraints",
     [
         [BOX, UPRIGHT, UPRIGHT],
-        [ac.FixedOrientation((0.0, 45.0, 0.0)), ac.TiltLimits("world", -60.0, -30.0)],  # from the other side
+        [
+            ac.FixedOrientation((0.0, 45.0, 0.0)),
+            ac.TiltLimits("world", -60.0, -30.0),
+        ],  # satisfied on the opposite side of the axis
         [ac.TiltLimits("world", -180.0, -179.0), ac.TiltLimits("world", 179.0, 180.0)],
         [ac.TiltLimits("world", 10.0, 20.0), ac.TiltLimits("world", -20.0, -10.0, turns_along=True)],
-        # These have one point, or one edge, in common.
+        # The sets of the next four constraints have a single point or edge in common.
         [ac.Box((0.005, -0.05, 0.0), (0.02, 0.05, 0.01)), ac.Cylinder("world", 0.0, 0.005)],
         [ac.HalfSpace((1.0, 0.0, 0.0), 0.1), ac.HalfSpace((-1.0, 0.0, 0.0), -0.1)],
         [ac.Funnel("world", 0.1, 0.1, 0.5), ac.KeepAbove(0.3)],
         [ac.Arc("world", 0.1), ac.Cylinder("world", 0.1, 0.1), ac.KeepAbove(0.0)],
-        # Objects move, so that constraints in different frames are not compared.
+        # Constraints in different frames are not compared, because objects move.
         [UPRIGHT, ac.FixedOrientation((90.0, 0.0, 0.0), "cup")],
     ],
 )
-def test_constraints_that_a_pose_satisfies_are_consistent(constraints):
+def test_find_contradiction_accepts_constraints_with_a_pose(constraints):
     assert find_contradiction(constraints) == ()
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_constraints_around_a_pose_are_consistent(seed):
+def test_find_contradiction_accepts_constraints_around_a_pose(seed):
     rng = np.random.default_rng(seed)
     p, room = 0.3 * rng.standard_normal(3), float(rng.choice([0.0, 1e-9, 1e-3, 0.1]))
     X_WE = RigidTransform(RotationMatrix(Rotation.random(rng=rng).as_matrix()), p)
@@ -91,7 +94,7 @@ def test_constraints_around_a_pose_are_consistent(seed):
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_orientations_around_a_pose_are_consistent(seed):
+def test_find_contradiction_accepts_orientations_of_a_pose(seed):
     rng = np.random.default_rng(seed)
     rpy, low, high = tuple(rng.uniform(-180, 180, 3)), *np.sort(rng.uniform(-180, 180, 2)).tolist()
     along, p = bool(rng.integers(2)), 0.3 * rng.standard_normal(3)
@@ -104,7 +107,7 @@ def test_orientations_around_a_pose_are_consistent(seed):
 
 
 @pytest.mark.parametrize("name", shipped_templates())
-def test_shipped_templates_do_not_contradict_themselves(name):
+def test_shipped_templates_have_no_contradiction(name):
     assert load_template(name).contradiction is None
 
 

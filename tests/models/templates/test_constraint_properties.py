@@ -1,4 +1,4 @@
-"""Active constraints with random sizes, compared with an independent formulation of their geometry."""
+"""Active constraints of random sizes, compared with an independent formulation of their geometry."""
 
 import math
 
@@ -15,11 +15,11 @@ from guiderail.models.templates.geometry import WORLD, angle_between, position_i
 
 F = "object"
 SEEDS = st.integers(0, 2**32 - 1)
-EXACT = 1e-11
+TOLERANCE = 1e-11
 
 
 def scene(seed, spread=0.3):
-    """Return a random generator, X_WE, the pose of an object by name, and the name of the object or of the world."""
+    """Return a random generator, X_WE, the pose of the object by its name, and the name of the object or the world."""
     rng = np.random.default_rng(seed)
 
     def pose():
@@ -30,15 +30,15 @@ def scene(seed, spread=0.3):
     return rng, X_WE, {F: X_WF}, frame
 
 
-def projected(constraint, X_WE, frames, frame):
-    """Return p_FE and its projection p_FP after checks of the properties of every position constraint."""
+def project_position(constraint, X_WE, frames, frame):
+    """Check the properties of every position constraint; return p_FE and its projection p_FP."""
     X_WP = constraint.project(X_WE, frames)
     assert angle_between(X_WP.rotation(), X_WE.rotation()) == 0.0
     p, q = position_in(frame, X_WE, frames), position_in(frame, X_WP, frames)
-    assert constraint.violation(X_WE, frames) == pytest.approx(np.linalg.norm(q - p), abs=EXACT)
-    second = constraint.project(X_WP, frames)
-    assert np.abs(second.translation() - X_WP.translation()).max() < EXACT
-    assert constraint.violation(X_WP, frames) < EXACT
+    assert constraint.violation(X_WE, frames) == pytest.approx(np.linalg.norm(q - p), abs=TOLERANCE)
+    again = constraint.project(X_WP, frames)
+    assert np.abs(again.translation() - X_WP.translation()).max() < TOLERANCE
+    assert constraint.violation(X_WP, frames) < TOLERANCE
     if X_WP is X_WE:
         assert constraint.violation(X_WE, frames) == 0.0
     assert constraint.frame_names == (() if frame == WORLD else (F,))
@@ -46,69 +46,67 @@ def projected(constraint, X_WE, frames, frame):
 
 
 @given(SEEDS)
-def test_half_space(seed):
+def test_half_space_projects_along_its_normal(seed):
     rng, X_WE, frames, frame = scene(seed)
     normal, offset = rng.standard_normal(3), 0.1 * rng.standard_normal()
-    p, q = projected(ac.HalfSpace(tuple(normal), offset, frame), X_WE, frames, frame)
+    p, q = project_position(ac.HalfSpace(tuple(normal), offset, frame), X_WE, frames, frame)
     n = normal / np.linalg.norm(normal)
-    assert n @ q >= offset - EXACT
-    np.testing.assert_allclose(q, p + max(0.0, offset - n @ p) * n, atol=EXACT)
+    assert n @ q >= offset - TOLERANCE
+    np.testing.assert_allclose(q, p + max(0.0, offset - n @ p) * n, atol=TOLERANCE)
 
 
 @given(SEEDS)
-def test_box(seed):
+def test_box_clips_each_coordinate(seed):
     rng, X_WE, frames, frame = scene(seed)
     lower = -0.3 * rng.uniform(size=3)
     upper = lower + rng.choice([0.0, 0.5], 3)
-    p, q = projected(ac.Box(tuple(lower), tuple(upper), frame), X_WE, frames, frame)
-    np.testing.assert_allclose(q, [min(max(x, a), b) for x, a, b in zip(p, lower, upper, strict=True)], atol=EXACT)
+    p, q = project_position(ac.Box(tuple(lower), tuple(upper), frame), X_WE, frames, frame)
+    np.testing.assert_allclose(q, [min(max(x, a), b) for x, a, b in zip(p, lower, upper, strict=True)], atol=TOLERANCE)
 
 
 @given(SEEDS)
-def test_cylinder(seed):
+def test_cylinder_clips_the_radius(seed):
     rng, X_WE, frames, _ = scene(seed)
-    least = rng.choice([0.0, 0.1, 0.3])
-    most = least + rng.choice([0.0, 0.2, 1000.0])
+    lower = rng.choice([0.0, 0.1, 0.3])
+    upper = lower + rng.choice([0.0, 0.2, 1000.0])
     if seed % 5 == 0:
         X_WE = RigidTransform(X_WE.rotation(), frames[F] @ np.array([0.0, 0.0, 0.2]))  # on the axis
-    p, q = projected(ac.Cylinder(F, least, most), X_WE, frames, F)
-    radius, kept = math.hypot(*p[:2]), math.hypot(*q[:2])
-    assert kept == pytest.approx(min(max(radius, least), most), abs=2e-12)
-    assert least - EXACT <= kept <= most + EXACT
-    assert q[2] == pytest.approx(p[2], abs=EXACT)
+    p, q = project_position(ac.Cylinder(F, lower, upper), X_WE, frames, F)
+    radius, projected_radius = math.hypot(*p[:2]), math.hypot(*q[:2])
+    assert projected_radius == pytest.approx(min(max(radius, lower), upper), abs=2e-12)
+    assert lower - TOLERANCE <= projected_radius <= upper + TOLERANCE
+    assert q[2] == pytest.approx(p[2], abs=TOLERANCE)
     if radius > 1e-6:
-        assert (p[0] * q[1] - p[1] * q[0]) / radius == pytest.approx(0, abs=EXACT)
-        assert p[:2] @ q[:2] >= -EXACT
+        assert (p[0] * q[1] - p[1] * q[0]) / radius == pytest.approx(0, abs=TOLERANCE)
+        assert p[:2] @ q[:2] >= -TOLERANCE
 
 
-def test_cylinder_projects_its_axis_along_minus_x():
+def test_cylinder_projects_points_on_the_axis_along_minus_x():
     X_WP = ac.Cylinder(F, 0.1, 0.2).project(RigidTransform([0.0, 0.0, 0.5]), {F: RigidTransform()})
     np.testing.assert_allclose(X_WP.translation(), [-0.1, 0.0, 0.5], atol=1e-11)
 
 
 @given(SEEDS)
-def test_sector(seed):
+def test_sector_rotates_to_the_nearer_limit(seed):
     rng, X_WE, frames, _ = scene(seed)
-    least = rng.uniform(-400, 300)
-    most = least + rng.choice([0.0, 30.0, 200.0, 360.0])
-    p, q = projected(ac.Sector(F, least, most), X_WE, frames, F)
-    assert math.hypot(*q[:2]) == pytest.approx(math.hypot(*p[:2]), abs=EXACT)
-    assert q[2] == pytest.approx(p[2], abs=EXACT)
+    lower = rng.uniform(-400, 300)
+    upper = lower + rng.choice([0.0, 30.0, 200.0, 360.0])
+    p, q = project_position(ac.Sector(F, lower, upper), X_WE, frames, F)
+    assert math.hypot(*q[:2]) == pytest.approx(math.hypot(*p[:2]), abs=TOLERANCE)
+    assert q[2] == pytest.approx(p[2], abs=TOLERANCE)
     before, after = (math.degrees(math.atan2(x[1], x[0])) for x in (p, q))
-    inside = (before - least) % 360 <= most - least
-    off = (after - least) % 360
-    assert off <= most - least + 1e-6 or off >= 360 - 1e-6
-    if inside:
-        np.testing.assert_allclose(q, p, atol=EXACT)
+    excess = (after - lower) % 360
+    assert excess <= upper - lower + 1e-6 or excess >= 360 - 1e-6
+    if (before - lower) % 360 <= upper - lower:
+        np.testing.assert_allclose(q, p, atol=TOLERANCE)
     else:
-        # To the nearer end: no way round the axis is shorter.
-        ends = [abs((before - end + 180) % 360 - 180) for end in (least, most)]
-        moved = abs((after - before + 180) % 360 - 180)
-        assert moved == pytest.approx(min(ends), abs=1e-6)
+        distances = [abs((before - limit + 180) % 360 - 180) for limit in (lower, upper)]
+        rotation = abs((after - before + 180) % 360 - 180)
+        assert rotation == pytest.approx(min(distances), abs=1e-6)
 
 
 @given(SEEDS)
-def test_keep_above(seed):
+def test_keep_above_lifts_the_lowest_point(seed):
     rng, X_WE, frames, frame = scene(seed)
     height = 0.1 * rng.standard_normal()
     points = rng.uniform(-0.2, 0.2, (rng.integers(1, 4), 3))
@@ -117,27 +115,28 @@ def test_keep_above(seed):
     X_WF = frames[F] if frame == F else RigidTransform()
     before = min((X_WF.inverse() @ (X_WE @ point))[2] for point in points)
     after = min((X_WF.inverse() @ (X_WP @ point))[2] for point in points)
-    assert after == pytest.approx(max(before, height), abs=EXACT)
+    assert after == pytest.approx(max(before, height), abs=TOLERANCE)
     lift = X_WF.rotation().inverse() @ (X_WP.translation() - X_WE.translation())
-    np.testing.assert_allclose(lift, [0, 0, max(0.0, height - before)], atol=EXACT)
+    np.testing.assert_allclose(lift, [0, 0, max(0.0, height - before)], atol=TOLERANCE)
     assert angle_between(X_WP.rotation(), X_WE.rotation()) == 0.0
-    assert (X_WP is X_WE) == (height - before <= 0) or abs(height - before) < EXACT
-    own = ac.KeepAbove(height, frame).project(X_WE, frames)
-    lowest = (X_WF.inverse() @ own.translation())[2]
-    assert lowest == pytest.approx(max((X_WF.inverse() @ X_WE.translation())[2], height), abs=EXACT)
+    assert (X_WP is X_WE) == (height - before <= 0) or abs(height - before) < TOLERANCE
+    X_WP = ac.KeepAbove(height, frame).project(X_WE, frames)  # without points, the origin of E
+    assert (X_WF.inverse() @ X_WP.translation())[2] == pytest.approx(
+        max((X_WF.inverse() @ X_WE.translation())[2], height), abs=TOLERANCE
+    )
 
 
 @given(SEEDS)
-def test_funnel(seed):
+def test_funnel_lowers_a_position_to_its_surface(seed):
     rng, X_WE, frames, _ = scene(seed)
     radius, height, slope = rng.uniform(0, 0.3), 0.1 * rng.standard_normal(), rng.choice([0.0, 0.9, 3.0])
-    p, q = projected(ac.Funnel(F, radius, height, slope), X_WE, frames, F)
+    p, q = project_position(ac.Funnel(F, radius, height, slope), X_WE, frames, F)
     ceiling = height + slope * max(0.0, math.hypot(p[0], p[1]) - radius)
-    np.testing.assert_allclose(q, [p[0], p[1], min(p[2], ceiling)], atol=EXACT)
+    np.testing.assert_allclose(q, [p[0], p[1], min(p[2], ceiling)], atol=TOLERANCE)
 
 
 @given(SEEDS)
-def test_fixed_orientation(seed):
+def test_fixed_orientation_changes_only_the_orientation(seed):
     rng, X_WE, frames, frame = scene(seed)
     rpy = tuple(rng.uniform(-180, 180, 3))
     X_WP = ac.FixedOrientation(rpy, frame).project(X_WE, frames)
@@ -147,44 +146,48 @@ def test_fixed_orientation(seed):
     np.testing.assert_array_equal(X_WP.translation(), X_WE.translation())
 
 
-def leaning(R_FE, p_FE, rest, turns_along):
-    """Return the tilt towards F's axis, and the angle about other axes [rad], of an orientation relative to `rest`."""
+def tilt_axis(p_FE):
+    """Return the horizontal axis of a tilt from p_FE towards the z axis of F."""
     towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
+    return np.array([-towards[1], towards[0], 0.0])
+
+
+def measure_tilt(R_FE, p_FE, R_FRest, turns_along):
+    """Return the tilt towards the z axis of F, and the angle about other axes [rad], relative to R_FRest."""
+    axis = tilt_axis(p_FE)
     if turns_along:
-        rest = Rotation.from_euler("z", math.atan2(towards[1], towards[0])) * rest
-    lean = (Rotation.from_matrix(R_FE) * rest.inv()).as_rotvec()
-    axis = np.array([-towards[1], towards[0], 0.0])
-    return lean @ axis, np.linalg.norm(lean - (lean @ axis) * axis)
+        R_FRest = Rotation.from_euler("z", math.atan2(-axis[0], axis[1])) * R_FRest
+    rotation = (Rotation.from_matrix(R_FE) * R_FRest.inv()).as_rotvec()
+    return rotation @ axis, np.linalg.norm(rotation - (rotation @ axis) * axis)
 
 
 @given(SEEDS, st.booleans())
-def test_tilt_limits(seed, turns_along):
+def test_tilt_limits_project_to_the_nearest_allowed_tilt(seed, turns_along):
     rng, X_WE, frames, frame = scene(seed)
-    least = rng.uniform(-180, 170)
-    most = rng.choice([least, rng.uniform(least, 180)])
+    lower = rng.uniform(-180, 170)
+    upper = rng.choice([lower, rng.uniform(lower, 180)])
     rpy = tuple(rng.uniform(-90, 90, 3))
-    constraint = ac.TiltLimits(frame, least, most, rpy, turns_along)
+    constraint = ac.TiltLimits(frame, lower, upper, rpy, turns_along)
     X_WP = constraint.project(X_WE, frames)
     np.testing.assert_array_equal(X_WP.translation(), X_WE.translation())
     X_WF = frames[F] if frame == F else RigidTransform()
     R_FP, R_FE = (X_WF.rotation().inverse() @ X.rotation() for X in (X_WP, X_WE))
     p_FE = X_WF.inverse() @ X_WE.translation()
-    tilt, rest_of_it = leaning(R_FP.matrix(), p_FE, Rotation.from_euler("xyz", rpy, degrees=True), turns_along)
-    assert rest_of_it < 1e-6
-    off = (math.degrees(tilt) - least + 1e-6) % 360
-    assert off <= most - least + 2e-6
+    tilt, other_angle = measure_tilt(R_FP.matrix(), p_FE, Rotation.from_euler("xyz", rpy, degrees=True), turns_along)
+    assert other_angle < 1e-6
+    assert (math.degrees(tilt) - lower + 1e-6) % 360 <= upper - lower + 2e-6
     assert constraint.violation(X_WP, frames) < 1e-7
     # No allowed tilt is nearer to the requested one.
-    towards = -p_FE[:2] / np.linalg.norm(p_FE[:2])
-    axis = np.array([-towards[1], towards[0], 0.0])
-    base = Rotation.from_rotvec(-tilt * axis) * Rotation.from_matrix(R_FP.matrix())
-    expected = np.linalg.norm(R_FP.matrix() - R_FE.matrix())
-    for other in np.radians(np.linspace(least, most, 60)):
-        assert np.linalg.norm((Rotation.from_rotvec(other * axis) * base).as_matrix() - R_FE.matrix()) > expected - 1e-6
+    axis = tilt_axis(p_FE)
+    upright = Rotation.from_rotvec(-tilt * axis) * Rotation.from_matrix(R_FP.matrix())
+    nearest = np.linalg.norm(R_FP.matrix() - R_FE.matrix())
+    for angle in np.radians(np.linspace(lower, upper, 60)):
+        R = (Rotation.from_rotvec(angle * axis) * upright).as_matrix()
+        assert np.linalg.norm(R - R_FE.matrix()) > nearest - 1e-6
 
 
 @given(SEEDS)
-def test_tilt_by_distance(seed):
+def test_tilt_by_distance_interpolates_the_tilt(seed):
     rng, X_WE, frames, frame = scene(seed)
     distances = np.sort(rng.uniform(0, 1, rng.integers(1, 5)))
     tilts = rng.uniform(-180, 180, len(distances))
@@ -194,39 +197,41 @@ def test_tilt_by_distance(seed):
     X_WP = constraint.project(X_WE, frames)
     X_WF = frames[F] if frame == F else RigidTransform()
     p_FE = X_WF.inverse() @ X_WE.translation()
-    far = np.linalg.norm(p_FE)
-    expected = np.interp(far, distances, tilts)
-    tilt, rest_of_it = leaning((X_WF.rotation().inverse() @ X_WP.rotation()).matrix(), p_FE, Rotation.identity(), False)
-    assert rest_of_it < 1e-6
+    distance = np.linalg.norm(p_FE)
+    expected = np.interp(distance, distances, tilts)
+    tilt, other_angle = measure_tilt(
+        (X_WF.rotation().inverse() @ X_WP.rotation()).matrix(), p_FE, Rotation.identity(), False
+    )
+    assert other_angle < 1e-6
     assert (math.degrees(tilt) - expected + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
 
 
 @given(SEEDS)
-def test_arc(seed):
+def test_arc_projects_position_and_orientation(seed):
     rng, X_WE, frames, frame = scene(seed)
-    least = rng.uniform(-180, 170)
-    most = rng.choice([least, rng.uniform(least, 180)])
+    lower = rng.uniform(-180, 170)
+    upper = rng.choice([lower, rng.uniform(lower, 180)])
     radius, height, rpy = rng.uniform(0.1, 1), rng.standard_normal(), tuple(rng.uniform(-90, 90, 3))
-    constraint = ac.Arc(frame, radius, height, least, most, rpy)
+    constraint = ac.Arc(frame, radius, height, lower, upper, rpy)
     X_WF = frames[F] if frame == F else RigidTransform()
     X_FP = X_WF.inverse() @ constraint.project(X_WE, frames)
     q, p = X_FP.translation(), X_WF.inverse() @ X_WE.translation()
     assert math.hypot(q[0], q[1]) == pytest.approx(radius)
     assert q[2] == pytest.approx(height)
     angle = math.degrees(math.atan2(q[1], q[0]))
-    assert (angle - least + 1e-6) % 360 <= most - least + 2e-6
-    asked = math.degrees(math.atan2(p[1], p[0]))
-    if (asked - least) % 360 <= most - least:
-        assert (angle - asked + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
+    assert (angle - lower + 1e-6) % 360 <= upper - lower + 2e-6
+    requested = math.degrees(math.atan2(p[1], p[0]))
+    if (requested - lower) % 360 <= upper - lower:
+        assert (angle - requested + 180) % 360 - 180 == pytest.approx(0, abs=1e-6)
     else:
-        ends = [abs((asked - end + 180) % 360 - 180) for end in (least, most)]
-        assert abs((angle - asked + 180) % 360 - 180) == pytest.approx(min(ends), abs=1e-6)
+        distances = [abs((requested - limit + 180) % 360 - 180) for limit in (lower, upper)]
+        assert abs((angle - requested + 180) % 360 - 180) == pytest.approx(min(distances), abs=1e-6)
     expected = Rotation.from_euler("z", angle, degrees=True) * Rotation.from_euler("xyz", rpy, degrees=True)
     np.testing.assert_allclose(X_FP.rotation().matrix(), expected.as_matrix(), atol=1e-9)
 
 
-class Tilted(ac.ActiveConstraint):
-    """Translates by 0.3 m and rotates by a given angle."""
+class ShiftAndRotate(ac.ActiveConstraint):
+    """Translates by 0.3 m along x and rotates by a given angle [rad] about x."""
 
     def __init__(self, angle):
         self.angle = angle
@@ -239,17 +244,17 @@ class Tilted(ac.ActiveConstraint):
 
 def test_violation_is_the_larger_of_meters_and_radians():
     X_WE = RigidTransform(RotationMatrix.MakeYRotation(0.7), [0.1, -0.2, 0.5])
-    assert Tilted(0.1).violation(X_WE, {}) == pytest.approx(0.3)
-    assert Tilted(0.5).violation(X_WE, {}) == pytest.approx(0.5)
-    assert Tilted(0.0).frame_names == ()
+    assert ShiftAndRotate(0.1).violation(X_WE, {}) == pytest.approx(0.3)
+    assert ShiftAndRotate(0.5).violation(X_WE, {}) == pytest.approx(0.5)
+    assert ShiftAndRotate(0.0).frame_names == ()
 
 
 @pytest.mark.parametrize("center", [-20.0, 0.0, 3.0, 100.0])
-def test_nearest_turn_is_within_half_a_turn(center):
+def test_nearest_turn_is_within_half_a_turn_of_the_center(center):
     for angle in (-9.0, 0.0, 0.5, 7.0):
-        turned = ac.nearest_turn(angle, center)
-        assert abs(turned - center) <= math.pi + 1e-12
-        assert (turned - angle) / math.tau == pytest.approx(round((turned - angle) / math.tau))
+        equivalent = ac.nearest_turn(angle, center)
+        assert abs(equivalent - center) <= math.pi + 1e-12
+        assert (equivalent - angle) / math.tau == pytest.approx(round((equivalent - angle) / math.tau))
 
 
 @pytest.mark.parametrize(
@@ -267,6 +272,7 @@ def test_nearest_turn_is_within_half_a_turn(center):
         (lambda: ac.Funnel(F, 0.1, 0.0, -1.0), "negative"),
         (lambda: ac.TiltLimits(F, -181.0, 0.0), "angles"),
         (lambda: ac.TiltLimits(F, 0.0, 181.0), "angles"),
+        (lambda: ac.TiltLimits(F, 10.0, -10.0), "angles"),
         (lambda: ac.TiltByDistance(F, (0.1, 0.1), (0.0, 1.0)), "increase"),
         (lambda: ac.TiltByDistance(F, (), ()), "increase"),
         (lambda: ac.TiltByDistance(F, (0.1,), (0.0, 1.0)), "increase"),
@@ -286,7 +292,7 @@ def test_nearest_turn_is_within_half_a_turn(center):
         (lambda: ac.Funnel(F, 0.1, 0.0, math.inf), "slope must be finite"),
     ],
 )
-def test_constraint_refuses_an_empty_set(make, message):
+def test_constraint_refuses_invalid_arguments(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -307,23 +313,23 @@ def test_constraint_accepts_limits_at_their_bounds():
 
 
 @given(SEEDS)
-def test_constraint_group_equals_its_constraints_one_by_one(seed):
+def test_group_constraints_groups_neighbors_in_one_frame(seed):
     rng, X_WE, frames, frame = scene(seed)
     box = ac.Box((-0.1, -0.2, -0.3), (0.3, 0.2, 0.1), frame)
     constraints = [
         box,
         ac.Cylinder(frame, 0.05, 0.2),
         ac.TiltLimits(frame, -20.0, 30.0, turns_along=True),
-        Tilted(rng.uniform(0.0, 1.0)),
+        ShiftAndRotate(rng.uniform(0.0, 1.0)),
         ac.KeepAbove(0.02, WORLD, ((0.0, 0.0, -0.1), (0.0, 0.1, 0.0))),
     ]
-    together = ac.group_constraints(constraints)
-    assert [len(g.constraints) if isinstance(g, ac.ConstraintGroup) else 0 for g in together] == [3, 0, 1]
+    groups = ac.group_constraints(constraints)
+    assert [len(group.constraints) if isinstance(group, ac.ConstraintGroup) else 0 for group in groups] == [3, 0, 1]
     X_WP = X_WQ = X_WE
     for constraint in constraints:
         X_WP = constraint.project(X_WP, frames)
-    for group in together:
+    for group in groups:
         X_WQ = group.project(X_WQ, frames)
     np.testing.assert_allclose(X_WP.GetAsMatrix4(), X_WQ.GetAsMatrix4(), atol=1e-12)
-    worst = max(constraint.violation(X_WE, frames) for constraint in constraints)
-    assert max(group.violation(X_WE, frames) for group in together) == pytest.approx(worst, abs=1e-12)
+    expected = max(constraint.violation(X_WE, frames) for constraint in constraints)
+    assert max(group.violation(X_WE, frames) for group in groups) == pytest.approx(expected, abs=1e-12)
