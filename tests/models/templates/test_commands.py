@@ -97,12 +97,10 @@ def test_command_is_inside_when_one_constraint_undoes_another(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_command_satisfies_tighter_constraints_of_the_next_state(seed):
+    insert = Transition("insert", 0.006, 0.002)
     wide, narrow = (
         make_state(name, [ac.Cylinder("f", max_radius_m=radius), ac.KeepAbove(-0.006, "f")], transitions)
-        for name, radius, transitions in (
-            ("search", 0.004, (Transition("insert", 0.006, 0.002),)),
-            ("insert", 0.002, ()),
-        )
+        for name, radius, transitions in (("search", 0.004, (insert,)), ("insert", 0.002, ()))
     )
     template = make_template(wide, narrow, speed=0.05)
     pairs = list(wander(template, seed))
@@ -131,9 +129,8 @@ def test_command_stays_inside_and_within_the_speed_limits(seed):
 @given(SEEDS)
 def test_command_moves_inside_within_the_speed_limits(seed):
     rng = np.random.default_rng(seed)
-    template = make_template(
-        make_state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")])
-    )
+    constraints = [ac.Box((-0.1,) * 3, (0.1,) * 3, "f"), ac.FixedOrientation(frame="f")]
+    template = make_template(make_state(constraints=constraints))
     last = random_pose(rng, 0.5)
     before = template.violation(0, last, FRAMES)
     command = template.command(0, last, last, FRAMES, PERIOD)
@@ -236,10 +233,8 @@ OUTSIDE = [
 
 @pytest.mark.parametrize("constraint", OUTSIDE, ids=lambda constraint: type(constraint).__name__)
 def test_path_between_commands_is_outside_of_a_shape(constraint):
-    rng, template = (
-        np.random.default_rng(0),
-        make_template(make_state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3), constraint])),
-    )
+    rng = np.random.default_rng(0)
+    template = make_template(make_state(constraints=[ac.Box((-0.1,) * 3, (0.1,) * 3), constraint]))
     frames = {"f": random_pose(rng, 0.01)}
     last, nearest, num_contacts, center = RigidTransform([0.0, 0.06, 0.0]), np.inf, 0, frames["f"].translation()
     for k in range(600):
@@ -258,10 +253,8 @@ def test_path_between_commands_is_outside_of_a_shape(constraint):
 
 @pytest.mark.parametrize("constraint", OUTSIDE, ids=lambda constraint: type(constraint).__name__)
 def test_command_leaves_a_shape_that_contains_the_last_command(constraint):
-    template, last = (
-        make_template(make_state(constraints=[constraint]), speed=0.05),
-        RigidTransform([0.001, 0.002, 0.0]),
-    )
+    template = make_template(make_state(constraints=[constraint]), speed=0.05)
+    last = RigidTransform([0.001, 0.002, 0.0])
     violations = [template.violation(0, last, FRAMES)]
     for _ in range(60):
         last = template.command(0, last, last, FRAMES, PERIOD).X_WE

@@ -121,9 +121,8 @@ def test_keep_above_lifts_the_lowest_point(seed):
     assert angle_between(X_WP.rotation(), X_WE.rotation()) == 0.0
     assert (X_WP is X_WE) == (height - before <= 0) or abs(height - before) < TOLERANCE
     X_WP = ac.KeepAbove(height, frame).project(X_WE, frames)  # without points, the origin of E
-    assert (X_WF.inverse() @ X_WP.translation())[2] == pytest.approx(
-        max((X_WF.inverse() @ X_WE.translation())[2], height), abs=TOLERANCE
-    )
+    before, after = ((X_WF.inverse() @ X.translation())[2] for X in (X_WE, X_WP))
+    assert after == pytest.approx(max(before, height), abs=TOLERANCE)
 
 
 @given(SEEDS)
@@ -199,9 +198,8 @@ def test_tilt_by_distance_interpolates_the_tilt(seed):
     p_FE = X_WF.inverse() @ X_WE.translation()
     distance = np.linalg.norm(p_FE)
     expected = np.interp(distance, distances, tilts)
-    tilt, other_angle = measure_tilt(
-        (X_WF.rotation().inverse() @ X_WP.rotation()).matrix(), p_FE, Rotation.identity(), False
-    )
+    R_FP = X_WF.rotation().inverse() @ X_WP.rotation()
+    tilt, other_angle = measure_tilt(R_FP.matrix(), p_FE, Rotation.identity(), False)
     assert other_angle < 1e-6
     assert (math.degrees(tilt) - expected + 180) % 360 - 180 == pytest.approx(0, abs=1e-5)
 

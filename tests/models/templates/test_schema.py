@@ -1,4 +1,4 @@
-"""Template files: what is read, and the sentence in which a faulty file is refused."""
+"""Template files: parsed values, and the error messages for invalid files."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +16,36 @@ from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, TRANSITION_DIST
 from guiderail.models.templates.transitions import TransitionDistance
 
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
+FAR = ("states", "far")
 
 
 def edit_template(change):
+    """Return the text of the template after a function has changed its data in place."""
     data = yaml.safe_load(TEMPLATE)
     change(data)
     return yaml.safe_dump(data, sort_keys=False)
+
+
+def set_value(*path, value):
+    """Return a function that sets the value at a path of keys."""
+
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        data[path[-1]] = value
+
+    return change
+
+
+def remove(*path):
+    """Return a function that removes the value at a path of keys."""
+
+    def change(data):
+        for key in path[:-1]:
+            data = data[key]
+        del data[path[-1]]
+
+    return change
 
 
 def test_parse_returns_states_in_order_in_si_units():
@@ -54,7 +78,7 @@ def test_parse_returns_limits_of_a_state():
     assert not any("≤" in line for line in state_lines(near))
 
 
-def test_register_adds_a_kind_with_one_decorator():
+def test_register_adds_a_kind():
     @register(ACTIVE_CONSTRAINTS, "at_origin")
     @dataclass(frozen=True)
     class AtOrigin(ActiveConstraint):
@@ -64,17 +88,12 @@ def test_register_adds_a_kind_with_one_decorator():
         def project(self, X_WE, frames):
             return RigidTransform(X_WE.rotation(), frames[self.frame] @ np.array([0.0, 0.0, self.height_m]))
 
+    constraint = {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
     try:
-
-        def use(data):
-            data["states"]["far"]["active_constraints"] = [
-                {"kind": "at_origin", "frame": "cup", "height_m": "2 * rim_m"}
-            ]
-
-        template = parse_template(edit_template(use))
+        template = parse_template(edit_template(set_value(*FAR, "active_constraints", value=[constraint])))
         X_WP = template.project(0, RigidTransform(), {"cup": RigidTransform([1.0, 0.0, 0.0])})
         np.testing.assert_allclose(X_WP.translation(), [1.0, 0.0, 0.1])
-        register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)  # the same class, as when its file is imported again
+        register(ACTIVE_CONSTRAINTS, "at_origin")(AtOrigin)  # as when a file is imported twice
         with pytest.raises(InputError, match="there is a kind 'at_origin' already, AtOrigin: choose another name"):
             register(ACTIVE_CONSTRAINTS, "at_origin")(next(iter(TRANSITION_DISTANCES.values())))
     finally:
@@ -89,19 +108,19 @@ class Abstract(TransitionDistance):
 @pytest.mark.parametrize(
     ("name", "kind", "sentence"),
     [
-        ("mine", type("NoDataclass", (), {}), "the kind 'mine' must be a dataclass"),
-        ("mine", 3, "the kind 'mine' must be a dataclass, not 3"),
-        ("mine", Abstract, "the kind 'mine' lacks value"),
+        ("local", type("NoDataclass", (), {}), "the kind 'local' must be a dataclass"),
+        ("local", 3, "the kind 'local' must be a dataclass, not 3"),
+        ("local", Abstract, "the kind 'local' lacks value"),
         (3, Abstract, "a kind is registered by a name, not 3"),
     ],
 )
-def test_register_refuses_what_is_no_kind(name, kind, sentence):
+def test_register_refuses_invalid_kinds_and_names(name, kind, sentence):
     with pytest.raises(InputError, match=sentence):
         register(TRANSITION_DISTANCES, name)(kind)
     assert name not in TRANSITION_DISTANCES
 
 
-def test_template_refuses_a_distance_that_is_no_number():
+def test_next_state_refuses_a_distance_that_is_no_number():
     @dataclass(frozen=True)
     class Text(TransitionDistance):
         frame: str
@@ -116,130 +135,114 @@ def test_template_refuses_a_distance_that_is_no_number():
         template.next_state(0, RigidTransform(), {"cup": RigidTransform()})
 
 
-def set_in(*path, value):
-    def change(data):
-        for key in path[:-1]:
-            data = data[key]
-        data[path[-1]] = value
-
-    return change
-
-
-def remove(*path):
-    def change(data):
-        for key in path[:-1]:
-            data = data[key]
-        del data[path[-1]]
-
-    return change
-
-
-FAR = ("states", "far")
-MOVE = {"kind": "translation", "inputs": [0, 1], "speed_m_per_s": 0.1}
-TILT = {"kind": "tilt_towards", "inputs": [0, 1], "speed_rad_per_s": 0.1}
-SCALED = {"kind": "scaled", "distance_m": [0], "factor": [1], "of": {**TILT, "frame": "cup"}}
-PLANE = {"kind": "half_space", "offset_m": 0}
-UPRIGHT = {"kind": "fixed_orientation"}
-LIMITS = {"kind": "tilt_limits", "frame": "cup", "min_deg": 0, "max_deg": 1}
-LEAN = {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0], "tilt_deg": [0]}
+TRANSLATION = {"kind": "translation", "inputs": [0, 1], "speed_m_per_s": 0.1}
+TILT_TOWARDS = {"kind": "tilt_towards", "inputs": [0, 1], "speed_rad_per_s": 0.1}
+SCALED = {"kind": "scaled", "distance_m": [0], "factor": [1], "of": {**TILT_TOWARDS, "frame": "cup"}}
+HALF_SPACE = {"kind": "half_space", "offset_m": 0}
+FIXED_ORIENTATION = {"kind": "fixed_orientation"}
+TILT_LIMITS = {"kind": "tilt_limits", "frame": "cup", "min_deg": 0, "max_deg": 1}
+TILT_BY_DISTANCE = {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0], "tilt_deg": [0]}
 ARC = {"kind": "arc", "frame": "cup", "radius_m": 1}
-LAST = {
+FINAL_STATE = {
     "input_mapping": [],
     "active_constraints": [],
     "transition_distance": {"kind": "height", "frame": "cup"},
     "starts_at_m": 1,
     "ends_at_m": 0,
 }
-TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
+TILT_TO_GO = {"kind": "tilt_to_go", "frame": "cup", "until_deg": 9}
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (set_in("inptus", value=3), "did you mean inputs"),
+        (set_value("inptus", value=3), "did you mean inputs"),
         (remove("max_speed_m_per_s"), "max_speed_m_per_s is missing"),
-        (set_in("inputs", value=7), "inputs should be less than or equal to 6"),
-        (set_in("initial_state", value="fra"), "did you mean far"),
-        (set_in(*FAR, "active_constraints", 0, "kind", value="cylindre"), "did you mean cylinder"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_mm", value=1), "did you mean min_radius_m"),
-        (set_in(*FAR, "active_constraints", 0, "frame", value="cpu"), "did you mean cup"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="rmi_m"), "did you mean rim_m"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="().__class__"), "is not a number"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1 / 0"), "not arithmetic"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=float("nan")), "finite"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=True), "must be a number"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=2.0), "0 ≤ min_radius_m ≤ max_radius_m"),
+        (set_value("inputs", value=7), "inputs should be less than or equal to 6"),
+        (set_value("initial_state", value="fra"), "did you mean far"),
+        (set_value(*FAR, "active_constraints", 0, "kind", value="cylindre"), "did you mean cylinder"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_mm", value=1), "did you mean min_radius_m"),
+        (set_value(*FAR, "active_constraints", 0, "frame", value="cpu"), "did you mean cup"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="rmi_m"), "did you mean rim_m"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="().__class__"), "is not a number"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="1 / 0"), "not arithmetic"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=float("nan")), "finite"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=True), "must be a number"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=2.0), "0 ≤ min_radius_m ≤ max_radius_m"),
         (remove(*FAR, "input_mapping", 0, "speed_m_per_s"), "speed_m_per_s is missing"),
-        (set_in(*FAR, "input_mapping", 0, "inputs", value=[0, 2]), "no input 2"),
-        (set_in(*FAR, "transitions", 0, "to", value="naer"), "did you mean near"),
-        (set_in(*FAR, "transitions", 0, "below_deg", value=5), "below_"),
-        (set_in(*FAR, "transitions", 0, "hysteresis_m", value=-0.1), "hysteresis_m should be greater than 0"),
-        (set_in(*FAR, "starts_at_m", value=0.05), "distances decrease"),
-        (set_in(*FAR, "max_force_n", value=0), "max_force_n should be greater than 0"),
-        (set_in(*FAR, "max_torque_nm", value=-1), "max_torque_nm should be greater than 0"),
-        (set_in(*FAR, "max_force_n", value=None), "max_force_n: must be a number"),
-        (set_in(*FAR, "max_force", value=5), "did you mean max_force_n"),
-        (set_in(*FAR, "max_speed_m_per_s", value=0.21), "must be at most the template's, 0.2, not 0.21"),
-        (set_in(*FAR, "max_speed_rad_per_s", value="30 * rim_m"), "must be at most the template's, 1, not 1.5"),
+        (set_value(*FAR, "input_mapping", 0, "inputs", value=[0, 2]), "no input 2"),
+        (set_value(*FAR, "transitions", 0, "to", value="naer"), "did you mean near"),
+        (set_value(*FAR, "transitions", 0, "below_deg", value=5), "below_"),
+        (set_value(*FAR, "transitions", 0, "hysteresis_m", value=-0.1), "hysteresis_m should be greater than 0"),
+        (set_value(*FAR, "starts_at_m", value=0.05), "distances decrease"),
+        (set_value(*FAR, "max_force_n", value=0), "max_force_n should be greater than 0"),
+        (set_value(*FAR, "max_torque_nm", value=-1), "max_torque_nm should be greater than 0"),
+        (set_value(*FAR, "max_force_n", value=None), "max_force_n: must be a number"),
+        (set_value(*FAR, "max_force", value=5), "did you mean max_force_n"),
+        (set_value(*FAR, "max_speed_m_per_s", value=0.21), "must be at most the template's, 0.2, not 0.21"),
+        (set_value(*FAR, "max_speed_rad_per_s", value="30 * rim_m"), "must be at most the template's, 1, not 1.5"),
         (remove("states", "near", "ends_at_deg"), "ends_at_deg is missing"),
-        (set_in("states", "near", "starts_at_m", value=1.0), "did you mean starts_at_deg"),
-        (set_in("states", value={}), "at least 1"),
-        (set_in("frames", value=["cup", "cup"]), "different names"),
-        (set_in("frames", value=["cup", "world"]), "world and tool exist already"),
-        (set_in("frames", value=["cup", "tool"]), "world and tool exist already"),
-        (set_in("frames", value=[["cup"]]), "frames[0] should be a valid string"),
-        (set_in("inputs", value=True), "inputs should be a valid integer"),
-        (set_in("name", value={"a": 1}), "name should be a valid string"),
-        (set_in("name", value="two\nlines"), "short text"),
-        (set_in("initial_state", value=["far"]), "initial_state should be a valid string"),
-        (set_in("states", "a\tb", value={}), "can't name anything"),
-        (set_in("states", value={f"s{i}": LAST for i in range(31)}), "at most 30"),
-        (set_in(*FAR, "active_constraints", value=[{**PLANE, "normal": [0, 0, 1]}] * 31), "at most 30"),
-        (set_in(*FAR, "active_constraints", 0, "kind", value=["cylinder"]), "unknown kind"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=int("9" * 400)), "not arithmetic"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="9" * 199), "at most a million"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1e309"), "finite"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=2e6), "at most a million"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="2001-99-99x"), "not arithmetic"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="(" * 150), "not arithmetic"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1+" * 20_000 + "1"), "too long"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="True"), "is not a number"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="1j"), "is not a number"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="2 ** 9999"), "is not a number"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value="a\0b"), "not arithmetic"),
-        (set_in(*FAR, "active_constraints", 0, "min_radius_m", value=[[[["x"] * 99] * 9] * 9]), "must be a number"),
-        (set_in(*FAR, "input_mapping", 0, "inputs", value=[True, False]), "valid integer"),
-        (set_in(*FAR, "input_mapping", 0, value={**MOVE, "inputs": [], "axes": []}), "at least one"),
-        (set_in(*FAR, "input_mapping", 0, value={**MOVE, "axes": [[1, 0], [0, 1]]}), "three numbers"),
-        (set_in(*FAR, "input_mapping", 0, value={**TILT, "frame": "tool"}), "or world, not tool"),
-        (set_in(*FAR, "input_mapping", 0, value={**SCALED, "frame": "tool"}), "or world, not tool"),
-        (set_in(*FAR, "active_constraints", 0, value={**PLANE, "normal": [1e-9, 0, 0]}), "must not be zero"),
-        (set_in(*FAR, "active_constraints", 0, value={**PLANE, "normal": [0.1] * 3000}), "three numbers"),
-        (set_in(*FAR, "active_constraints", 0, value={**UPRIGHT, "rpy_deg": [0, 0]}), "three numbers"),
-        (set_in(*FAR, "active_constraints", 0, value={**LIMITS, "rpy_deg": [0]}), "three numbers"),
-        (set_in(*FAR, "active_constraints", 0, value={**ARC, "rpy_deg": [0] * 4}), "three numbers"),
-        (set_in(*FAR, "active_constraints", 0, value={**LEAN, "rpy_deg": []}), "three numbers"),
-        (set_in(*FAR, "transition_distance", value={"kind": "distance", "frame": "cup", "point_m": [0]}), "three"),
-        (set_in(*FAR, "transition_distance", value={"kind": "rotation_to_go", "rpy_deg": [0]}), "three"),
-        (set_in(*FAR, "transition_distance", value={**TO_GO, "rpy_deg": [0]}), "three"),
-        (set_in(*FAR, "transitions", 0, "to", value=["near"]), "to should be a valid string"),
-        (set_in(*FAR, "transitions", value=[]), "ends_at_m is missing"),
-        (set_in(*FAR, "transitions", value=None), "transitions should be a valid list"),
-        (set_in("parameters", "rim m", value=1), "parameters: 'rim m' can't name a parameter; use letters"),
-        (set_in("parameters", "ﬁ", value=1), "parameters: 'ﬁ' can't name a parameter"),
-        (set_in("states", "", value={}), "states: '' can't name anything"),
-        (set_in(*FAR, "active_constraints", 0, "kind", value=None), "active_constraints[0] has no kind; give it one"),
-        (set_in(*FAR, "transitions", 0, "below_m", value=-0.012), "below_m must be positive"),
-        (set_in(*FAR, "transitions", 0, "below_m", value=0), "below_m must be positive"),
-        (set_in(*FAR, "transitions", 0, "to", value="far"), "must lead to another state, not to far itself"),
+        (set_value("states", "near", "starts_at_m", value=1.0), "did you mean starts_at_deg"),
+        (set_value("states", value={}), "at least 1"),
+        (set_value("frames", value=["cup", "cup"]), "different names"),
+        (set_value("frames", value=["cup", "world"]), "world and tool exist already"),
+        (set_value("frames", value=["cup", "tool"]), "world and tool exist already"),
+        (set_value("frames", value=[["cup"]]), "frames[0] should be a valid string"),
+        (set_value("inputs", value=True), "inputs should be a valid integer"),
+        (set_value("name", value={"a": 1}), "name should be a valid string"),
+        (set_value("name", value="two\nlines"), "short text"),
+        (set_value("initial_state", value=["far"]), "initial_state should be a valid string"),
+        (set_value("states", "a\tb", value={}), "can't name anything"),
+        (set_value("states", value={f"s{i}": FINAL_STATE for i in range(31)}), "at most 30"),
+        (set_value(*FAR, "active_constraints", value=[{**HALF_SPACE, "normal": [0, 0, 1]}] * 31), "at most 30"),
+        (set_value(*FAR, "active_constraints", 0, "kind", value=["cylinder"]), "unknown kind"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=int("9" * 400)), "not arithmetic"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="9" * 199), "at most a million"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="1e309"), "finite"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=2e6), "at most a million"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="2001-99-99x"), "not arithmetic"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="(" * 150), "not arithmetic"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="1+" * 20_000 + "1"), "too long"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="True"), "is not a number"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="1j"), "is not a number"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="2 ** 9999"), "is not a number"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value="a\0b"), "not arithmetic"),
+        (set_value(*FAR, "active_constraints", 0, "min_radius_m", value=[[[["x"] * 99] * 9] * 9]), "must be a number"),
+        (set_value(*FAR, "input_mapping", 0, "inputs", value=[True, False]), "valid integer"),
+        (set_value(*FAR, "input_mapping", 0, value={**TRANSLATION, "inputs": [], "axes": []}), "at least one"),
+        (set_value(*FAR, "input_mapping", 0, value={**TRANSLATION, "axes": [[1, 0], [0, 1]]}), "three numbers"),
+        (set_value(*FAR, "input_mapping", 0, value={**TILT_TOWARDS, "frame": "tool"}), "or world, not tool"),
+        (set_value(*FAR, "input_mapping", 0, value={**SCALED, "frame": "tool"}), "or world, not tool"),
+        (set_value(*FAR, "active_constraints", 0, value={**HALF_SPACE, "normal": [1e-9, 0, 0]}), "must not be zero"),
+        (set_value(*FAR, "active_constraints", 0, value={**HALF_SPACE, "normal": [0.1] * 3000}), "three numbers"),
+        (set_value(*FAR, "active_constraints", 0, value={**FIXED_ORIENTATION, "rpy_deg": [0, 0]}), "three numbers"),
+        (set_value(*FAR, "active_constraints", 0, value={**TILT_LIMITS, "rpy_deg": [0]}), "three numbers"),
+        (set_value(*FAR, "active_constraints", 0, value={**ARC, "rpy_deg": [0] * 4}), "three numbers"),
+        (set_value(*FAR, "active_constraints", 0, value={**TILT_BY_DISTANCE, "rpy_deg": []}), "three numbers"),
+        (set_value(*FAR, "transition_distance", value={"kind": "distance", "frame": "cup", "point_m": [0]}), "three"),
+        (set_value(*FAR, "transition_distance", value={"kind": "rotation_to_go", "rpy_deg": [0]}), "three"),
+        (set_value(*FAR, "transition_distance", value={**TILT_TO_GO, "rpy_deg": [0]}), "three"),
+        (set_value(*FAR, "transitions", 0, "to", value=["near"]), "to should be a valid string"),
+        (set_value(*FAR, "transitions", value=[]), "ends_at_m is missing"),
+        (set_value(*FAR, "transitions", value=None), "transitions should be a valid list"),
+        (set_value("parameters", "rim m", value=1), "parameters: 'rim m' can't name a parameter; use letters"),
+        (set_value("parameters", "ﬁ", value=1), "parameters: 'ﬁ' can't name a parameter"),
+        (set_value("states", "", value={}), "states: '' can't name anything"),
+        (
+            set_value(*FAR, "active_constraints", 0, "kind", value=None),
+            "active_constraints[0] has no kind; give it one",
+        ),
+        (set_value(*FAR, "transitions", 0, "below_m", value=-0.012), "below_m must be positive"),
+        (set_value(*FAR, "transitions", 0, "below_m", value=0), "below_m must be positive"),
+        (set_value(*FAR, "transitions", 0, "to", value="far"), "must lead to another state, not to far itself"),
     ],
 )
-def test_parse_names_fault_and_place_in_one_sentence(change, message):
-    with pytest.raises(InputError) as refused:
+def test_parse_names_the_invalid_field_in_one_line(change, message):
+    with pytest.raises(InputError) as error:
         parse_template(edit_template(change))
-    assert message in str(refused.value)
-    assert "\n" not in str(refused.value)
-    assert len(str(refused.value)) < 500
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 500
 
 
 def test_parse_refuses_parameters_that_are_not_numbers():
@@ -249,18 +252,15 @@ def test_parse_refuses_parameters_that_are_not_numbers():
     assert parse_template(TEMPLATE, rim_m=np.float32(0.25)).parameters["rim_m"] == 0.25
 
 
-def test_parse_refuses_ambiguous_or_exploding_yaml():
+def test_parse_refuses_ambiguous_or_large_yaml():
     for text in ("inputs: 010", "inputs: 2001-99-99", "inputs: 2\ninputs: 3", "inputs: !!int 2", "inputs: 1:30"):
         with pytest.raises(InputError):
             parse_template(TEMPLATE.replace("inputs: 2", text, 1))
-    bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n" + "".join(
-        f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10)
-    )
     with pytest.raises(InputError, match="more than 10000"):
-        parse_template(TEMPLATE + bomb)
+        parse_template(f"{TEMPLATE}\nentries: [{'x, ' * 10_001}]")
 
 
-def test_load_refuses_unknown_names_and_missing_files(tmp_path):
+def test_load_refuses_unknown_names_and_invalid_files(tmp_path):
     with pytest.raises(InputError, match="did you mean pouring"):
         load_template("puoring")
     with pytest.raises(InputError, match="there is no template"):
@@ -282,6 +282,6 @@ def test_parse_refuses_a_parameter_that_depends_on_another():
 
 
 @pytest.mark.parametrize("source", [None, 5, ["pouring"]])
-def test_template_is_read_from_a_path_or_a_name(source):
+def test_load_refuses_sources_that_are_no_path_or_name(source):
     with pytest.raises(InputError, match="a template is read from a file or by its name, not from"):
         load_template(source)

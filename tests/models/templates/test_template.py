@@ -1,4 +1,4 @@
-"""The laws of a template: mapping, displacement, command, transitions and progress."""
+"""Input mappings, commands, transitions and progress of a template."""
 
 from dataclasses import replace
 
@@ -23,11 +23,21 @@ def pouring():
 
 
 def in_mug(p):
+    """Return the pose of an end effector at a position [m] in the mug's frame, with the mug's orientation."""
     return RigidTransform(MUG["mug_tip"].rotation(), MUG["mug_tip"] @ np.array(p))
 
 
 def run(template, X_WE, inputs, steps, state=None, observe=None):
-    """Run the template with `inputs(k, X)` like the systems; return the last state and command."""
+    """Execute a template as its systems do; return the last state and command.
+
+    Args:
+        template: Template to execute.
+        X_WE: Pose of the end effector at the start.
+        inputs: Function that returns the inputs for a step and a pose.
+        steps: Number of steps.
+        state: Initial state; None for the state at X_WE.
+        observe: Function that is called at every step with the state, the previous command and the command.
+    """
     state = template.state_at(X_WE, MUG) if state is None else state
     for k in range(steps):
         request = template.displace(X_WE, template.map(state, inputs(k, X_WE), X_WE, MUG, PERIOD))
@@ -59,9 +69,11 @@ def test_tilt_towards_uses_only_the_input_along_the_bearing():
     across = mapping.displacement(np.array([1.0, 0.0]), X_WE, MUG, 0.1)
     along = mapping.displacement(np.array([0.3, 0.5]), X_WE, MUG, 0.1)
     assert angle_between(across.rotation(), RotationMatrix()) < 1e-12
-    # The tool's z axis leans along the mug frame's y, where the mug is.
-    lean = along.rotation().matrix()[:, 2]
-    np.testing.assert_allclose(lean, MUG["mug_tip"].rotation() @ np.array([0, np.sin(0.05), np.cos(0.05)]), atol=1e-12)
+    # The tool's z axis tilts towards the mug, along y of the mug's frame.
+    z_axis = along.rotation().matrix()[:, 2]
+    np.testing.assert_allclose(
+        z_axis, MUG["mug_tip"].rotation() @ np.array([0, np.sin(0.05), np.cos(0.05)]), atol=1e-12
+    )
 
 
 def test_scaled_slows_down_near_the_object():
@@ -80,11 +92,11 @@ def test_uneven_scales_positive_and_negative_inputs_differently():
     np.testing.assert_allclose(speeds, [-1.0, 0.0, 0.2, 0.4])
 
 
-def test_map_clips_inputs_to_one(pouring):
+def test_map_clips_inputs(pouring):
     X_WE = in_mug([0.0, -0.3, 0.1])
-    limit = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)
+    expected = pouring.map(0, np.array([1.0, -1.0, 0.0]), X_WE, MUG, PERIOD)
     clipped = pouring.map(0, np.array([50.0, -7.0, 0.0]), X_WE, MUG, PERIOD)
-    np.testing.assert_array_equal(clipped.GetAsMatrix34(), limit.GetAsMatrix34())
+    np.testing.assert_array_equal(clipped.GetAsMatrix34(), expected.GetAsMatrix34())
 
 
 def test_map_returns_no_displacement_without_a_mapping(pouring):
@@ -105,15 +117,15 @@ def test_command_is_safe_under_adversarial_inputs(pouring):
         speed = max(speed, np.linalg.norm(X_WE.translation() - X_last.translation()) / PERIOD)
         turn = max(turn, angle_between(X_WE.rotation(), X_last.rotation()) / PERIOD)
 
-    held = np.zeros(3)
+    held_inputs = np.zeros(3)
     for _ in range(4):
 
         def inputs(k, X_WE):
-            nonlocal held
+            nonlocal held_inputs
             if k % 10 == 0:
                 towards = MUG["mug_tip"].translation() - X_WE.translation()
-                held = np.clip(1.5 * rng.normal(size=3) + 2.0 * towards / np.linalg.norm(towards), -1.0, 1.0)
-            return held
+                held_inputs = np.clip(1.5 * rng.normal(size=3) + 2.0 * towards / np.linalg.norm(towards), -1.0, 1.0)
+            return held_inputs
 
         start = in_mug(rng.normal([-0.1, -0.25, 0.15], 0.05))
         start = pouring.project(pouring.state_at(start, MUG), start, MUG)
@@ -124,7 +136,7 @@ def test_command_is_safe_under_adversarial_inputs(pouring):
     assert turn <= pouring.max_speed_rad_per_s * (1 + 1e-9)
 
 
-def test_command_slows_translation_when_the_tilt_would_lag(pouring):
+def test_command_slows_translation_when_the_tilt_is_limited(pouring):
     full = np.array([0.0, 1.0, 0.0])
     X_WE = pouring.project(1, in_mug([0.0, -0.15, 0.06]), MUG)
     request = pouring.displace(X_WE, pouring.map(1, full, X_WE, MUG, 0.1))
@@ -133,8 +145,8 @@ def test_command_slows_translation_when_the_tilt_would_lag(pouring):
     assert pouring.violation(1, slow.X_WE, MUG) <= 1e-9
 
 
-def test_command_outside_is_led_inside_at_the_largest_speed(pouring):
-    outside = in_mug([0.0, -0.3, 0.02])  # 3 cm too low
+def test_command_from_outside_moves_inside_at_maximum_speed(pouring):
+    outside = in_mug([0.0, -0.3, 0.02])  # 3 cm below the active constraint
     steps = 0
     X_WE = outside
     while pouring.violation(0, X_WE, MUG) > 1e-9:
@@ -151,44 +163,42 @@ def test_next_state_has_hysteresis(pouring):
     assert [after(0, d) for d in (0.251, 0.249)] == [0, 1]
     assert [after(1, d) for d in (0.269, 0.271)] == [1, 0]
     assert [after(1, d) for d in (0.076, 0.074)] == [1, 2]
-    assert after(2, 0.5) == 2  # no return from pouring
+    assert after(2, 0.5) == 2  # pour has no transition back
 
 
 def test_command_is_inside_the_next_states_constraints(pouring):
-    jumps = []
+    violations = []
 
     def observe(state, X_last, X_WE):
-        after = pouring.next_state(state, X_WE, MUG)
-        if after > state:
-            jumps.append(pouring.violation(after, X_WE, MUG))
+        next_state = pouring.next_state(state, X_WE, MUG)
+        if next_state > state:
+            violations.append(pouring.violation(next_state, X_WE, MUG))
 
     run(pouring, in_mug([-0.05, -0.31, 0.12]), lambda k, X: np.array([0.1, 0.8, -0.5]), 600, observe=observe)
-    assert len(jumps) == 2
-    assert max(jumps) <= 1e-9
+    assert len(violations) == 2
+    assert max(violations) <= 1e-9
 
 
 def test_progress_sums_the_decrease_of_the_distances(pouring):
-    rises = []
-    first = in_mug([-0.05, -0.31, 0.12])
-    last = [pouring.progress(0, first, MUG)]
+    start = in_mug([-0.05, -0.31, 0.12])
+    progress = [pouring.progress(0, start, MUG)]
 
     def observe(state, X_last, X_WE):
-        rises.append(pouring.progress(state, X_WE, MUG) - last[0])
-        last[0] += rises[-1]
+        progress.append(pouring.progress(state, X_WE, MUG))
 
-    state, X_WE = run(pouring, first, lambda k, X: np.array([0.1, 0.8, -0.5]), 900, observe=observe)
+    state, X_WE = run(pouring, start, lambda k, X: np.array([0.1, 0.8, -0.5]), 900, observe=observe)
     assert state == 2
-    assert min(rises) > -0.02  # on a straight approach, progress falls by no more than the overshoot of a transition
-    total = sum(s.weight * (s.starts_at - s.ends_at) for s in pouring.states)
+    assert np.diff(progress).min() > -0.02  # on a straight approach, by at most the overshoot of a transition
+    total = sum(state.weight * (state.starts_at - state.ends_at) for state in pouring.states)
     assert pouring.progress(state, X_WE, MUG) == pytest.approx(total, abs=0.01)
 
 
-def test_without_active_constraints_keeps_states(pouring):
+def test_without_active_constraints_changes_only_constraints(pouring):
     free = pouring.without_active_constraints()
     X_WE = in_mug([0.0, -0.06, 0.01])
     assert pouring.violation(1, X_WE, MUG) > 0.01
     assert free.violation(1, X_WE, MUG) == 0.0
-    assert [s.name for s in free.states] == [s.name for s in pouring.states]
+    assert [state.name for state in free.states] == [state.name for state in pouring.states]
 
 
 def test_load_adapts_the_template_to_the_object():
@@ -205,11 +215,11 @@ def test_translation_scales_with_the_length_of_an_axis():
     np.testing.assert_allclose(moved[1].translation(), 2 * moved[0].translation())
 
 
-REACH = 0.125  # [m] largest step of the templates below, an exact binary number
+REACH = 0.125  # largest displacement [m] in a period of 1 s; a binary fraction, so that products are exact
 
 
-class UpTo(ac.ActiveConstraint):
-    """Bound on x with an identity projection, so that only a shorter displacement is inside."""
+class UpperBoundOnX(ac.ActiveConstraint):
+    """Upper bound on x [m] whose projection changes nothing, so that only shorter displacements satisfy the bound."""
 
     frame_names = ()
 
@@ -223,73 +233,73 @@ class UpTo(ac.ActiveConstraint):
         return max(0.0, X_WE.translation()[0] - self.limit)
 
 
-def one_state(*constraints, name="only", **numbers):
+def make_state(*constraints, name="only", **numbers):
     numbers = {"starts_at": 1.0, "ends_at": 0.0, **numbers}
     return TemplateState(name, (im.Translation((0, 1, 2), 1.0),), constraints, td.Height("world"), **numbers)
 
 
-def one(*constraints):
-    return SharedControlTemplate("one", 3, (), (one_state(*constraints),), 0, REACH, 1.0)
+def make_template(*constraints):
+    return SharedControlTemplate("one", 3, (), (make_state(*constraints),), 0, REACH, 1.0)
 
 
-def shifted(x):
+def at_x(x):
     return RigidTransform([x, 0.0, 0.0])
 
 
-def floor_and_ceiling(floor, ceiling):
-    return one(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
+def make_floor_and_ceiling(floor, ceiling):
+    return make_template(ac.HalfSpace((0.0, 0.0, 1.0), floor), ac.HalfSpace((0.0, 0.0, -1.0), -ceiling))
 
 
-def test_violation_of_a_nanometer_counts_as_inside():
-    """With a floor above a ceiling, a pose at the ceiling violates the floor by their distance."""
+def test_pose_is_inside_when_the_violation_is_a_nanometer():
+    """A pose at a ceiling below a floor violates the floor by the distance of floor and ceiling."""
     X = RigidTransform()
     for floor, fraction in ((1e-9, 1.0), (1.5e-9, 0.0)):
-        assert floor_and_ceiling(floor, 0.0).command(0, X, X, {}, 1.0).fraction == fraction
-        assert floor_and_ceiling(floor, 0.0).can_enter(0, X, {}, 1.0) == (fraction == 1.0)
+        assert make_floor_and_ceiling(floor, 0.0).command(0, X, X, {}, 1.0).fraction == fraction
+        assert make_floor_and_ceiling(floor, 0.0).can_enter(0, X, {}, 1.0) == (fraction == 1.0)
 
 
 @pytest.mark.parametrize("halvings", range(9))
 def test_command_halves_a_displacement_at_most_seven_times(halvings):
-    template = one(UpTo(0.75 * 0.5 ** (halvings - 1) * 0.0625))
-    command = template.command(0, RigidTransform(), shifted(0.0625), {}, 1.0)
+    template = make_template(UpperBoundOnX(0.75 * 0.5 ** (halvings - 1) * 0.0625))
+    command = template.command(0, RigidTransform(), at_x(0.0625), {}, 1.0)
     fraction = 0.5**halvings if halvings < 8 else 0.0
     assert command.fraction == fraction
     assert command.X_WE.translation()[0] == pytest.approx(0.0625 * fraction, abs=1e-15)
 
 
 def test_command_reaches_exactly_the_speed_limit():
-    target = shifted(REACH)
-    assert one().command(0, RigidTransform(), target, {}, 1.0) == Command(target, 1.0)
-    assert one(UpTo(0.75 * REACH)).command(0, RigidTransform(), target, {}, 1.0).fraction == 0.5
-    beyond = one(ac.HalfSpace((1.0, 0.0, 0.0), REACH))
+    target = at_x(REACH)
+    assert make_template().command(0, RigidTransform(), target, {}, 1.0) == Command(target, 1.0)
+    assert make_template(UpperBoundOnX(0.75 * REACH)).command(0, RigidTransform(), target, {}, 1.0).fraction == 0.5
+    beyond = make_template(ac.HalfSpace((1.0, 0.0, 0.0), REACH))
     assert beyond.can_enter(0, RigidTransform(), {}, 1.0)
-    assert beyond.can_enter(0, shifted(0.5 * REACH), {}, 1.0)
-    assert not beyond.can_enter(0, shifted(-1e-6), {}, 1.0)
+    assert beyond.can_enter(0, at_x(0.5 * REACH), {}, 1.0)
+    assert not beyond.can_enter(0, at_x(-1e-6), {}, 1.0)
 
 
 def test_command_is_the_last_command_when_no_motion_is_allowed():
-    X_WLast = shifted(0.0)
-    command = one(UpTo(0.0)).command(0, X_WLast, shifted(0.1), {}, 1.0)
+    X_WLast = at_x(0.0)
+    command = make_template(UpperBoundOnX(0.0)).command(0, X_WLast, at_x(0.1), {}, 1.0)
     assert command.X_WE is X_WLast
     assert command.fraction == 0.0
 
 
-def test_command_led_inside_stops_at_the_projection():
-    command = floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
+def test_command_from_outside_stops_at_the_projection():
+    command = make_floor_and_ceiling(0.0, -0.02).command(0, RigidTransform([0.0, 0.0, 0.04]), RigidTransform(), {}, 1.0)
     assert command == Command(command.X_WE, 0.0)
     np.testing.assert_allclose(command.X_WE.translation(), [0.0, 0.0, -0.02], atol=1e-15)
 
 
 def test_command_slides_along_a_wall_for_a_distant_request():
-    """A request is brought within reach before it is projected, so that the command slides by a whole step."""
-    template = one(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
-    for far in (1.0, 1e4, 1e8):
-        command = template.command(0, RigidTransform(), RigidTransform([far, far, 0.0]), {}, 1.0)
+    """A request is limited to the reach of one step before its projection, so the command slides by a full step."""
+    template = make_template(ac.Box((-1.0, -1.0, -1.0), (0.0, 1e9, 1.0), "world"))
+    for distance in (1.0, 1e4, 1e8):
+        command = template.command(0, RigidTransform(), RigidTransform([distance, distance, 0.0]), {}, 1.0)
         np.testing.assert_allclose(command.X_WE.translation(), [0.0, REACH / np.sqrt(2), 0.0], rtol=1e-7, atol=1e-9)
 
 
 def test_template_has_defaults_and_refuses_unknown_states():
-    template = one()
+    template = make_template()
     assert template.parameters == {}
     assert template.states[0].weight == 1.0
     with pytest.raises(InputError, match=r"one has no state 'onyl'.*did you mean only"):
@@ -298,7 +308,7 @@ def test_template_has_defaults_and_refuses_unknown_states():
 
 def test_progress_is_finite_for_cyclic_states():
     a, b, c = (
-        one_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
+        make_state(name=name, transitions=(Transition(to, 0.5),)) for name, to in (("a", "b"), ("b", "c"), ("c", "b"))
     )
     template = SharedControlTemplate("round", 3, (), (a, b, c), 0, REACH, 1.0)
     assert [template.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]
@@ -317,7 +327,7 @@ def test_map_and_command_refuse_unknown_states(state):
 
 
 @pytest.mark.parametrize("period", [-0.02, 0.0, np.nan])
-def test_map_and_command_refuse_wrong_arguments(period):
+def test_map_and_command_refuse_invalid_arguments(period):
     template, X_WE = load_template("pouring"), RigidTransform([0.0, -0.3, 0.15])
     frames = {"mug_tip": RigidTransform()}
     with pytest.raises(InputError, match="a period must be positive"):

@@ -1,4 +1,4 @@
-"""Checks of templates find faults that reading a file does not."""
+"""Validation of templates: faults that parsing does not find, and drawings."""
 
 from pathlib import Path
 
@@ -13,15 +13,20 @@ from guiderail.models.templates.validate import validate
 TEMPLATE = (Path(__file__).parent / "reach.yaml").read_text()
 
 
-def findings(change=None):
-    data = yaml.safe_load(TEMPLATE)
+def parse_changed(change=None, text=TEMPLATE):
+    """Return a template after a function has changed its data in place."""
+    data = yaml.safe_load(text)
     if change:
         change(data)
-    return validate(parse_template(yaml.safe_dump(data, sort_keys=False)))
+    return parse_template(yaml.safe_dump(data, sort_keys=False))
+
+
+def validate_changed(change=None):
+    return validate(parse_changed(change))
 
 
 def errors(change):
-    return [finding.message for finding in findings(change) if finding.is_error]
+    return [finding.message for finding in validate_changed(change) if finding.is_error]
 
 
 @pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
@@ -30,20 +35,20 @@ def test_validate_finds_no_errors_in_shipped_templates(name):
 
 
 def test_validate_returns_nothing_for_a_valid_template():
-    assert findings() == []
+    assert validate_changed() == []
 
 
 def test_validate_finds_an_unreachable_state():
     def change(data):
-        data["states"]["lost"] = dict(data["states"]["near"])
+        data["states"]["unreachable"] = dict(data["states"]["near"])
 
     (message,) = errors(change)
-    assert "lost" in message
+    assert "unreachable" in message
 
 
 def test_validate_finds_a_transition_blocked_by_constraints():
     def change(data):
-        data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # the cylinder keeps it at 0.06
+        data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # [m]; the cylinder keeps the distance above 0.06 m
 
     assert any("never fires" in message and "constraints" in message for message in errors(change))
 
@@ -71,7 +76,7 @@ def test_validate_finds_contradictory_constraints():
 
 def test_validate_finds_constraints_in_the_wrong_order():
     def change(data):
-        # An orientation that depends on the position, before the position is final.
+        # The orientation depends on the position, which the next constraint changes.
         data["states"]["far"]["active_constraints"].insert(
             0, {"kind": "tilt_by_distance", "frame": "cup", "distance_m": [0.1, 0.5], "tilt_deg": [60, 0]}
         )
@@ -84,7 +89,7 @@ def test_validate_warns_of_unused_inputs_and_frames():
         data["inputs"] = 4
         data["frames"].append("saucer")
 
-    messages = [finding.message for finding in findings(change)]
+    messages = [finding.message for finding in validate_changed(change)]
     assert any("input 2" in message for message in messages)
     assert any("saucer" in message for message in messages)
 
@@ -95,11 +100,9 @@ def test_draw_quotes_names_of_states(tmp_path, name):
         data["states"][name] = data["states"].pop("near")
         data["states"]["far"]["transitions"][0]["to"] = name
 
-    data = yaml.safe_load(TEMPLATE)
-    change(data)
-    template = parse_template(yaml.safe_dump(data, sort_keys=False))
+    template = parse_changed(change)
     draw(template, tmp_path / "a.png")
-    # Quotes and backslashes inside a quoted word are escaped, so that the other quotes form pairs.
+    # Quotes inside a quoted name are escaped, so the number of other quotes is even.
     for line in to_dot(template).splitlines():
         assert line.replace("\\\\", "").replace('\\"', "").count('"') % 2 == 0
 
@@ -108,7 +111,7 @@ def test_draw_shows_every_state_and_transition(tmp_path):
     template = load_template("pouring")
     dot = to_dot(template)
     assert all(f'"{state.name}"' in dot for state in template.states)
-    assert dot.count("->") == 3  # forward twice, and back from tilt
+    assert dot.count("->") == 3  # two forward, and one back from tilt
     for suffix in (".dot", ".png"):
         draw(template, tmp_path / f"pouring{suffix}")
         assert (tmp_path / f"pouring{suffix}").stat().st_size > 100
@@ -138,7 +141,7 @@ def test_validate_warns_of_a_transition_that_waits():
             0, {"kind": "cylinder", "frame": "cup", "max_radius_m": 0.01}
         )
 
-    assert any("waits in" in finding.message and not finding.is_error for finding in findings(change))
+    assert any("waits in" in finding.message and not finding.is_error for finding in validate_changed(change))
 
 
 SLIDE_AND_LIFT = """
@@ -172,44 +175,41 @@ states:
 """
 
 
-def slide_and_lift(change=None):
-    data = yaml.safe_load(SLIDE_AND_LIFT)
-    if change:
-        change(data["states"]["slide"])
-    return validate(parse_template(yaml.safe_dump(data, sort_keys=False)))
+def validate_slide_and_lift(change=lambda slide: None):
+    return validate(parse_changed(lambda data: change(data["states"]["slide"]), SLIDE_AND_LIFT))
 
 
-def test_validate_searches_from_the_poses_of_a_handover():
-    # From poses farther from the axis than those in which slide ends, no input leads to the end of lift.
-    assert slide_and_lift() == []
+def test_validate_searches_from_poses_of_the_previous_transition():
+    # No input leads to the end of lift from poses farther from the axis than those at which slide ends.
+    assert validate_slide_and_lift() == []
 
 
 @pytest.mark.parametrize("factor", [[0.0, 1.0], [0.0, 0.0]])
-def test_validate_warns_of_inputs_that_lead_nowhere(factor):
+def test_validate_warns_of_inputs_that_reach_no_transition(factor):
     def change(slide):
         (mapping,) = slide["input_mapping"]
         slide["input_mapping"] = [
             {"kind": "scaled", "frame": "edge", "distance_m": [0.02, 0.03], "factor": factor, "of": mapping}
         ]
 
-    (finding,) = slide_and_lift(change)
+    (finding,) = validate_slide_and_lift(change)
     assert "slide: the transition to lift was not reached" in finding.message
     assert not finding.is_error
 
 
 def test_validate_warns_of_a_state_without_a_mapping():
-    findings = slide_and_lift(lambda slide: slide.update(input_mapping=[]))
+    findings = validate_slide_and_lift(lambda slide: slide.update(input_mapping=[]))
     assert any("slide: the transition to lift was not reached" in finding.message for finding in findings)
     assert not any(finding.is_error for finding in findings)
 
 
-def test_validate_warns_of_constraints_with_a_single_pose():
+def test_validate_warns_of_constraints_without_an_interior():
     def change(slide):
         slide["active_constraints"] = [
             {"kind": "box", "frame": "edge", "lower_m": [0.005, -0.05, 0], "upper_m": [0.02, 0.05, 0.01]},
             {"kind": "cylinder", "frame": "edge", "max_radius_m": 0.005},
         ]
 
-    findings = slide_and_lift(change)
+    findings = validate_slide_and_lift(change)
     assert any("Box" in finding.message and "in all sampled poses" in finding.message for finding in findings)
     assert not any(finding.is_error for finding in findings)
