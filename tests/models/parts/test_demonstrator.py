@@ -1,3 +1,5 @@
+"""Scripted demonstrator: variance, turns and repeatability of its motions."""
+
 import numpy as np
 
 from guiderail.models.common.transforms import MM
@@ -14,7 +16,7 @@ from guiderail.models.parts.demonstrator import (
 RIM, PRESS = 20.0 * MM, 2.5 * MM
 
 
-def test_the_variance_is_that_of_the_sockets_from_the_rim_down_to_the_target():
+def test_motions_have_the_variance_of_the_socket_offsets():
     script = plan_search(30.0 * MM, RIM, 0.0, 4.0 * MM, PRESS)
     times = np.arange(0.0, script[0][-1], 0.02)
     press_from = RIM - PRESS - 1.0 * MM
@@ -25,35 +27,35 @@ def test_the_variance_is_that_of_the_sockets_from_the_rim_down_to_the_target():
     assert inserted.sum() > 20
     np.testing.assert_allclose(motions[:, inserted, :2].mean(axis=1), socket_offsets(), atol=0.3 * MM)
     deviations = motions[:, :, :2].std(axis=0)
-    assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # an action reaches far at every time
+    assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # actions are scaled by the deviation
     assert deviations.max() < 1.6 * SPREAD / np.sqrt(2.0)
     np.testing.assert_allclose(socket_offsets().mean(axis=0), 0.0, atol=1e-12)
 
 
-def test_a_screw_advances_while_it_turns():
-    """Otherwise the command goes straight down, and without an advance it only turns at the bottom."""
+def test_plans_advance_during_the_turn_of_a_screw():
+    """Without an advance, the command is at the bottom before the turn begins."""
     turn, push, advance = -np.pi, 4.0 * MM, 1.0 * MM
     for plan, press in ((plan_straight_insertion, ()), (plan_search, (PRESS,))):
         _, poses = plan(30.0 * MM, RIM, turn, push, *press, advance)
         first = np.flatnonzero(poses[:, 3] == -turn)[-1]
         np.testing.assert_allclose(poses[first : first + 2, 2], [advance - push, -push])
         np.testing.assert_allclose(poses[first + 1 :, 3], 0.0)
-        plain = plan(30.0 * MM, RIM, turn, push, *press)[1]
-        assert np.isclose(plain[:, 2], -push).sum() > np.isclose(poses[:, 2], -push).sum()
+        without_advance = plan(30.0 * MM, RIM, turn, push, *press)[1]
+        assert np.isclose(without_advance[:, 2], -push).sum() > np.isclose(poses[:, 2], -push).sum()
 
 
 def test_motions_depend_on_the_seed_alone():
     script = plan_search(30.0 * MM, RIM, 0.5, 4.0 * MM, PRESS)
     times = np.arange(0.0, script[0][-1], 0.02)
-    first, again, other = (demonstrator_motions(seed, script, RIM, times) for seed in (0, 0, 1))
+    first, again, different = (demonstrator_motions(seed, script, RIM, times) for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
-    assert np.abs(first - other).max() > 0.1 * MM
+    assert np.abs(first - different).max() > 0.1 * MM
 
 
-def test_sockets_are_turned_evenly_and_independently_of_their_offsets():
+def test_socket_turns_are_uncorrelated_with_the_offsets():
     turns = socket_turns(0.08)
     assert np.abs(turns).max() == 0.08
-    assert turns.std() > 0.7 * 0.08  # an action reaches far
+    assert turns.std() > 0.7 * 0.08  # actions are scaled by the deviation
     np.testing.assert_allclose(np.column_stack([np.ones(len(turns)), socket_offsets()]).T @ turns, 0.0, atol=1e-12)
     script = plan_search(30.0 * MM, RIM, 0.0, 4.0 * MM, PRESS)
     times = np.arange(0.0, script[0][-1], 0.02)

@@ -1,4 +1,4 @@
-"""A faulty mesh is repaired and reported, or refused in one sentence with the remedy."""
+"""Mesh files: units, repairs and their reports, and errors that name a remedy."""
 
 import json
 import os
@@ -22,30 +22,37 @@ def box():
     return trimesh.creation.box((10.0, 10.0, 20.0))
 
 
-def hole(mesh):
+def remove_triangle(mesh):
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     return mesh
 
 
-def inside_out(mesh):
+def invert(mesh):
     mesh.invert()
     return mesh
 
 
-def hollow(mesh):
-    cavity = trimesh.creation.box((2.0, 2.0, 4.0))
-    cavity.invert()
-    return trimesh.util.concatenate([mesh, cavity])
+def add_cavity(mesh):
+    return trimesh.util.concatenate([mesh, invert(trimesh.creation.box((2.0, 2.0, 4.0)))])
 
 
-def inside_out_next_to_another(mesh):
-    return trimesh.util.concatenate([mesh, inside_out(box()).apply_translation((30.0, 0.0, 0.0))])
+def add_inverted_body(mesh):
+    return trimesh.util.concatenate([mesh, invert(box()).apply_translation((30.0, 0.0, 0.0))])
 
 
-def one_flipped(mesh):
+def flip_triangle(mesh):
     faces = mesh.faces.copy()
     faces[3] = faces[3][::-1]
     return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def split_edge(mesh, has_sliver=False):
+    """Split an edge in one triangle only, which is a T-junction; a triangle without area can close its gap."""
+    a, b, c = mesh.faces[0]
+    middle = len(mesh.vertices)
+    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
+    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c], *[[a, b, middle]] * has_sliver]])
+    return trimesh.Trimesh(vertices, faces, process=False)
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "glb"])
@@ -58,7 +65,7 @@ def test_load_part_returns_meters(ending, tmp_path):
     assert str(part.repair) == ""
 
 
-def test_unit_applies_to_files_whose_format_states_none():
+def test_find_units_uses_the_unit_of_the_file_format():
     assert find_units([Path("plug.glb"), Path("socket.stl")], "mm") == ["m", "mm"]
     assert find_units([Path("plug.glb"), Path("socket.step")], None) == ["m", "m"]
     with pytest.raises(InputError, match=r"plug\.glb and socket\.step are read in meters, .*: remove --unit mm"):
@@ -73,18 +80,18 @@ def test_load_part_reads_step():
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words", "bodies"),
+    ("change", "report", "bodies"),
     [
-        (inside_out, "turned 1 body right side out", 1),
-        (inside_out_next_to_another, "turned 1 body right side out", 2),
-        (hollow, "filled 1 closed cavity", 1),
-        (one_flipped, "closed 3 edges; surface moved by at most 0.0000 mm", 1),
+        (invert, "turned 1 body right side out", 1),
+        (add_inverted_body, "turned 1 body right side out", 2),
+        (add_cavity, "filled 1 closed cavity", 1),
+        (flip_triangle, "closed 3 edges; surface moved by at most 0.0000 mm", 1),
     ],
 )
-def test_load_part_repairs_and_reports(spoil, words, bodies, tmp_path):
-    spoil(box()).export(tmp_path / "part.stl")
+def test_load_part_repairs_a_mesh_and_reports_the_repair(change, report, bodies, tmp_path):
+    change(box()).export(tmp_path / "part.stl")
     part = load_part(tmp_path / "part.stl", "mm")
-    assert str(part.repair) == words
+    assert str(part.repair) == report
     assert len(part.bodies) == bodies
     for vertices, triangles in part.bodies:
         solid = trimesh.Trimesh(vertices, triangles, process=False)
@@ -92,14 +99,8 @@ def test_load_part_repairs_and_reports(spoil, words, bodies, tmp_path):
         assert solid.volume == pytest.approx(2e-6)
 
 
-def test_load_part_keeps_slivers_that_close_a_seam(tmp_path):
-    """A T-junction is closed by a triangle without area, which must not be removed."""
-    mesh = box()
-    a, b, c = mesh.faces[0]
-    middle = len(mesh.vertices)
-    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
-    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c], [a, b, middle]]])
-    trimesh.Trimesh(vertices, faces, process=False).export(tmp_path / "part.obj")
+def test_load_part_accepts_slivers_that_close_a_t_junction(tmp_path):
+    split_edge(box(), has_sliver=True).export(tmp_path / "part.obj")
     part = load_part(tmp_path / "part.obj", "mm")
     assert part.repair.closed_edges == 0
     assert trimesh.Trimesh(*part.bodies[0], process=False).volume == pytest.approx(2e-6)
@@ -116,17 +117,8 @@ def test_load_part_refuses_triangles_of_missing_vertices(index, tmp_path):
         load_part(tmp_path / "part.ply", "mm")
 
 
-def split_edge(mesh):
-    """Split an edge of one face only: a T-junction."""
-    a, b, c = mesh.faces[0]
-    middle = len(mesh.vertices)
-    vertices = np.vstack([mesh.vertices, mesh.vertices[[a, b]].mean(axis=0)])
-    faces = np.vstack([mesh.faces[1:], [[a, middle, c], [middle, b, c]]])
-    return trimesh.Trimesh(vertices, faces, process=False)
-
-
-def cap_of_a_bore(mesh):
-    """Drill a blind bore with a doubled and partly reversed cap."""
+def add_doubled_cap(mesh):
+    """Drill a blind bore, and close it with a cap of doubled and partly reversed triangles."""
     bore = trimesh.creation.cylinder(2.0, 10.0).apply_translation((0.0, 0.0, 9.0))
     drilled = trimesh.boolean.difference([mesh, bore], engine="manifold")
     rim = np.flatnonzero((np.abs(drilled.vertices[:, 2] - 10.0) < 1e-9) & (np.abs(drilled.vertices[:, 0]) < 3.0))
@@ -136,8 +128,8 @@ def cap_of_a_bore(mesh):
     return trimesh.Trimesh(drilled.vertices, faces, process=False)
 
 
-def bore_next_to_its_wall(mesh):
-    """Drill a through bore whose wall is drawn 0.05 mm beside the edges of the faces."""
+def shift_wall_of_a_bore(mesh):
+    """Drill a through bore whose wall is shifted by 0.05 mm relative to the edges of the faces."""
     bore = trimesh.creation.cylinder(2.0, 40.0)
     drilled = trimesh.boolean.difference([mesh, bore], engine="manifold")
     radii = np.linalg.norm(drilled.vertices[drilled.faces][:, :, :2], axis=2).max(axis=1)
@@ -147,26 +139,30 @@ def bore_next_to_its_wall(mesh):
     return trimesh.util.concatenate([rest, shifted])
 
 
-def loose_triangle(mesh):
+def add_loose_triangle(mesh):
     vertices = np.vstack([mesh.vertices, mesh.vertices[mesh.faces[0]].mean(axis=0) + (3.0, 3.0, 3.0)])
     faces = np.vstack([mesh.faces, [*mesh.faces[0][:2], len(mesh.vertices)]])
     return trimesh.Trimesh(vertices, faces, process=False)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "volume", "words"),
+    ("change", "volume", "report"),
     [
         (split_edge, 2000.0, "closed 3 edges; surface moved by at most 0.0000 mm"),
-        (cap_of_a_bore, 2000.0 - 24.0 * np.pi, r"closed 33 edges; .* at most 0.0000 mm; left out .* 1.\d+ mm from it"),
-        (bore_next_to_its_wall, 2000.0 - 80.0 * np.pi, r"closed 128 edges; .* at most 0.0[0-4]\d+ mm"),
-        (loose_triangle, 2000.0, r"closed 3 edges; surface moved by at most 0.0000 mm; left out .* from it"),
+        (
+            add_doubled_cap,
+            2000.0 - 24.0 * np.pi,
+            r"closed 33 edges; .* at most 0.0000 mm; left out .* 1.\d+ mm from it",
+        ),
+        (shift_wall_of_a_bore, 2000.0 - 80.0 * np.pi, r"closed 128 edges; .* at most 0.0[0-4]\d+ mm"),
+        (add_loose_triangle, 2000.0, r"closed 3 edges; surface moved by at most 0.0000 mm; left out .* from it"),
     ],
 )
-def test_load_part_closes_flat_faces_exactly(spoil, volume, words, tmp_path, monkeypatch):
+def test_load_part_closes_flat_faces_exactly(change, volume, report, tmp_path, monkeypatch):
     monkeypatch.setattr(repair, "_wrap", lambda *arguments: pytest.fail("fTetWild is not needed"))
-    spoil(box()).export(tmp_path / "part.obj")
+    change(box()).export(tmp_path / "part.obj")
     part = load_part(tmp_path / "part.obj", "mm")
-    assert re.fullmatch(words, str(part.repair))
+    assert re.fullmatch(report, str(part.repair))
     [body] = part.bodies
     solid = trimesh.Trimesh(*body, process=False)
     assert solid.is_watertight
@@ -174,28 +170,27 @@ def test_load_part_closes_flat_faces_exactly(spoil, volume, words, tmp_path, mon
 
 
 def test_load_part_refuses_a_hole(tmp_path):
-    hole(box()).export(tmp_path / "part.stl")
+    remove_triangle(box()).export(tmp_path / "part.stl")
     with pytest.raises(InputError, match=r"\(3 open edges.*close it"):
         load_part(tmp_path / "part.stl", "mm")
 
 
-def test_load_part_closes_a_small_hole_and_states_the_distance(tmp_path, monkeypatch):
-    def closed(gaps, vertices, triangles):
-        return to_manifold(np.asarray(whole.vertices) * 1e-3, np.asarray(whole.faces))
+def test_load_part_closes_only_small_holes_by_moving_the_surface(tmp_path, monkeypatch):
+    def wrap(gaps, vertices, triangles):
+        return to_manifold(np.asarray(closed.vertices) * 1e-3, np.asarray(closed.faces))
 
-    monkeypatch.setattr(repair, "_wrap", closed)
-    for size, is_closed in (((0.15, 0.15, 2.0), True), ((10.0, 10.0, 20.0), False)):
-        whole = trimesh.creation.box(size)
-        hole(whole.copy()).export(tmp_path / "part.stl")
-        if is_closed:
-            part = load_part(tmp_path / "part.stl", "mm")
-            assert 2e-5 < part.repair.moved < repair.MAX_MOVED
-            assert "surface moved by at most 0." in str(part.repair)
-            continue
-        with pytest.raises(
-            InputError, match=r"has a hole around .* \(3 open edges\), which a repair would close by moving"
-        ):
-            load_part(tmp_path / "part.stl", "mm")
+    monkeypatch.setattr(repair, "_wrap", wrap)
+    closed = trimesh.creation.box((0.15, 0.15, 2.0))
+    remove_triangle(closed.copy()).export(tmp_path / "part.stl")
+    part = load_part(tmp_path / "part.stl", "mm")
+    assert 2e-5 < part.repair.moved < repair.MAX_MOVED
+    assert "surface moved by at most 0." in str(part.repair)
+    closed = box()
+    remove_triangle(box()).export(tmp_path / "part.stl")
+    with pytest.raises(
+        InputError, match=r"has a hole around .* \(3 open edges\), which a repair would close by moving"
+    ):
+        load_part(tmp_path / "part.stl", "mm")
 
 
 def test_load_part_uses_the_best_of_several_repairs(tmp_path, monkeypatch):
@@ -213,12 +208,12 @@ def test_load_part_uses_the_best_of_several_repairs(tmp_path, monkeypatch):
     mesh = box()
     gaps = "part.stl is not watertight"
     solid = repair._wrap(gaps, np.asarray(mesh.vertices) * 1e-3, np.asarray(mesh.faces))
-    assert len(calls) == 3  # the third moves the surface by a micrometer
+    assert len(calls) == 3  # the third result moves the surface by a micrometer only
     assert solid.volume() == pytest.approx(1e9 * 2e-6, rel=1e-3)
 
 
 @pytest.mark.parametrize(
-    ("spoil", "unit", "message"),
+    ("change", "unit", "message"),
     [
         (lambda mesh: mesh, "m", "would be 20 m long with --unit m: is its unit mm or cm"),
         (lambda mesh: mesh.apply_scale(1e30), "mm", "would be 2e.28 m long"),
@@ -227,8 +222,8 @@ def test_load_part_uses_the_best_of_several_repairs(tmp_path, monkeypatch):
         (lambda mesh: trimesh.Trimesh([[0, 0, 0], [9, 0, 0]], [[0, 0, 1]], process=False), "mm", "without an area"),
     ],
 )
-def test_load_part_names_the_remedy_when_a_mesh_is_unusable(spoil, unit, message, tmp_path):
-    spoil(box()).export(tmp_path / "part.stl")
+def test_load_part_names_the_remedy_when_a_mesh_is_unusable(change, unit, message, tmp_path):
+    change(box()).export(tmp_path / "part.stl")
     with pytest.raises(InputError, match=message):
         load_part(tmp_path / "part.stl", unit)
 
@@ -247,29 +242,29 @@ def test_load_part_refuses_an_unknown_unit(tmp_path):
         load_part(tmp_path / "part.stl", "foot")
 
 
-def test_load_part_refuses_a_name_that_no_file_system_takes():
+def test_load_part_refuses_a_name_longer_than_file_systems_allow():
     with pytest.raises(InputError, match="check the path"):
         load_part(Path("n" * 300 + ".stl"), "mm")
 
 
 @pytest.mark.parametrize(("limit", "is_accepted"), [(12, True), (11, False)])
-def test_number_of_triangles_is_limited(limit, is_accepted, tmp_path, monkeypatch):
+def test_load_part_limits_the_number_of_triangles(limit, is_accepted, tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_TRIANGLES", limit)
     box().export(tmp_path / "part.stl")
     with nullcontext() if is_accepted else pytest.raises(InputError, match="12 triangles, more than 11"):
         load_part(tmp_path / "part.stl", "mm")
 
 
-@pytest.mark.parametrize(("more", "is_accepted"), [(0, True), (-1, False)])
-def test_size_of_a_mesh_file_is_limited(more, is_accepted, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("margin", "is_accepted"), [(0, True), (-1, False)])
+def test_load_part_limits_the_size_of_a_file(margin, is_accepted, tmp_path, monkeypatch):
     box().export(file := tmp_path / "part.stl")
-    monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_FILE_SIZE", file.stat().st_size + more)
+    monkeypatch.setattr("guiderail.models.parts.mesh_file.MAX_FILE_SIZE", file.stat().st_size + margin)
     with nullcontext() if is_accepted else pytest.raises(InputError, match="is larger than"):
         load_part(file, "mm")
 
 
-def test_load_part_opens_no_file_that_a_mesh_names(tmp_path):
-    """A pipe as a material would block, and a file of another folder must not be read."""
+def test_load_part_opens_no_file_named_in_a_mesh(tmp_path):
+    """Reading a pipe as a material file would block, and files of other folders must not be read."""
     os.mkfifo(tmp_path / "pipe.mtl")
     box().export(tmp_path / "part.obj")
     for name in ("pipe.mtl", "../secret.mtl", "/dev/zero"):
@@ -278,7 +273,7 @@ def test_load_part_opens_no_file_that_a_mesh_names(tmp_path):
         assert len(load_part(tmp_path / "named.obj", "mm").bodies) == 1
 
 
-def test_load_part_refuses_a_mesh_that_claims_more_than_it_holds(tmp_path, monkeypatch):
+def test_load_part_refuses_a_mesh_that_states_too_many_vertices(tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.models.parts.mesh_file._MAX_MEMORY", 2**28)
     header = {
         "asset": {"version": "2.0"},

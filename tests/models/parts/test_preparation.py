@@ -1,4 +1,4 @@
-"""Contact geometry deviates from the drawing by no more than it says, and nothing that can touch is cropped."""
+"""Contact geometry: measured deviations, regions without contact that are cropped, and pieces that Drake refuses."""
 
 import numpy as np
 import pytest
@@ -34,9 +34,9 @@ def test_surface_locator_agrees_with_brute_force():
     points = np.random.default_rng(0).normal(size=(50, 3))
     nearest, distances, faces = SurfaceLocator(mesh.vertices, mesh.faces).find_nearest(points)
     for point, near, distance, face in zip(points, nearest, distances, faces, strict=True):
-        every = trimesh.triangles.closest_point(mesh.triangles, np.tile(point, (len(mesh.faces), 1)))
-        assert distance == pytest.approx(np.linalg.norm(every - point, axis=1).min(), rel=1e-9)
-        np.testing.assert_allclose(near, every[face], atol=1e-9)
+        candidates = trimesh.triangles.closest_point(mesh.triangles, np.tile(point, (len(mesh.faces), 1)))
+        assert distance == pytest.approx(np.linalg.norm(candidates - point, axis=1).min(), rel=1e-9)
+        np.testing.assert_allclose(near, candidates[face], atol=1e-9)
 
 
 @pytest.mark.parametrize("tolerance", [0.05, 0.01, 0.001])
@@ -49,34 +49,36 @@ def test_simplify_deviates_by_no_more_than_the_tolerance(tolerance):
         assert simpler.num_tri() < 0.3 * solid.num_tri()
 
 
-def test_crop_keeps_the_hole_and_leaves_out_what_cannot_touch():
+def test_crop_removes_only_regions_that_cannot_touch():
     plate = manifold3d.Manifold.cube((200.0, 200.0, 20.0), True).translate((0, 0, -10.0))
     socket = plate - manifold3d.Manifold.cylinder(20.0, 5.0, 5.0, 32).translate((0, 0, -15.0))
     plug = manifold3d.Manifold.cylinder(300.0, 4.9, 4.9, 32).translate((0, 0, -15.0))
-    fixed = crop_to_contact(socket, plug, 4.0, 0.0, is_plug=False)
-    held = crop_to_contact(plug, socket, 4.0, 0.0, is_plug=True)
+    cropped_socket = crop_to_contact(socket, plug, 4.0, 0.0, is_plug=False)
+    cropped_plug = crop_to_contact(plug, socket, 4.0, 0.0, is_plug=True)
     near = manifold3d.Manifold.cylinder(30.0, 8.5, 8.5, 64).translate((0, 0, -18.5))
-    assert ((socket ^ near) - fixed).volume() < 1e-6 * socket.volume()
-    assert fixed.volume() < 0.05 * socket.volume()
-    assert held.bounding_box()[5] < 40.0  # whole slabs
+    assert ((socket ^ near) - cropped_socket).volume() < 1e-6 * socket.volume()
+    assert cropped_socket.volume() < 0.05 * socket.volume()
+    assert cropped_plug.bounding_box()[5] < 40.0  # [mm]; the plug is 300 mm long and cropped in whole slabs
 
 
 @pytest.mark.parametrize("name", ["keyed_peg", "snap_fit"])
 def test_prepared_surfaces_report_their_deviation(name, tmp_path):
     parts = [load_part(path, "mm") for path in PARTS[name]().write(tmp_path)]
     motion, tolerance = plan_motion(*parts, 0.0), choose_tolerance(measure_side_clearance(*parts))
-    lean = [decimate(part, tolerance) for part in parts]
+    decimated = [decimate(part, tolerance) for part in parts]
     snapping = frozenset({1, 2}) if name == "snap_fit" else frozenset()
-    surfaces = prepare_surfaces(lean[0][0], lean[1][0], motion, tolerance, max(d for _, d in lean), snapping)
+    surfaces = prepare_surfaces(
+        decimated[0][0], decimated[1][0], motion, tolerance, max(d for _, d in decimated), snapping
+    )
     assert max(surface.deviation for surface in surfaces) <= tolerance * (1.0 + 1e-9)
     assert surfaces[0].snapping == len(snapping)
     for part, surface in zip(parts, surfaces, strict=True):
-        assert surface.volume == pytest.approx(1e-9 * sum(one.volume() for one in make_solids(part)), rel=1e-3)
+        assert surface.volume == pytest.approx(1e-9 * sum(solid.volume() for solid in make_solids(part)), rel=1e-3)
     for _, pieces, _ in make_compliant("convex", {"plug": surfaces[0]}, tolerance, lambda line: None):
         assert {piece.body for piece in pieces} == set(range(len(surfaces[0].bodies)))
 
 
-def test_pieces_that_abort_drake_are_left_out_or_refused():
+def test_accepted_pieces_leaves_out_or_refuses_invalid_pieces():
     cube, triangles = to_arrays(manifold3d.Manifold.cube((10.0, 10.0, 10.0)))
     good, flat = Piece(0, ".obj", cube, triangles), Piece(0, ".obj", cube * [1.0, 1.0, 1e-9], triangles)
     assert accepted_pieces([good]) == [good]
@@ -86,7 +88,7 @@ def test_pieces_that_abort_drake_are_left_out_or_refused():
     assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 2]]))]) is None
 
 
-def test_no_pieces_are_accepted_without_a_check(monkeypatch):
+def test_accepted_pieces_returns_none_when_the_check_fails(monkeypatch):
     def fail(*_, **__):
         raise IsolatedError("it was killed")
 
@@ -96,12 +98,12 @@ def test_no_pieces_are_accepted_without_a_check(monkeypatch):
     assert accepted_pieces([Piece(0, ".vtk", cube, np.array([[0, 1, 2, 4]]))] * 3) is None
 
 
-def test_pieces_report_what_they_fill():
+def test_cut_bodies_reports_the_deviation_of_added_material():
     ring = manifold3d.CrossSection.circle(1.0, 16).translate((4.0, 0.0)).revolve(24)
     surface, tolerance = ContactSurface((to_arrays(ring),), 0, to_arrays(ring), 0.0, 1.0), 1e-4
-    made = cut_bodies(surface, tolerance, "fine")
-    assert made is not None
-    pieces, deviation = made
+    result = cut_bodies(surface, tolerance, "fine")
+    assert result is not None
+    pieces, deviation = result
     filled = manifold3d.Manifold.batch_boolean(
         [to_manifold(piece.points, piece.cells) for piece in pieces], manifold3d.OpType.Add
     )
