@@ -27,7 +27,7 @@ def test_motions_have_the_variance_of_the_socket_offsets():
     assert inserted.sum() > 20
     np.testing.assert_allclose(motions[:, inserted, :2].mean(axis=1), socket_offsets(), atol=0.3 * MM)
     deviations = motions[:, :, :2].std(axis=0)
-    assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # actions are scaled by the deviation
+    assert deviations.min() > 0.5 * SPREAD / np.sqrt(2.0)  # the reach of an action is proportional to the deviation
     assert deviations.max() < 1.6 * SPREAD / np.sqrt(2.0)
     np.testing.assert_allclose(socket_offsets().mean(axis=0), 0.0, atol=1e-12)
 
@@ -55,7 +55,7 @@ def test_motions_depend_on_the_seed_alone():
 def test_socket_turns_are_uncorrelated_with_the_offsets():
     turns = socket_turns(0.08)
     assert np.abs(turns).max() == 0.08
-    assert turns.std() > 0.7 * 0.08  # actions are scaled by the deviation
+    assert turns.std() > 0.7 * 0.08  # the reach of an action is proportional to the deviation
     np.testing.assert_allclose(np.column_stack([np.ones(len(turns)), socket_offsets()]).T @ turns, 0.0, atol=1e-12)
     script = plan_search(30.0 * MM, RIM, 0.0, 4.0 * MM, PRESS)
     times = np.arange(0.0, script[0][-1], 0.02)

@@ -1,3 +1,5 @@
+"""LBR iiwa 14: rotor inertia, and the external wrench at the wrist."""
+
 import numpy as np
 import pytest
 from pydrake.multibody.plant import MultibodyPlant
@@ -18,7 +20,7 @@ def arm():
 
 
 def test_iiwa_reflected_rotor_inertia_dominates(arm):
-    """The rotor inertia, times the squared gear ratio, dominates; an explicit impedance is unstable without it."""
+    """Without the rotor inertia times the squared gear ratio, an explicit impedance would be unstable."""
     context = arm.CreateDefaultContext()
     arm.SetPositions(context, IIWA14.home)
     reflected = [arm.get_joint_actuator(index).default_reflected_inertia() for index in arm.GetJointActuatorIndices()]
@@ -29,13 +31,13 @@ def test_iiwa_reflected_rotor_inertia_dominates(arm):
 def test_wrist_wrench_at_rest_is_the_external_wrench():
     mass, gravity = 2.0, np.array([0.0, 0.0, -9.81])
     M = np.diag([0.01, 0.02, 0.03, mass, mass, mass])
-    pushed_up = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0])
+    expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 5.0])  # 5 N upwards
     F_reaction = np.array([0.0, 0.0, 0.0, 0.0, 0.0, mass * 9.81 - 5.0])
-    np.testing.assert_allclose(external_wrench(F_reaction, M, np.zeros(6), np.zeros(6), gravity), pushed_up, atol=1e-12)
+    np.testing.assert_allclose(external_wrench(F_reaction, M, np.zeros(6), np.zeros(6), gravity), expected, atol=1e-12)
 
 
 def test_wrist_wrench_is_zero_in_free_fall_with_spin():
-    """A free body with an offset center of mass, compared with Drake's dynamics."""
+    """The motion of a free body with an offset center of mass is computed by Drake."""
     plant = MultibodyPlant(0.0)
     (model,) = add_models(plant, CONNECTOR_TOOL.model)
     plant.Finalize()

@@ -1,4 +1,4 @@
-"""Inverse kinematics: exact, nearest to a posture, within limits, deterministic, and refusals."""
+"""Inverse kinematics: accuracy, distance from the posture, joint limits, repeatability, and refusals."""
 
 import numpy as np
 import pytest
@@ -14,6 +14,8 @@ from guiderail.systems.support.drake_multibody import pose_to_transform
 
 
 class Arm:
+    """Robot arm without a tool, and the inverse kinematics of its flange."""
+
     def __init__(self, name):
         self.robot = find_robot(name)
         self.plant = MultibodyPlant(0.0)
@@ -32,6 +34,7 @@ class Arm:
         return solve_inverse_kinematics(self.plant, self.plant.world_frame(), self.flange, X, posture)
 
     def error(self, q, X):
+        """Return the norm of the pose error, translation [m] and rotation [rad] together."""
         D = X.inverse() @ self.pose(q)
         return np.linalg.norm([np.linalg.norm(D.translation()), D.rotation().ToAngleAxis().angle()])
 
@@ -42,11 +45,11 @@ class Arm:
             self.context, JacobianWrtVariable.kV, self.flange, np.zeros(3), world, world
         )
 
-    def around_home(self, rng):
+    def random_pose(self, rng):
+        """Return a random flange pose near the pose at home."""
         shift = rng.uniform([-0.1, -0.1, -0.1, -1.0, -0.3, -0.3], [0.1, 0.1, 0.1, 1.0, 0.3, 0.3])
-        X = pose_to_transform(shift)
-        X_home = self.pose(self.home)
-        return RigidTransform(X.rotation() @ X_home.rotation(), X.translation() + X_home.translation())
+        X, X_WHome = pose_to_transform(shift), self.pose(self.home)
+        return RigidTransform(X.rotation() @ X_WHome.rotation(), X.translation() + X_WHome.translation())
 
 
 @pytest.fixture(scope="module", params=["iiwa14", "panda", "ur5e"])
@@ -57,7 +60,7 @@ def arm(request):
 def test_solution_is_exact_within_limits_and_deterministic(arm):
     rng = np.random.default_rng(0)
     for _ in range(20):
-        X = arm.around_home(rng)
+        X = arm.random_pose(rng)
         q = arm.solve(X)
         assert arm.error(q, X) < 1e-9
         assert ((q >= arm.lower) & (q <= arm.upper)).all()
@@ -68,21 +71,20 @@ def test_solution_is_nearest_to_the_posture(arm):
     """No null-space motion reduces the distance from the posture."""
     rng = np.random.default_rng(1)
     for _ in range(10):
-        q = arm.solve(arm.around_home(rng))
+        q = arm.solve(arm.random_pose(rng))
         J = arm.jacobian(q)
-        away = q - arm.home
-        still = away - np.linalg.pinv(J) @ (J @ away)
-        assert np.linalg.norm(still) < 1e-4
-        assert np.linalg.norm(away) < 2.0
+        difference = q - arm.home
+        null_space_part = difference - np.linalg.pinv(J) @ (J @ difference)
+        assert np.linalg.norm(null_space_part) < 1e-4
+        assert np.linalg.norm(difference) < 2.0
 
 
-def test_solution_is_the_posture_when_it_meets_the_pose():
+def test_solution_is_the_posture_when_the_posture_has_the_pose():
     arm = Arm("panda")
     np.testing.assert_allclose(arm.solve(arm.pose(arm.home)), arm.home, atol=1e-7)
 
 
-def test_solution_keeps_a_joint_at_its_limit_within_it():
-    """For a posture beyond a limit the nearest solution has that joint at its limit, at the exact pose."""
+def test_solution_is_within_limits_when_the_posture_is_not():
     arm = Arm("panda")
     X = arm.pose(arm.home)
     posture = arm.home.copy()
@@ -92,8 +94,8 @@ def test_solution_keeps_a_joint_at_its_limit_within_it():
     assert arm.error(q, X) < 1e-9
 
 
-def test_solution_exists_when_the_posture_is_on_the_wrong_side():
-    """If the search from a posture half a turn away fails, further searches start around it."""
+def test_solution_is_found_when_the_posture_is_far_away():
+    """If the search from a distant posture fails, further searches start at random postures around it."""
     arm = Arm("ur5e")
     X = arm.pose(arm.home)
     for seed in range(10):
@@ -103,7 +105,7 @@ def test_solution_exists_when_the_posture_is_on_the_wrong_side():
 
 
 @pytest.mark.parametrize(("name", "joint"), [("ur5e", 4), ("ur5e", 2), ("iiwa14", 5)])
-def test_solution_exists_for_a_singular_pose(name, joint):
+def test_solution_is_found_for_a_singular_pose(name, joint):
     arm = Arm(name)
     singular = arm.home.copy()
     singular[joint] = 0.0
@@ -114,13 +116,13 @@ def test_solution_exists_for_a_singular_pose(name, joint):
     assert np.abs(q - near).max() < 0.5
 
 
-def test_refuses_a_pose_out_of_reach(arm):
+def test_solve_refuses_a_pose_out_of_reach(arm):
     with pytest.raises(InputError, match=r"can't reach \[2\. *0\. *0\. *\] m: move the workcell nearer"):
         arm.solve(RigidTransform([2.0, 0.0, 0.0]))
 
 
-def test_refuses_a_pose_beyond_a_joint_limit():
-    """A pose near the base with the flange down needs an elbow that folds further."""
+def test_solve_refuses_a_pose_beyond_a_joint_limit():
+    """At a pose near the base with the flange down, the elbow would be beyond its limit."""
     arm = Arm("panda")
     X = RigidTransform(arm.pose(arm.home).rotation(), [0.05, 0.0, 0.1])
     with pytest.raises(InputError, match="only beyond a joint's limit"):

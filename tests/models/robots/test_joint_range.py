@@ -1,3 +1,5 @@
+"""Joint range: joint positions of a commanded pose, linearized limits, and singular values."""
+
 import numpy as np
 import pytest
 from pydrake.multibody.tree import JacobianWrtVariable
@@ -13,7 +15,8 @@ from guiderail.models.robots.joint_range import JointRange
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
 POSE = np.array([0.02, 0.03, 0.1, 0.7, 0.1, -0.2])
-MARGIN, SMALLEST = 0.1, 0.05
+MARGIN = 0.1  # [rad]
+MIN_SINGULAR_VALUE = 0.05  # [m]
 
 
 @pytest.fixture(scope="module")
@@ -21,18 +24,19 @@ def model():
     return ArmControllerPlant(BncWorkcell())
 
 
-def joint_range(model, **arguments):
+def make_joint_range(model, **arguments):
     return JointRange(model.plant, model.target, model.tool_center, model.posture, **arguments)
 
 
-def test_solution_has_the_pose_and_is_nearest_to_the_posture(model):
-    joints = joint_range(model)
+def test_solve_returns_the_solution_nearest_to_the_posture(model):
+    joints = make_joint_range(model)
     q = joints.solve(POSE)
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, q)
     X = model.tool_center.CalcPose(context, model.target)
     np.testing.assert_allclose(X.GetAsMatrix4(), pose_to_transform(POSE).GetAsMatrix4(), atol=1e-8)
-    np.testing.assert_allclose(q, model.solve(POSE, model.posture), atol=1e-3)  # by another solver
+    expected = model.solve(POSE, model.posture)  # by another solver
+    np.testing.assert_allclose(q, expected, atol=1e-3)
     assert joints.solve(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) is None
     assert joints.violation(POSE + [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]) == np.inf
     with pytest.raises(ValueError, match="read-only"):
@@ -40,31 +44,31 @@ def test_solution_has_the_pose_and_is_nearest_to_the_posture(model):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_pose_that_is_not_finite_is_not_reached(model, value):
-    joints, pose = joint_range(model), np.r_[value, POSE[1:]]
+def test_solve_returns_none_for_a_pose_that_is_not_finite(model, value):
+    joints, pose = make_joint_range(model), np.r_[value, POSE[1:]]
     assert joints.solve(pose) is None
     assert joints.violation(pose) == np.inf
 
 
-def test_rows_are_the_limits_up_to_the_second_order(model):
-    joints = joint_range(model, margin=MARGIN)
+def test_linearized_limits_are_accurate_to_second_order(model):
+    joints = make_joint_range(model, margin=MARGIN)
     G, c = joints.linearize(POSE)
     lower = model.plant.GetPositionLowerLimits() + MARGIN - joints.solve(POSE)
     assert len(G) == 14
     errors = []
     for size in (1e-2, 1e-3):
         change = size * np.array([1.0, -0.5, 0.5, 1.0, -1.0, 1.0])
-        moved = joints.solve(POSE + change) - joints.solve(POSE)
-        scale = lower / (c - G @ POSE)[:7]  # of a row, in radians
+        difference = joints.solve(POSE + change) - joints.solve(POSE)
+        scale = lower / (c - G @ POSE)[:7]  # scale of each row [rad]
         predicted = scale * (G @ change)[:7]
-        errors.append(np.linalg.norm(joint_space_part(model, joints.solve(POSE), moved - predicted)))
+        errors.append(np.linalg.norm(tool_motion_part(model, joints.solve(POSE), difference - predicted)))
         np.testing.assert_allclose((G @ change)[7:], -(G @ change)[:7], atol=1e-12)
     assert errors[0] < 5e-3
     assert errors[1] < 0.02 * errors[0]
 
 
-def joint_space_part(model, q, change):
-    """Part of a change of the joints that moves the tool: the null space follows the posture."""
+def tool_motion_part(model, q, change):
+    """Return the part of a change (n,) of the joint positions that moves the tool, without null-space motion."""
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, q)
     J = model.plant.CalcJacobianSpatialVelocity(
@@ -73,53 +77,55 @@ def joint_space_part(model, q, change):
     return np.linalg.pinv(J) @ J @ change
 
 
-def test_gradient_of_the_singular_value_is_that_of_a_difference(model):
-    joints = joint_range(model, min_singular_value=SMALLEST)
+def test_gradient_of_the_singular_value_is_accurate(model):
+    joints = make_joint_range(model, min_singular_value=MIN_SINGULAR_VALUE)
     q = joints.solve(POSE)
     value, gradient = joints._singular_value(q)
     step = 1e-5 * np.array([1.0, -2.0, 1.0, 0.5, -1.0, 1.0, 2.0])
     assert joints._singular_value(q + step)[0] - value == pytest.approx(gradient @ step, rel=1e-2)
     assert len(joints.linearize(POSE)[0]) == 15
-    assert joints.violation(POSE) == max(joint_range(model).violation(POSE), (SMALLEST - value) / LEVER)
+    assert joints.violation(POSE) == max(make_joint_range(model).violation(POSE), (MIN_SINGULAR_VALUE - value) / LEVER)
 
 
 def test_violation_of_the_singular_value_is_an_angle(model):
-    value = joint_range(model)._singular_value(joint_range(model).solve(POSE))[0]
+    joints = make_joint_range(model)
+    value = joints._singular_value(joints.solve(POSE))[0]
     for excess in (-0.001, 0.001):  # [m]
-        assert joint_range(model, min_singular_value=value + excess).violation(POSE) == pytest.approx(excess / LEVER)
+        constrained = make_joint_range(model, min_singular_value=value + excess)
+        assert constrained.violation(POSE) == pytest.approx(excess / LEVER)
 
 
 @pytest.mark.parametrize("direction", [[0.6, 0.0, 0.0, 0.0, 0.0, 0.0], [-0.45, 0.0, -0.3, 0.0, 0.0, 0.0]])
-def test_no_command_takes_a_joint_beyond_its_limits(model, direction):
-    joints = joint_range(model, margin=MARGIN, min_singular_value=SMALLEST)
+def test_commands_do_not_move_a_joint_beyond_its_limits(model, direction):
+    joints = make_joint_range(model, margin=MARGIN, min_singular_value=MIN_SINGULAR_VALUE)
     motion = MotionConstraints(LinearConstraints.none(6), max_speed=[2.0, 2.0, 2.0, 6.0, 6.0, 6.0], state=[joints])
-    law, desired = MotionConstraintFilter(motion, 0.02), POSE + np.array(direction)
+    motion_filter, desired = MotionConstraintFilter(motion, 0.02), POSE + np.array(direction)
     assert joints.violation(desired) > 0.0
-    state, violations = law.start(POSE), []
+    state, violations = motion_filter.start(POSE), []
     for _ in range(15):
-        state, _ = law.apply(state, desired)
+        state, _ = motion_filter.apply(state, desired)
         violations.append(joints.violation(state[:6]))
     assert max(violations) <= 0.0
-    assert max(violations) > -0.02  # a limit was reached
-    free = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(6), max_speed=motion.max_speed), 0.02)
-    state = free.start(POSE)
+    assert max(violations) > -0.02  # [rad], a limit is reached
+    unlimited = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(6), max_speed=motion.max_speed), 0.02)
+    state = unlimited.start(POSE)
     for _ in range(15):
-        state, _ = free.apply(state, desired)
+        state, _ = unlimited.apply(state, desired)
     assert joints.violation(state[:6]) > 0.0
 
 
-def test_range_raises_when_an_argument_is_out_of_range(model):
+def test_joint_range_refuses_invalid_arguments(model):
     for arguments in ({"margin": -0.1}, {"min_singular_value": np.nan}, {"margin": 3.0}):
         with pytest.raises(InputError):
-            joint_range(model, **arguments)
+            make_joint_range(model, **arguments)
 
 
-def test_singular_value_needs_a_margin():
+def test_min_singular_value_requires_a_joint_margin():
     with pytest.raises(InputError, match="joint_margin=0 as well"):
         make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", min_singular_value=0.05)
 
 
-def test_option_needs_an_arm():
+def test_joint_margin_requires_an_arm():
     with pytest.raises(InputError, match="station=arm"):
         make_prior_knowledge("BncConnector", guidance="kgrl", joint_margin=0.1)
     config = make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", joint_margin=0.1).demonstrations

@@ -1,4 +1,4 @@
-"""Mounting of robots and end effectors in a plant: refusals, model files, and rigid copies for a controller."""
+"""Mounting of robots and end effectors in a plant: refusals, model files, and rigid models for a controller."""
 
 import dataclasses
 import re
@@ -16,7 +16,8 @@ UR5E = find_robot("ur5e")
 GRIPPER = find_end_effector("parallel_gripper")
 
 
-def mounted(end_effector, robot=UR5E, **options):
+def mount(end_effector, robot=UR5E, **options):
+    """Return a finalized plant, the arm and the end effector."""
     plant = MultibodyPlant(0.005)
     arm = add_robot(plant, robot)
     tool = add_end_effector(plant, robot, arm, end_effector, **options)
@@ -24,8 +25,8 @@ def mounted(end_effector, robot=UR5E, **options):
     return plant, arm, tool
 
 
-def test_add_robot_orders_actuators_like_the_joints():
-    plant, arm, _ = mounted(find_end_effector("connector_tool"))
+def test_add_robot_returns_actuators_in_the_order_of_joints():
+    plant, arm, _ = mount(find_end_effector("connector_tool"))
     assert [actuator.joint().name() for actuator in arm.actuators] == list(UR5E.joints)
     q = np.arange(6) / 10
     context = plant.CreateDefaultContext()
@@ -37,34 +38,43 @@ TRANSMISSION = r"(?s)<transmission.*?</transmission>"
 
 
 def reverse_transmissions(text):
-    last_first = iter(reversed(re.findall(TRANSMISSION, text)))
-    return re.sub(TRANSMISSION, lambda _: next(last_first), text)
+    transmissions = re.findall(TRANSMISSION, text)
+    return re.sub(TRANSMISSION, lambda _: transmissions.pop(), text)
 
 
-def drop(pattern, by=""):
+def substitute(pattern, by=""):
+    """Return a function that replaces the matches of a regular expression in a text."""
     return lambda text: re.sub(pattern, by, text)
 
 
 @pytest.mark.parametrize(
     ("change", "fields", "match"),
     [
-        (drop(r' effort="[\d.]+"'), {}, "shoulder_pan_joint' needs a finite effort limit"),
-        (drop(r' lower="[^"]*" upper="[^"]*"'), {}, "shoulder_pan_joint' needs finite position limits"),
-        (drop(r'lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"'), {}, "pan_joint' needs finite position limits"),
-        (drop(r' velocity="[^"]*"'), {}, "shoulder_pan_joint' needs a positive, finite velocity limit"),
-        (drop(r'velocity="[^"]*"', 'velocity="0"'), {}, "shoulder_pan_joint' needs a positive, finite velocity limit"),
+        (substitute(r' effort="[\d.]+"'), {}, "shoulder_pan_joint' needs a finite effort limit"),
+        (substitute(r' lower="[^"]*" upper="[^"]*"'), {}, "shoulder_pan_joint' needs finite position limits"),
         (
-            drop(r"(?s)<inertial>.*?</inertial>"),
+            substitute(r'lower="[^"]*" upper="[^"]*"', 'lower="0" upper="0"'),
             {},
-            "robot 'mine': the link that joint 'ur5e_shoulder_pan_joint' moves needs a mass",
+            "pan_joint' needs finite position limits",
+        ),
+        (substitute(r' velocity="[^"]*"'), {}, "shoulder_pan_joint' needs a positive, finite velocity limit"),
+        (
+            substitute(r'velocity="[^"]*"', 'velocity="0"'),
+            {},
+            "shoulder_pan_joint' needs a positive, finite velocity limit",
         ),
         (
-            drop(r'lower="([^"]*)" upper="([^"]*)"', r'lower="\2" upper="\1"'),
+            substitute(r"(?s)<inertial>.*?</inertial>"),
             {},
-            "robot 'mine': the lower position limit of joint 'ur5e_shoulder_pan_joint' in .* is above the upper one",
+            "robot 'local': the link that joint 'ur5e_shoulder_pan_joint' moves needs a mass",
         ),
-        (drop(r"<drake:rotor_inertia[^>]*/>"), {}, "shoulder_pan_joint' needs a transmission with rotor inertia"),
-        (drop(r'gear_ratio value="\d+"', 'gear_ratio value="0"'), {}, "rotor inertia and gear ratio"),
+        (
+            substitute(r'lower="([^"]*)" upper="([^"]*)"', r'lower="\2" upper="\1"'),
+            {},
+            "robot 'local': the lower position limit of joint 'ur5e_shoulder_pan_joint' in .* is above the upper one",
+        ),
+        (substitute(r"<drake:rotor_inertia[^>]*/>"), {}, "shoulder_pan_joint' needs a transmission with rotor inertia"),
+        (substitute(r'gear_ratio value="\d+"', 'gear_ratio value="0"'), {}, "rotor inertia and gear ratio"),
         (
             reverse_transmissions,
             {},
@@ -74,14 +84,14 @@ def drop(pattern, by=""):
         (str, {"level_posture": (*UR5E.home[:5], -7.0)}, "level_posture of joint 'ur5e_wrist_3_joint'"),
     ],
 )
-def test_robot_with_incomplete_drives_or_a_posture_out_of_range_is_refused(tmp_path, change, fields, match):
+def test_add_robot_refuses_incomplete_drives_and_postures(tmp_path, change, fields, match):
     model = tmp_path / "arm.urdf"
     model.write_text(change(UR5E.model.read_text()))
     with pytest.raises(InputError, match=match):
-        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, name="mine", model=model, **fields))
+        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, name="local", model=model, **fields))
 
 
-def test_crossed_limits_of_an_sdf_file_name_the_joint(tmp_path):
+def test_add_models_names_the_joint_of_crossed_limits(tmp_path):
     limit = "<axis><xyz>0 0 1</xyz><limit><lower>1</lower><upper>-1</upper></limit></axis>"
     joint = f"<joint name='hinge' type='revolute'><parent>world</parent><child>link</child>{limit}</joint>"
     file = tmp_path / "arm.sdf"
@@ -101,9 +111,9 @@ def test_lighten_rotors_scales_the_rotor_inertia():
     assert after == pytest.approx([0.25 * inertia for inertia in before])
 
 
-def test_add_end_effector_as_rigid_adds_one_open_body():
-    plant, _, tool = mounted(GRIPPER)
-    rigid_plant, _, rigid = mounted(GRIPPER, as_rigid=True)
+def test_add_end_effector_as_rigid_adds_one_body():
+    plant, _, tool = mount(GRIPPER)
+    rigid_plant, _, rigid = mount(GRIPPER, as_rigid=True)
     assert rigid_plant.num_positions() == 6
     assert not rigid.actuators
     context, rigid_context = plant.CreateDefaultContext(), rigid_plant.CreateDefaultContext()
@@ -116,7 +126,7 @@ def test_add_end_effector_as_rigid_adds_one_open_body():
         tool.tool_center.CalcPoseInWorld(context).GetAsMatrix4(),
         atol=1e-12,
     )
-    # Both fingers are open; one of them mimics the other.
+    # Both fingers are open; the right finger mimics the left one.
     np.testing.assert_allclose(plant.GetPositions(context, tool.model), [0.04, 0.04])
 
 
@@ -145,14 +155,14 @@ STAND = """
 
 
 def test_add_robot_accepts_model_directives(tmp_path):
-    """The model file welds the base of an arm to a stand, not at the world's origin."""
+    """The directives weld the base of the arm to a stand of 0.4 m."""
     (tmp_path / "package.xml").write_text("<package><name>laboratory</name></package>")
     (tmp_path / "stand.urdf").write_text(STAND)
     (tmp_path / "ur5e.urdf").write_text(UR5E.model.read_text())
     (tmp_path / "cell.dmd.yaml").write_text(DIRECTIVES)
-    on_a_stand = dataclasses.replace(UR5E, name="on a stand", model=tmp_path / "cell.dmd.yaml")
+    robot_on_stand = dataclasses.replace(UR5E, name="on a stand", model=tmp_path / "cell.dmd.yaml")
     heights = []
-    for robot in (UR5E, on_a_stand):
+    for robot in (UR5E, robot_on_stand):
         plant = MultibodyPlant(0.0)
         arm = add_robot(plant, robot)
         plant.Finalize()
@@ -162,7 +172,7 @@ def test_add_robot_accepts_model_directives(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("fields", "reason"),
     [
         ({"base_frame": "foot"}, "has no frame 'foot'"),
         ({"flange_frame": "hand"}, "has no frame 'hand'"),
@@ -170,13 +180,13 @@ def test_add_robot_accepts_model_directives(tmp_path):
         ({"joints": (*UR5E.joints[:4], UR5E.joints[5], UR5E.joints[4])}, "in the order from base to"),
     ],
 )
-def test_add_robot_refuses_data_that_the_model_lacks(wrong, sentence):
-    with pytest.raises(InputError, match=sentence):
-        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, **wrong))
+def test_add_robot_refuses_data_that_the_model_lacks(fields, reason):
+    with pytest.raises(InputError, match=reason):
+        add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, **fields))
 
 
-def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
-    for text, sentence in (
+def test_add_robot_refuses_missing_and_invalid_models(tmp_path):
+    for text, reason in (
         (None, "no model file"),
         ("<robot", "robot 'ur5e': .* can't be read"),
         (UR5E.model.read_text().split("<transmission")[0] + "</robot>", "give its model file a transmission"),
@@ -184,12 +194,12 @@ def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
         file = tmp_path / "robot.urdf"
         if text is not None:
             file.write_text(text)
-        with pytest.raises(InputError, match=sentence):
+        with pytest.raises(InputError, match=reason):
             add_robot(MultibodyPlant(0.0), dataclasses.replace(UR5E, model=file))
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("fields", "reason"),
     [
         ({"mount_frame": "flange"}, "has no frame 'flange'"),
         ({"tool_center": "tip"}, "has no frame 'tip'"),
@@ -198,18 +208,18 @@ def test_add_robot_refuses_a_missing_or_broken_model(tmp_path):
     ],
 )
 @pytest.mark.parametrize("as_rigid", [False, True])
-def test_add_end_effector_refuses_data_that_the_model_lacks(wrong, sentence, as_rigid):
-    with pytest.raises(InputError, match=sentence):
-        mounted(dataclasses.replace(GRIPPER, **wrong), as_rigid=as_rigid)
+def test_add_end_effector_refuses_data_that_the_model_lacks(fields, reason, as_rigid):
+    with pytest.raises(InputError, match=reason):
+        mount(dataclasses.replace(GRIPPER, **fields), as_rigid=as_rigid)
 
 
 @pytest.mark.parametrize("as_rigid", [False, True])
-def test_add_end_effector_refuses_a_missing_or_double_model(as_rigid, tmp_path):
+def test_add_end_effector_refuses_files_without_one_model(as_rigid, tmp_path):
     file = tmp_path / "two.dmd.yaml"
     label = "end effector 'parallel_gripper'"
     with pytest.raises(InputError, match=f"{label}: there is no model file"):
-        mounted(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
+        mount(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
     models = (f"- add_model: {{name: {name}, file: 'file://{GRIPPER.model}'}}\n" for name in ("one", "two"))
     file.write_text("directives:\n" + "".join(models))
     with pytest.raises(InputError, match=f"{label}: .* must contain one model, not 2"):
-        mounted(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)
+        mount(dataclasses.replace(GRIPPER, model=file), as_rigid=as_rigid)

@@ -1,4 +1,4 @@
-"""Data of robots and end effectors: registry, refusals, and agreement with published values."""
+"""Data of robots and end effectors: registry, refusals, and comparison with published values."""
 
 import dataclasses
 import re
@@ -24,7 +24,7 @@ from guiderail.models.robots.robot import (
 ROBOTS = ("iiwa14", "panda", "ur5e")
 
 
-class Alone:
+class Arm:
     """Plant of a robot without a tool."""
 
     def __init__(self, name):
@@ -40,20 +40,20 @@ class Alone:
 
 
 @pytest.fixture(scope="module", params=ROBOTS)
-def alone(request):
-    return Alone(request.param)
+def arm(request):
+    return Arm(request.param)
 
 
-def test_registry_finds_every_robot_of_the_package():
+def test_registry_contains_the_robots_of_the_package():
     assert tuple(robot_names()) == ROBOTS
     assert end_effector_names() == ["connector_tool", "parallel_gripper"]
     assert find_robot("panda") is find_robot(find_robot("panda"))
 
 
-@pytest.mark.parametrize(("typed", "meant"), [("iiwa", "iiwa14"), ("Panda", "panda"), ("ur5", "ur5e")])
-def test_find_robot_suggests_the_nearest_name(typed, meant):
-    with pytest.raises(InputError, match=f"no robot '{typed}': did you mean {meant}"):
-        find_robot(typed)
+@pytest.mark.parametrize(("name", "suggestion"), [("iiwa", "iiwa14"), ("Panda", "panda"), ("ur5", "ur5e")])
+def test_find_robot_suggests_the_nearest_name(name, suggestion):
+    with pytest.raises(InputError, match=f"no robot '{name}': did you mean {suggestion}"):
+        find_robot(name)
 
 
 def test_find_end_effector_suggests_the_nearest_name():
@@ -62,18 +62,17 @@ def test_find_end_effector_suggests_the_nearest_name():
 
 
 @pytest.mark.parametrize("robot", [5, None, type("Arm", (), {"name": "arm"})])
-def test_register_refuses_what_is_no_robot(robot):
+def test_register_robot_refuses_other_objects(robot):
     with pytest.raises(InputError, match="a robot is registered as a Robot object, not"):
         register_robot(robot)
 
 
-def test_register_refuses_a_second_robot_of_a_name():
+def test_register_robot_refuses_a_second_robot_of_a_name():
     with pytest.raises(InputError, match="panda"):
         register_robot(dataclasses.replace(find_robot("panda"), title="another"))
 
 
-def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
-    """Install a distribution with two entry points: one registers a robot on import, the other is a robot."""
+def test_entry_point_of_an_installed_package_adds_a_robot(tmp_path, monkeypatch):
     (tmp_path / "laboratory.py").write_text(
         "import dataclasses\n"
         "from guiderail.models.robots.robot import find_robot\n"
@@ -90,7 +89,7 @@ def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("fields", "reason"),
     [
         ({"home": (0.0,) * 5}, "home must be 6 joint positions"),
         ({"home": (np.nan,) * 6}, "home must be 6 joint positions"),
@@ -106,13 +105,13 @@ def test_entry_point_of_an_installed_package_adds_robots(tmp_path, monkeypatch):
         ({"drives": JointDrives((1.0,), (1.0,))}, "needs a drive for each of its"),
     ],
 )
-def test_robot_refuses_invalid_data(wrong, sentence):
-    with pytest.raises(InputError, match=sentence):
-        dataclasses.replace(find_robot("ur5e"), **wrong)
+def test_robot_refuses_invalid_data(fields, reason):
+    with pytest.raises(InputError, match=reason):
+        dataclasses.replace(find_robot("ur5e"), **fields)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "sentence"),
+    ("fields", "reason"),
     [
         ({"bodies": ()}, "bodies"),
         ({"opening": {}}, "opening"),
@@ -120,15 +119,17 @@ def test_robot_refuses_invalid_data(wrong, sentence):
         ({"drives": None}, "drive"),
     ],
 )
-def test_end_effector_refuses_invalid_data(wrong, sentence):
-    with pytest.raises(InputError, match=sentence):
-        dataclasses.replace(find_end_effector("parallel_gripper"), **wrong)
+def test_end_effector_refuses_invalid_data(fields, reason):
+    with pytest.raises(InputError, match=reason):
+        dataclasses.replace(find_end_effector("parallel_gripper"), **fields)
 
 
-@pytest.mark.parametrize("wrong", [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,)), (("a",), (1.0,))])
-def test_drives_refuse_invalid_data(wrong):
+@pytest.mark.parametrize(
+    ("stiffness", "inertia"), [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,)), (("a",), (1.0,))]
+)
+def test_drives_refuse_invalid_data(stiffness, inertia):
     with pytest.raises(InputError):
-        JointDrives(*wrong)
+        JointDrives(stiffness, inertia)
 
 
 def test_drives_are_critically_damped():
@@ -136,7 +137,8 @@ def test_drives_are_critically_damped():
     assert np.roots([0.25, damping, 400.0]) == pytest.approx([-40.0, -40.0])
 
 
-# Denavit and Hartenberg's a, d [m] and α of each row; Craig's convention where α and a come before the joint.
+# Denavit-Hartenberg parameters a [m], d [m] and α [rad] of each joint. In Craig's convention, a and α are applied
+# before the joint's rotation.
 CRAIG = {
     "panda": [
         (0.0, 0.333, 0.0),
@@ -160,27 +162,28 @@ CLASSIC = {
 }
 
 
-def _step(a, d, alpha, theta, craig):
+def dh_transform(a, d, alpha, theta, is_craig):
+    """Return the transform of a joint with Denavit-Hartenberg parameters at the angle `theta` [rad]."""
     turn = RigidTransform(RotationMatrix.MakeZRotation(theta), [0.0, 0.0, d])
     twist = RigidTransform(RotationMatrix.MakeXRotation(alpha), [a, 0.0, 0.0])
-    return twist @ turn if craig else turn @ twist
+    return twist @ turn if is_craig else turn @ twist
 
 
-def test_flange_pose_equals_published_kinematics(alone):
-    name = alone.robot.name
-    if name == "iiwa14":  # the data sheet has the height of the stretched arm
-        np.testing.assert_allclose(alone.flange(np.zeros(7)).translation(), [0.0, 0.0, 1.306], atol=1e-9)
+def test_flange_pose_equals_published_kinematics(arm):
+    name = arm.robot.name
+    if name == "iiwa14":  # height of the stretched arm in the data sheet [m]
+        np.testing.assert_allclose(arm.flange(np.zeros(7)).translation(), [0.0, 0.0, 1.306], atol=1e-9)
         return
     rng = np.random.default_rng(0)
     for _ in range(5):
-        q = rng.uniform(-1.5, 1.5, alone.robot.num_joints)
-        # The base frame of a UR is turned by half a turn relative to the direction of its arm at zero.
+        q = rng.uniform(-1.5, 1.5, arm.robot.num_joints)
+        # The model's base frame of the UR5e is rotated by half a turn about z.
         X = RigidTransform(RotationMatrix.MakeZRotation(np.pi if name == "ur5e" else 0.0), [0.0, 0.0, 0.0])
         for row, theta in zip((CRAIG | CLASSIC)[name], q, strict=True):
-            X = X @ _step(*row, theta, craig=name in CRAIG)
+            X = X @ dh_transform(*row, theta, is_craig=name in CRAIG)
         if name == "panda":
             X = X @ RigidTransform([0.0, 0.0, 0.107])
-        np.testing.assert_allclose(alone.flange(q).GetAsMatrix4(), X.GetAsMatrix4(), atol=1e-9)
+        np.testing.assert_allclose(arm.flange(q).GetAsMatrix4(), X.GetAsMatrix4(), atol=1e-9)
 
 
 PUBLISHED_LIMITS = {
@@ -194,66 +197,66 @@ PUBLISHED_LIMITS = {
 }
 
 
-def test_limits_equal_published_ones(alone):
-    upper, speed, effort = PUBLISHED_LIMITS[alone.robot.name]
-    np.testing.assert_allclose(alone.plant.GetPositionUpperLimits(), upper, atol=1e-5)
-    np.testing.assert_allclose(alone.plant.GetVelocityUpperLimits(), speed, atol=1e-5)
-    np.testing.assert_allclose(alone.plant.GetEffortUpperLimits(), effort)
-    if alone.robot.name == "panda":
+def test_joint_limits_equal_published_limits(arm):
+    upper, speed, effort = PUBLISHED_LIMITS[arm.robot.name]
+    np.testing.assert_allclose(arm.plant.GetPositionUpperLimits(), upper, atol=1e-5)
+    np.testing.assert_allclose(arm.plant.GetVelocityUpperLimits(), speed, atol=1e-5)
+    np.testing.assert_allclose(arm.plant.GetEffortUpperLimits(), effort)
+    if arm.robot.name == "panda":
         lower = [-2.8973, -1.7628, -2.8973, -3.0718, -2.8973, -0.0175, -2.8973]
-        np.testing.assert_allclose(alone.plant.GetPositionLowerLimits(), lower, atol=1e-9)
+        np.testing.assert_allclose(arm.plant.GetPositionLowerLimits(), lower, atol=1e-9)
 
 
 def test_panda_gravity_equals_the_identified_model():
-    """Compare gravity torques at Franka's ready posture with the coefficients published by Gaz et al.
+    """The gravity torques are those of the dynamic coefficients of Gaz et al., at Franka's ready posture.
 
-    The feasible masses and centers of mass that were computed from the coefficients reproduce the torques to 0.15 Nm.
+    The feasible masses and centers of mass computed from these coefficients reproduce the torques to 0.15 Nm.
     """
-    alone = Alone("panda")
-    alone.plant.SetPositions(alone.context, [0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
-    torque = -alone.plant.CalcGravityGeneralizedForces(alone.context)
+    arm = Arm("panda")
+    arm.plant.SetPositions(arm.context, [0, -np.pi / 4, 0, -3 * np.pi / 4, 0, np.pi / 2, np.pi / 4])
+    torque = -arm.plant.CalcGravityGeneralizedForces(arm.context)
     np.testing.assert_allclose(torque, [0.0, -1.7388, -0.6683, 18.5240, 0.7158, 1.6714, 0.0], atol=0.15)
 
 
-def test_ur5e_gravity_equals_that_of_published_masses():
-    """At zero the arm is stretched out, and the shoulder torque is the sum of the masses times their distances."""
-    alone = Alone("ur5e")
-    alone.plant.SetPositions(alone.context, np.zeros(6))
-    masses = np.array([8.058, 2.846, 1.37, 1.3, 0.365])
-    distances = np.array([0.2125, 0.425 + 0.2422, 0.8172, 0.8172, 0.8172])
-    shoulder = -alone.plant.CalcGravityGeneralizedForces(alone.context)[1]
+def test_ur5e_gravity_equals_that_of_the_published_masses():
+    """At zero, the arm is stretched out, and the shoulder torque is g times the sum of masses times distances."""
+    arm = Arm("ur5e")
+    arm.plant.SetPositions(arm.context, np.zeros(6))
+    masses = np.array([8.058, 2.846, 1.37, 1.3, 0.365])  # [kg]
+    distances = np.array([0.2125, 0.425 + 0.2422, 0.8172, 0.8172, 0.8172])  # from the shoulder [m]
+    shoulder = -arm.plant.CalcGravityGeneralizedForces(arm.context)[1]
     assert abs(shoulder) == pytest.approx(9.81 * masses @ distances, rel=1e-4)
 
 
-def test_home_is_regular_within_limits_and_points_down(alone):
-    robot, plant = alone.robot, alone.plant
+def test_home_is_regular_within_limits_and_points_down(arm):
+    robot, plant = arm.robot, arm.plant
     home = np.array(robot.home)
     lower, upper = plant.GetPositionLowerLimits(), plant.GetPositionUpperLimits()
     assert (home > lower + 0.3).all()
     assert (home < upper - 0.3).all()
-    X = alone.flange(home)
+    X = arm.flange(home)
     assert X.rotation().matrix()[2, 2] < -0.99
     assert X.translation()[0] > 0.3
 
 
-def test_tool_turn_aligns_the_tool_with_the_base_at_home(alone):
-    """The last joint is in the middle of its range."""
-    robot, plant = alone.robot, alone.plant
+def test_tool_turn_aligns_the_tool_with_the_base_at_home(arm):
+    """The tool's yaw is within 16 degrees of zero when the last joint is in the middle of its range."""
+    robot, plant = arm.robot, arm.plant
     q = np.array(robot.home)
     q[-1] = 0.5 * (plant.GetPositionLowerLimits()[-1] + plant.GetPositionUpperLimits()[-1])
-    R = alone.flange(q).rotation() @ RotationMatrix.MakeZRotation(robot.tool_turn)
+    R = arm.flange(q).rotation() @ RotationMatrix.MakeZRotation(robot.tool_turn)
     assert abs(np.rad2deg(RollPitchYaw(R @ RotationMatrix.MakeXRotation(np.pi)).yaw_angle())) < 16.0
 
 
-def test_robot_names_the_source_of_its_numbers(alone):
-    assert len(alone.robot.source) > 40
+def test_robot_has_a_source_of_its_data(arm):
+    assert len(arm.robot.source) > 40
 
 
-def test_models_reference_no_remote_files(alone):
-    text = alone.robot.model.read_text()
+def test_robot_models_reference_no_remote_files(arm):
+    text = arm.robot.model.read_text()
     assert not re.search(r"package:|https?:(?!//drake\.mit\.edu)|mesh ", text)
 
 
-def test_register_refuses_what_is_no_end_effector():
+def test_register_end_effector_refuses_other_objects():
     with pytest.raises(InputError, match="an end effector is registered as an EndEffector object, not 3"):
         register_end_effector(3)
