@@ -582,8 +582,8 @@ def run_checker(folder, capsys, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["checker.py", str(folder)])
     try:
         runpy.run_path(checker.__file__, run_name="__main__")
-    except SystemExit as ended:
-        return ended.code, capsys.readouterr().out
+    except SystemExit as error:
+        return error.code, capsys.readouterr().out
     return 0, capsys.readouterr().out
 
 
@@ -595,6 +595,12 @@ def test_checker_prints_usage_when_arguments_are_wrong(arguments, capsys, monkey
     assert capsys.readouterr().out == "usage: python checker.py FOLDER [KEY_FILE]\n"
 
 
+MALFORMED = {
+    "claims as a list": lambda c: {**c, CERTIFICATE: b"[]"},
+    "claims as a number": lambda c: {**c, CERTIFICATE: b"3"},
+    "digests as a list": lambda c: {**c, CERTIFICATE: seal(json.loads(c[CERTIFICATE]) | {"digests": []})},
+    "a horizon as text": lambda c: change_data(c, "primitive.npz", horizon=lambda _: "long"),
+}
 UNREADABLE = {
     "100 bytes of the claims": lambda c: {**c, CERTIFICATE: c[CERTIFICATE][:100]},
     "claims that are not UTF-8": lambda c: {**c, CERTIFICATE: bytes(range(256))},
@@ -603,27 +609,13 @@ UNREADABLE = {
     "no files": lambda c: {},
 }
 
-MALFORMED = {
-    "claims as a list": lambda c: {**c, CERTIFICATE: b"[]"},
-    "claims as a number": lambda c: {**c, CERTIFICATE: b"3"},
-    "digests as a list": lambda c: {**c, CERTIFICATE: seal(json.loads(c[CERTIFICATE]) | {"digests": []})},
-    "a horizon as text": lambda c: change_data(c, "primitive.npz", horizon=lambda _: "long"),
-}
 
-
-@pytest.mark.parametrize("content", MALFORMED)
-def test_checker_rejects_invalid_content(valid_files, content, tmp_path, capsys, monkeypatch):
-    code, out = run_checker(write(tmp_path, MALFORMED[content](valid_files)), capsys, monkeypatch)
-    assert code == 1
-    assert out.startswith("no: ")
-    assert out.count("\n") == 1
-
-
-@pytest.mark.parametrize("content", UNREADABLE)
-def test_checker_reports_unreadable_files_with_exit_code_2(valid_files, content, tmp_path, capsys, monkeypatch):
-    code, out = run_checker(write(tmp_path, UNREADABLE[content](valid_files)), capsys, monkeypatch)
-    assert code == 2
-    assert out.startswith("no: the files make no sense")
+@pytest.mark.parametrize("content", MALFORMED | UNREADABLE)
+def test_checker_exits_with_1_or_2_for_invalid_files(valid_files, content, tmp_path, capsys, monkeypatch):
+    folder = write(tmp_path, (MALFORMED | UNREADABLE)[content](valid_files))
+    code, out = run_checker(folder, capsys, monkeypatch)
+    assert code == (1 if content in MALFORMED else 2)
+    assert out.startswith("no: " if content in MALFORMED else "no: the files make no sense")
     assert out.count("\n") == 1
 
 
