@@ -63,7 +63,7 @@ CASES = {
 
 @cache
 def certify_case(name):
-    """Return a loop of `CASES` and its bounds; the budgets are 1.5 times the largest ones that an adversary reached."""
+    """Return a loop of `CASES` and its bounds; the budgets are 1.5 times the excess and residue of an attack."""
     loop = make_loop(*CASES[name], correlation=0.5)
     attack = Adversary(loop, np.ones(STEPS, bool)).attack(30 * STEPS)
     return loop, certify(loop, Budget(1.5 * attack.excess + 0.01, 1.5 * attack.residue))

@@ -1,4 +1,4 @@
-"""Entry points of installed packages: a broken entry point is refused when it is used, and is not usable."""
+"""Entry points of installed packages: discovery, name conflicts, and errors of broken entry points."""
 
 import sys
 

@@ -107,7 +107,7 @@ def test_make_solids_refuses_faces_that_cross():
         make_solids(Part(Path("x.stl"), ((tetrahedron, flat),)))
 
 
-def test_overlap_error_suggests_a_distance_of_shrinking(tmp_path):
+def test_overlap_error_suggests_a_shrink_distance(tmp_path):
     plug, socket = load("square_peg", tmp_path)
     check_target(plug, socket)
     shifted = plug.transform(np.eye(3), np.array([1.5e-4, 0.0, 0.0]))  # 0.15 mm with a clearance of 0.1 mm

@@ -52,13 +52,10 @@ def test_find_contradiction_returns_contradictory_constraints(constraints, indic
     "constraints",
     [
         [BOX, UPRIGHT, UPRIGHT],
-        [
-            ac.FixedOrientation((0.0, 45.0, 0.0)),
-            ac.TiltLimits("world", -60.0, -30.0),
-        ],  # satisfied on the opposite side of the axis
+        [ac.FixedOrientation((0.0, 45.0, 0.0)), ac.TiltLimits("world", -60.0, -30.0)],  # on the other side of the axis
         [ac.TiltLimits("world", -180.0, -179.0), ac.TiltLimits("world", 179.0, 180.0)],
         [ac.TiltLimits("world", 10.0, 20.0), ac.TiltLimits("world", -20.0, -10.0, turns_along=True)],
-        # The sets of the next four constraints have a single point or edge in common.
+        # In each of the next four lists, the sets have a single point or edge in common.
         [ac.Box((0.005, -0.05, 0.0), (0.02, 0.05, 0.01)), ac.Cylinder("world", 0.0, 0.005)],
         [ac.HalfSpace((1.0, 0.0, 0.0), 0.1), ac.HalfSpace((-1.0, 0.0, 0.0), -0.1)],
         [ac.Funnel("world", 0.1, 0.1, 0.5), ac.KeepAbove(0.3)],

@@ -48,7 +48,7 @@ def test_validate_finds_an_unreachable_state():
 
 def test_validate_finds_a_transition_blocked_by_constraints():
     def change(data):
-        data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # [m]; the cylinder keeps the distance above 0.06 m
+        data["states"]["far"]["transitions"][0]["below_m"] = 0.05  # [m]; the cylinder's smallest radius is 0.06 m
 
     assert any("never fires" in message and "constraints" in message for message in errors(change))
 

@@ -114,7 +114,7 @@ def test_firm_search_commands_a_deeper_pose_than_a_light_search():
 
 
 @pytest.mark.parametrize(
-    ("session", "num_steps"),  # number of first poses that are compared to 1e-6
+    ("session", "num_steps"),  # number of first poses that are compared with a tolerance of 1e-6
     [(generator.INSERT_SESSION, 60), (generator.SEARCH_SESSION, 20), (generator.FIRM_SEARCH_SESSION, 20)],
     ids=["insertion", "search", "firm search on the arm"],
 )
