@@ -109,17 +109,17 @@ $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"
 	touch $@
 
-# metaworld and robosuite need an older MuJoCo than this package's extra: neither Drake nor that extra is installed here.
-# robosuite's own requirements have a whole-body inverse kinematics that needs NumPy 1 and that no task here uses.
+# metaworld and robosuite need an older MuJoCo than the extra `mujoco`. Neither Drake nor that extra is installed here.
+# robosuite is installed without its requirements: one, a whole-body inverse kinematics, needs NumPy 1 and is not used here.
 $(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
 	$(PYTHON) -m venv $(OUTSIDE)
 	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check -r research/outside_envs/requirements.txt -e .
 	$(OUTSIDE)/bin/python -m pip install -qq --disable-pip-version-check --no-deps robosuite==1.5.2
 	touch $@
 
-# pip would compile with one core, and the tests of other packages too. What is left out is compiled when it is imported.
+# Bytecode is compiled separately: pip uses one core and compiles the tests of packages, too.
 $(VENV)/.ready: pyproject.toml setup.py constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]"
-	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true  # some packages have templates that are no Python
+	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true  # some packages contain templates that are not Python
 	touch $@
