@@ -1,4 +1,4 @@
-"""A bead on a wire with a goal and a wall: the smallest environment that reports what guiderail's own report."""
+"""Minimal environment with the `info` and trace of guiderail's environments: a point moves to a goal up to a wall."""
 
 from types import SimpleNamespace
 

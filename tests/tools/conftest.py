@@ -3,8 +3,8 @@ from bead_runs import _bead_run, bead_config, bead_run  # noqa: F401
 
 
 @pytest.fixture(autouse=True, scope="session")
-def plain_pictures():
-    """Skip the layout of labels, which takes half of the time of a picture; a training's page shows one episode."""
+def simplify_pictures():
+    """Omit the layout of labels, half of the time of a picture, and show one episode on the page of a run."""
     from guiderail.tools.visualization import replay, style
 
     with pytest.MonkeyPatch.context() as patch:

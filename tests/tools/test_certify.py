@@ -37,7 +37,7 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
     key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
-    monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # it takes seconds
+    monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # the checker takes seconds
     for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
         verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
         assert verdict == f"no: the certificate's {name} is not that of NarrowPassage"
@@ -61,21 +61,21 @@ def test_certify_skill_accepts_demonstrations_alone(tmp_path):
     assert result["constrained_steps"] == 0
 
 
-def test_command_of_an_attack_violates_a_bound_if_it_is_nan(tmp_path, monkeypatch):
+def test_command_of_an_attack_violates_a_bound_when_nan(tmp_path, monkeypatch):
     attack = Adversary.attack
 
-    def failing(adversary, steps):
+    def attack_with_nan(adversary, steps):
         result = attack(adversary, steps)
         result.largest["pose"][3, 0] = np.nan
         return result
 
-    monkeypatch.setattr(Adversary, "attack", failing)
+    monkeypatch.setattr(Adversary, "attack", attack_with_nan)
     rows = certify_skill("NarrowPassage", COARSE | {"guidance": "kmp"}, out=tmp_path, attack=200)["attack"]
     assert sum(row["violations"] for row in rows) == 1
 
 
 @pytest.mark.parametrize(
-    ("of", "environment", "words"),
+    ("subject", "environment", "message"),
     [
         ("NarrowPassage", {"guidance": "residual"}, "cannot be certified"),
         ("NarrowPassage", {"guidance": "skgrl", "adaptive_history": True}, "of fixed length"),
@@ -83,46 +83,40 @@ def test_command_of_an_attack_violates_a_bound_if_it_is_nan(tmp_path, monkeypatc
         ("nowhere", {}, "no task"),
     ],
 )
-def test_certify_skill_refuses_other_guidance(tmp_path, of, environment, words):
-    with pytest.raises(InputError, match=words):
-        certify_skill(of, environment, out=tmp_path)
-
-
-def test_certify_skill_refuses_a_negative_start_offset(tmp_path):
-    with pytest.raises(InputError, match="not negative"):
-        certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, start_within=-1.0)
-
-
-def test_certify_skill_refuses_a_negative_attack(tmp_path):
-    with pytest.raises(InputError, match="number of steps"):
-        certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path, attack=-1)
-
-
-def test_certify_skill_refuses_a_task_without_out():
-    with pytest.raises(InputError, match="--out"):
-        certify_skill("NarrowPassage", {"guidance": "kgrl"})
+def test_certify_skill_refuses_other_guidance(tmp_path, subject, environment, message):
+    with pytest.raises(InputError, match=message):
+        certify_skill(subject, environment, out=tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("difficulty", "far"),
-    [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds of starts that would be farther than there are any
+    ("arguments", "message"),
+    [({"start_within": -1.0}, "not negative"), ({"attack": -1}, "number of steps"), ({"out": None}, "--out")],
 )
-def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, far):
-    """Episodes begin next to the demonstrations, and so does the history of sKGRL."""
+def test_certify_skill_refuses_invalid_arguments(arguments, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        certify_skill("NarrowPassage", {"guidance": "kgrl"}, **{"out": tmp_path, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("difficulty", "clipped_seeds"),
+    [("standard", (755, 1950)), ("hard", (1352, 8387))],  # seeds whose sampled start offset is clipped to its limit
+)
+def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, clipped_seeds):
+    """Robot and history of sKGRL begin with an offset from the demonstrations."""
     monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 10_000)
     environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
     result = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert result["checker"] == "yes"
     assert result["start_within"] == pytest.approx([0.04, 0.04] if difficulty == "standard" else [0.12, 0.12])
-    claims = json.loads((tmp_path / "certificate.json").read_text())
+    certificate = json.loads((tmp_path / "certificate.json").read_text())
     env = make_env("NarrowPassage", **environment)
-    for seed in (*far, *range(1_000_000, 1_000_004)):
+    for seed in (*clipped_seeds, *range(1_000_000, 1_000_004)):
         env.reset(seed=seed, options={"held_out": True})
         while not any(env.step(np.zeros(2))[2:4]):
             pass
         y, period = env.trace.commanded, env.task.control_period
         for regime in ("free", "budgeted"):
-            bounds = {name: np.array(claims[regime][name])[: len(y)] for name in ("lower", "upper", "speed")}
+            bounds = {name: np.array(certificate[regime][name])[: len(y)] for name in ("lower", "upper", "speed")}
             assert (y >= bounds["lower"] - 1e-7).all()
             assert (y <= bounds["upper"] + 1e-7).all()
             assert (np.abs(np.diff(y, axis=0)) / period <= bounds["speed"][1:] + 1e-6).all()
@@ -135,20 +129,20 @@ def declared_start(task, **environment):
     return _declared_start(config, config.make_task().reference().num_outputs)
 
 
-def test_start_is_within_the_declared_offset():
+def test_declared_start_adds_pose_bias_and_start_offset():
     assert not declared_start("BncConnector").any()
     np.testing.assert_allclose(declared_start("BncConnector", start_offset_max=0.002), np.full(6, 0.002))
     np.testing.assert_allclose(declared_start("BncConnector", pose_bias=0.001), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
-    both = declared_start("BncConnector", pose_bias=0.001, start_offset_max=0.002)
-    np.testing.assert_allclose(both, [3e-3, 3e-3, 3e-3, 2e-3, 2e-3, 2e-3])
+    combined = declared_start("BncConnector", pose_bias=0.001, start_offset_max=0.002)
+    np.testing.assert_allclose(combined, [3e-3, 3e-3, 3e-3, 2e-3, 2e-3, 2e-3])
 
 
 @pytest.mark.parametrize(
-    "far", [{"pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"pose_bias": 5e-4, "start_offset_max": 1e-3}]
+    "options", [{"pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"pose_bias": 5e-4, "start_offset_max": 1e-3}]
 )
-def test_history_begins_within_the_declared_offset(far):
-    env = make_env("BncConnector", guidance="skgrl", **far)
-    within = declared_start("BncConnector", **far)
+def test_history_begins_within_the_declared_offset(options):
+    env = make_env("BncConnector", guidance="skgrl", **options)
+    within = declared_start("BncConnector", **options)
     declared = env.task.declaration
     start = declared.constraints().nearest(declared.reference().means[0])
     farthest = np.zeros(6)
@@ -156,8 +150,8 @@ def test_history_begins_within_the_declared_offset(far):
         env.reset(seed=seed, options={"held_out": True})
         history = env.task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("history")
         context = history.GetMyContextFromRoot(env.simulator.get_context())
-        beside = history.get_history_output_port().Eval(context).reshape(-1, 6) - start
-        farthest = np.maximum(farthest, np.abs(beside).max(axis=0))
+        offset = history.get_history_output_port().Eval(context).reshape(-1, 6) - start
+        farthest = np.maximum(farthest, np.abs(offset).max(axis=0))
     env.close()
     assert (farthest <= within + 1e-9).all()
     assert (farthest[:2] > 0.5 * within[:2]).all()
@@ -170,7 +164,7 @@ def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_pat
 
 
 def test_via_points_move_the_motion_but_not_its_start(tmp_path):
-    """A reset starts at the demonstrations, not at via-points."""
+    """A reset starts at the demonstrations, not at a via-point of the first step."""
     via = [0.0, 0.36, 0.1]
     environment = {"guidance": "kgrl", "via_points": via, "control_period": 0.1}
     certify_skill("NarrowPassage", environment, out=tmp_path)

@@ -1,4 +1,4 @@
-"""Declarations of tasks, guidance and stations, compared with what these provide."""
+"""Declared values of tasks, guidance and stations, compared with the registered entries."""
 
 import subprocess
 import sys
@@ -17,15 +17,15 @@ TASKS_WITH_OPTIONS = [name for name in TASKS.names() if TASKS.is_packaged(name) 
 
 
 @pytest.mark.parametrize(("registry", "noun"), [(TASKS, "task"), (GUIDANCE, "guidance"), (STATIONS, "station")])
-def test_declared_values_are_those_of_the_entries(registry, noun):
+def test_declared_values_equal_the_values_of_the_entries(registry, noun):
     folders = {"task": ("tasks",), "guidance": ("guidance",), "station": ("stations", "hardware")}[noun]
     packages = [f"guiderail.diagrams.{folder}" for folder in folders]
-    fresh = Registry(noun, package=packages, decorator=f"register_{noun}")  # none of its entries is imported
-    for name in fresh.names():
+    declarations = Registry(noun, package=packages, decorator=f"register_{noun}")  # imports no entry
+    for name in declarations.names():
         entry = registry.get(name)
         for attribute in ("Options", "options", "rewards", "observations", "workcell_kind", "needs", "label"):
-            if fresh.declares(name, attribute):
-                assert fresh.declared(name, attribute) == getattr(entry, attribute), (name, attribute)
+            if declarations.declares(name, attribute):
+                assert declarations.declared(name, attribute) == getattr(entry, attribute), (name, attribute)
 
 
 def test_every_option_of_an_environment_is_declared():
@@ -39,19 +39,19 @@ def test_every_option_of_an_environment_is_declared():
 
 
 @pytest.mark.parametrize("name", TASKS_WITH_OPTIONS)
-def test_check_accepts_what_an_environment_accepts(name):
+def test_check_accepts_the_options_of_every_difficulty(name):
     for difficulty in TASKS.get(name).difficulties:
         check_declared_options(name, EnvConfig.resolve(name, {"difficulty": difficulty}).options)
 
 
 @pytest.mark.parametrize("options", [{"nope": 1}, {"reward": "nope"}, {"friction": "9"}, {"kernel": "nope"}])
-def test_check_refuses_what_an_environment_refuses(options):
+def test_check_and_environment_refuse_the_same_options(options):
     for check in (check_declared_options, EnvConfig.resolve):
         with pytest.raises(InputError, match=next(iter(options))):
             check("BncConnector", options)
 
 
-def test_models_of_options_import_no_drake():
+def test_option_models_import_no_slow_package():
     code = """
 import sys
 from guiderail.tools.environments import declared_models

@@ -1,4 +1,4 @@
-"""Server of an environment for programs in another Python environment."""
+"""Environment server for programs of another Python installation."""
 
 import io
 import json
@@ -21,7 +21,7 @@ def server():
     return EnvServer(open_environment("NarrowPassage", OPTIONS))
 
 
-def test_answers_are_those_of_the_environment(server):
+def test_answers_equal_the_steps_of_the_environment(server):
     env = gymnasium.make("guiderail/NarrowPassage-v0", **OPTIONS)
     observation, _ = env.reset(seed=3)
     assert server.answer({"reset": 3})["observation"] == observation.tolist()
@@ -33,7 +33,7 @@ def test_answers_are_those_of_the_environment(server):
     assert not answer["is_done"]
 
 
-def test_seed_determines_the_values_that_are_hidden_for_a_run():
+def test_seed_determines_the_hidden_offset_of_a_run():
     options = {"guidance": "kgrl", "station": "gantry", "action_repeat": 10}
     env = gymnasium.make("guiderail/BncConnector-v0", **options)
     offsets = [env.reset(seed=3)[1]["jack_offset"]]
@@ -69,7 +69,7 @@ def test_end_of_the_episode_is_reported(server):
         {"x": 1},
     ],
 )
-def test_wrong_requests_are_refused_and_nothing_moves(server, request_):
+def test_invalid_request_is_refused_and_changes_no_state(server, request_):
     before = server.answer({"reset": 0})
     assert "error" in server.answer(request_)
     assert server._state() == before
@@ -85,7 +85,7 @@ def test_lines_are_answered_until_the_input_ends(server):
     assert "one line of JSON" in third["error"]
 
 
-def test_line_that_is_too_long_has_one_answer(server):
+def test_line_that_is_too_long_is_answered_with_one_error(server):
     answers = io.StringIO()
     padded = " " * MAX_LINE + '{"reset": 1}'
     serve(server, io.StringIO(f'{padded}\n{{"reset": 1}}\n{padded}'), answers)
@@ -96,11 +96,12 @@ def test_line_that_is_too_long_has_one_answer(server):
 
 
 @pytest.mark.parametrize(
-    ("opened", "words"), [(partial(open_environment, options={}), "cannot be read"), (make_env, "there is no task")]
+    ("open_name", "message"),
+    [(partial(open_environment, options={}), "cannot be read"), (make_env, "there is no task")],
 )
-def test_name_that_is_too_long_is_refused(opened, words):
-    with pytest.raises(InputError, match=words):
-        opened("x" * 300)
+def test_name_that_is_too_long_is_refused(open_name, message):
+    with pytest.raises(InputError, match=message):
+        open_name("x" * 300)
 
 
 def test_real_robot_is_refused():

@@ -1,4 +1,4 @@
-"""Output paths that cannot be written are refused before anything is computed for them."""
+"""Checks of output paths before a computation, and removal of partial files of processes that were killed."""
 
 import os
 import subprocess
@@ -34,13 +34,12 @@ def test_check_refuses_a_path_below_a_file(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["", "."])
-def test_current_folder_with_files_is_no_folder_for_a_run(path, tmp_path, monkeypatch):
+def test_current_folder_is_refused_for_a_run_when_not_empty(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     refuse_existing_run(Path(path))
     (tmp_path / "file").touch()
-    with pytest.raises(
-        InputError, match=r"^a run needs a folder of its own, and the current folder is not empty: name"
-    ):
+    message = "^a run needs a folder of its own, and the current folder is not empty: name"
+    with pytest.raises(InputError, match=message):
         refuse_existing_run(Path(path))
 
 
@@ -51,9 +50,9 @@ def test_check_refuses_a_name_that_is_too_long(tmp_path):
 
 def test_check_refuses_an_existing_folder(tmp_path):
     (tmp_path / "page.html").mkdir()
-    for refused in (check_writable, check_page):
+    for check in (check_writable, check_page):
         with pytest.raises(InputError, match="is a folder"):
-            refused(tmp_path / "page.html")
+            check(tmp_path / "page.html")
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "config.yaml", "page", "."])
@@ -64,16 +63,16 @@ def test_check_page_refuses_another_ending(name, tmp_path):
 
 @pytest.mark.parametrize("seed", [-1, 2**31])
 def test_seed_is_refused_when_out_of_range(seed, bead_run, tmp_path):
-    for refused in (
+    for use_seed in (
         lambda: check_seed(seed),
         lambda: EpisodeSpec.of_policy(bead_run, seed=seed),
         lambda: evaluate(bead_run, save=tmp_path / "x.npz", seed=seed),
     ):
         with pytest.raises(InputError, match=f"a seed is a whole number from 0 to {2**31 - 1}, not {seed}"):
-            refused()
+            use_seed()
 
 
-def test_evaluate_checks_the_output_before_it_runs(bead_run, tmp_path, monkeypatch):
+def test_evaluate_checks_the_output_before_loading_a_policy(bead_run, tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setattr(Policy, "load", lambda path: pytest.fail("the policy is loaded before the output is checked"))
     with pytest.raises(InputError, match="cannot be written"):
@@ -93,32 +92,32 @@ def test_lock_removes_partial_files_of_ended_processes(ended_process, tmp_path):
     for number in (ended_process, os.getpid(), 10**30):
         (tmp_path / "checkpoint" / f".state.safetensors.{number}.part").touch()
         (tmp_path / f".peg.{number}.part" / "parts").mkdir(parents=True)
-    (tmp_path / "checkpoint" / ".own.part").touch()  # `write_atomically` gives no such name
+    (tmp_path / "checkpoint" / ".own.part").touch()  # `write_atomically` creates no file of this name
     with RunFolder(tmp_path).locked():
-        left = {path.name for path in tmp_path.rglob("*")}
-    assert left == {"checkpoint", ".own.part", LOCK}
+        remaining = {path.name for path in tmp_path.rglob("*")}
+    assert remaining == {"checkpoint", ".own.part", LOCK}
 
 
-def test_partial_files_of_running_processes_stay(ended_process, tmp_path):
-    alive = os.getppid()
-    another = tmp_path / "another_run"
-    kept = [
-        tmp_path / f".report.html.{alive}.part",
-        another / "checkpoint" / f".state.safetensors.{ended_process}.part",
+def test_partial_files_of_running_processes_are_not_removed(ended_process, tmp_path):
+    running_process, another_run = os.getppid(), tmp_path / "another_run"
+    paths = [
+        tmp_path / f".report.html.{running_process}.part",
+        tmp_path / f".peg.{running_process}.part" / f".part.yaml.{ended_process}.part",
+        another_run / "checkpoint" / f".state.safetensors.{ended_process}.part",
+        another_run / LOCK,
     ]
-    kept += [tmp_path / f".peg.{alive}.part" / f".part.yaml.{ended_process}.part", another / LOCK]
-    for path in kept:
+    for path in paths:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.touch()
     remove_partial_files(tmp_path)
-    assert all(path.exists() for path in kept)
+    assert all(path.exists() for path in paths)
 
 
-def test_atomic_folder_removes_what_a_killed_process_left(ended_process, tmp_path):
+def test_atomic_folder_removes_partial_files_of_a_killed_process(ended_process, tmp_path):
     for name in (f".peg.{ended_process}.part", f".pegs.{ended_process}.part", f".peg.{os.getppid()}.part", ".peg.part"):
         (tmp_path / name / "parts").mkdir(parents=True)
     with atomic_folder(tmp_path / "peg") as folder:
         (folder / "file").touch()
-    left = {path.name for path in tmp_path.iterdir()}
-    assert left == {"peg", f".pegs.{ended_process}.part", f".peg.{os.getppid()}.part", ".peg.part"}
+    remaining = {path.name for path in tmp_path.iterdir()}
+    assert remaining == {"peg", f".pegs.{ended_process}.part", f".peg.{os.getppid()}.part", ".peg.part"}
     assert [path.name for path in (tmp_path / "peg").iterdir()] == ["file"]

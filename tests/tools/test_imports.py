@@ -1,4 +1,4 @@
-"""Files that name code, such as the configuration of a run, execute it only if the user trusts them for that call."""
+"""Modules named in a file, such as the configuration of a run, are executed only with --trust-imports."""
 
 import sys
 from types import ModuleType
@@ -15,20 +15,20 @@ from guiderail.tools.learning.train import Run
 
 @pytest.fixture
 def canary(tmp_path):
-    """Return a module file that writes next to itself when it is executed, and the file it writes."""
+    """Return the path of a module, and the path of the file that the module creates when executed."""
     file = tmp_path / "stored_module.py"
     file.write_text("from pathlib import Path\nPath(__file__).with_name('executed').touch()\n")
     return file, tmp_path / "executed"
 
 
-def name_imports(run, *modules):
+def write_imports(run, *modules):
     file = run / "config.yaml"
     file.write_text(yaml.safe_dump(yaml.safe_load(file.read_text()) | {"imports": list(map(str, modules))}))
 
 
 def test_run_configuration_executes_nothing_without_trust(bead_run, canary):
     file, executed = canary
-    name_imports(bead_run, file)
+    write_imports(bead_run, file)
     with pytest.raises(InputError, match=r"stored_module.py.*--trust-imports"):
         RunFolder(bead_run).config()
     assert not executed.exists()
@@ -37,16 +37,16 @@ def test_run_configuration_executes_nothing_without_trust(bead_run, canary):
     assert executed.exists()
     executed.unlink()
     file.write_text(file.read_text() + "# changed after it was trusted\n")
-    RunFolder(bead_run).config()  # the file was named in this process
+    RunFolder(bead_run).config()  # trusted, because this process has imported the file
 
 
 def test_file_that_the_user_names_needs_no_trust(bead_run, canary):
     file, executed = canary
-    name_imports(bead_run, file)
+    write_imports(bead_run, file)
     import_modules([str(file)])
     executed.unlink()
     RunFolder(bead_run).config()
-    assert not executed.exists(), "it was executed already"
+    assert not executed.exists(), "the module was executed twice"
 
 
 @pytest.mark.parametrize("name", ["stored_module", "stored_module.part", "json.tool"])
@@ -60,7 +60,7 @@ def test_module_that_is_not_loaded_needs_trust(name, canary, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["stored_module/part", "../stored_module", "/etc/stored_module", "", ".x", "a..b"])
-def test_path_is_no_module(name, canary, monkeypatch):
+def test_path_is_refused_as_the_name_of_a_module(name, canary, monkeypatch):
     file, executed = canary
     monkeypatch.syspath_prepend(file.parent)
     with trust_imports(), pytest.raises(InputError, match="there is no"):
@@ -68,11 +68,11 @@ def test_path_is_no_module(name, canary, monkeypatch):
     assert not executed.exists()
 
 
-def test_folder_without_code_is_no_module(tmp_path, monkeypatch):
-    (tmp_path / "recordings_of_mine").mkdir()
+def test_folder_without_code_is_refused_as_a_module(tmp_path, monkeypatch):
+    (tmp_path / "lab_recordings").mkdir()
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(InputError, match="there is no module, file or task folder recordings_of_mine"):
-        import_modules(["recordings_of_mine"])
+    with pytest.raises(InputError, match="there is no module, file or task folder lab_recordings"):
+        import_modules(["lab_recordings"])
 
 
 def test_loaded_module_needs_no_trust(tmp_path):
@@ -82,16 +82,16 @@ def test_loaded_module_needs_no_trust(tmp_path):
 def test_printed_evaluate_command_is_trusted_and_quoted(bead_run, canary):
     run = bead_run.rename(bead_run.with_name("run one"))
 
-    def printed():
+    def printed_arguments():
         return Run(run).summary["success_in_training"].partition("guiderail evaluate ")[2]
 
-    assert printed() == f"'{run}'"
-    name_imports(run, canary[0])
-    assert printed() == f"'{run}' --trust-imports"
+    assert printed_arguments() == f"'{run}'"
+    write_imports(run, canary[0])
+    assert printed_arguments() == f"'{run}' --trust-imports"
     assert not canary[1].exists()
     (run / "task.yaml").touch()
-    name_imports(run, run)  # a task folder holds no code
-    assert printed() == f"'{run}'"
+    write_imports(run, run)  # a task folder contains no code
+    assert printed_arguments() == f"'{run}'"
 
 
 COMMANDS = (
@@ -101,15 +101,15 @@ COMMANDS = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_command_executes_nothing_from_a_folder_without_trust(words, bead_run, canary, capsys, tmp_path):
+@pytest.mark.parametrize("arguments", COMMANDS, ids=" ".join)
+def test_command_executes_nothing_from_a_folder_without_trust(arguments, bead_run, canary, capsys, tmp_path):
     file, executed = canary
-    name_imports(bead_run, file)
+    write_imports(bead_run, file)
     study = tmp_path / "study.yaml"
     study.write_text(f"name: s\ntask: Bead\nmethods: {{a: {{}}}}\nseeds: [0]\nimports: ['{file}']\n")
-    places = {"RUN": str(bead_run), "STUDY": str(study), "OUT": str(tmp_path / "out")}
+    paths = {"RUN": str(bead_run), "STUDY": str(study), "OUT": str(tmp_path / "out")}
     with pytest.raises(SystemExit) as end:
-        main([places.get(word, word) for word in words])
+        main([paths.get(argument, argument) for argument in arguments])
     message = capsys.readouterr().err
     assert end.value.code == 2
     assert str(file) in message
@@ -119,7 +119,7 @@ def test_command_executes_nothing_from_a_folder_without_trust(words, bead_run, c
 
 def test_trust_ends_with_the_command(bead_run, canary, capsys, tmp_path):
     file, executed = canary
-    name_imports(bead_run, file)
+    write_imports(bead_run, file)
     with pytest.raises(SystemExit) as end:
         main(["report", str(bead_run), "--out", str(tmp_path / "report.html"), "--trust-imports"])
     assert end.value.code == 0

@@ -1,4 +1,4 @@
-"""Tools on the task NarrowPassage, from training to the files of a run."""
+"""Training, evaluation and visualization of a run on the task NarrowPassage."""
 
 from dataclasses import replace
 
@@ -67,12 +67,12 @@ def test_evaluation_includes_the_demonstration_alone(trained):
 def test_held_out_starts_differ_and_follow_the_seed():
     env = make_environment("NarrowPassage", {"guidance": "kmp"})
     env.reset(seed=0)
-    usual = env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy()
+    training_start = env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy()
     starts = []
     for seed in (1, 2, 1):
         env.reset(seed=seed, options={"held_out": True})
         starts.append(env.unwrapped._pose_port.Eval(env.unwrapped.simulator.get_context()).copy())
-    assert not np.array_equal(usual, starts[0])
+    assert not np.array_equal(training_start, starts[0])
     assert not np.array_equal(starts[0], starts[1])
     np.testing.assert_array_equal(starts[0], starts[2])
 
@@ -88,8 +88,8 @@ def test_replay_is_one_self_contained_page(trained):
 
 
 def test_image_has_the_format_of_its_ending(trained, tmp_path, monkeypatch):
-    watched = camera.record_frames(EpisodeSpec.of_policy(trained.path), camera.ROWS * camera.COLUMNS)
-    monkeypatch.setattr(camera, "record_frames", lambda *_: watched)  # once for both
+    frames = camera.record_frames(EpisodeSpec.of_policy(trained.path), camera.ROWS * camera.COLUMNS)
+    monkeypatch.setattr(camera, "record_frames", lambda *_: frames)  # one episode for both files
     for ending, magic in ((".png", b"\x89PNG"), (".jpg", b"\xff\xd8\xff")):
         picture = tmp_path / f"film{ending}"
         row = camera.write_image(picture, EpisodeSpec.of_policy(trained.path))
@@ -97,11 +97,18 @@ def test_image_has_the_format_of_its_ending(trained, tmp_path, monkeypatch):
         assert picture.read_bytes().startswith(magic)
         image = imread(picture)
         assert image.shape[0] > 400
-        assert image[..., :3].std() / image.max() > 0.05  # it is not blank
+        assert image[..., :3].std() / image.max() > 0.05  # the image is not blank
+
+
+@pytest.fixture(scope="module")
+def recorded(trained):
+    """Return an episode's row of metrics and its video frames."""
+    return camera._run(EpisodeSpec.of_policy(trained.path), camera.MAX_VIDEO_FRAMES)
 
 
 @pytest.mark.parametrize("ending", [".webp", ".gif"])
-def test_video_is_an_animation_in_real_time(ending, trained, tmp_path):
+def test_video_is_an_animation_in_real_time(ending, recorded, trained, tmp_path, monkeypatch):
+    monkeypatch.setattr(camera, "_run", lambda *_: recorded)
     row = camera.write_video(tmp_path / f"video{ending}", EpisodeSpec.of_policy(trained.path))
     with Image.open(tmp_path / f"video{ending}") as video:
         assert video.n_frames > 10
@@ -122,7 +129,7 @@ def test_visualization_refuses_wrong_input_and_writes_nothing(trained, tmp_path)
 
 
 def test_saved_episodes_can_be_used_as_demonstrations(trained, tmp_path):
-    file = tmp_path / "again.npz"
+    file = tmp_path / "saved.npz"
     assert evaluate(trained.path, episodes=2, save=file)["saved"] == 2
     assert Demonstrations.load(file).num_demonstrations == 2
     assert validate_demonstrations(file)["demonstrations"] == 2
@@ -131,8 +138,8 @@ def test_saved_episodes_can_be_used_as_demonstrations(trained, tmp_path):
 def test_tube_has_a_constant_radius():
     points = np.column_stack([np.linspace(0, 1, 31), np.sin(np.linspace(0, 3, 31)), np.zeros(31)])
     vertices, faces = tube(points, 0.01)
-    kept = np.vstack([points[:-1:3], points[-1:]])
-    distance = np.linalg.norm(vertices.reshape(len(kept), -1, 3) - kept[:, None], axis=2)
+    centers = np.vstack([points[:-1:3], points[-1:]])  # the tube has a ring of vertices at every third point
+    distance = np.linalg.norm(vertices.reshape(len(centers), -1, 3) - centers[:, None], axis=2)
     np.testing.assert_allclose(distance, 0.01, rtol=1e-9)
     assert faces.min() == 0
     assert faces.max() == len(vertices) - 1

@@ -1,4 +1,4 @@
-"""Messages about mistakes in the declaration of a task."""
+"""Task that a user declares: effects of the declaration, and messages about mistakes in it."""
 
 import sys
 from dataclasses import replace
@@ -32,7 +32,7 @@ NUM_STEPS = 10
 
 
 class Own(Task):
-    """Straight up through a wide gap."""
+    """Task whose reference moves straight up through a wide gap."""
 
     workcell_kind = "plane"
     num_steps = NUM_STEPS
@@ -58,7 +58,7 @@ class Own(Task):
         return {}
 
 
-class Ignorant(Task):
+class TaskWithoutReference(Task):
     """Task that provides nothing to guidance."""
 
     workcell, observation_terms, reward_terms = Own.workcell, Own.observation_terms, Own.reward_terms
@@ -66,7 +66,7 @@ class Ignorant(Task):
 
 
 @pytest.fixture(autouse=True)
-def no_other_test_has_it():
+def remove_task():
     yield
     TASKS._entries.pop("lab/Own", None)
     gymnasium.registry.pop("lab/Own-v0", None)
@@ -79,11 +79,11 @@ def first_step(**options):
 
 
 def declare(of=Own, **attributes):
-    return register_task("lab/Own")(type("Mine", (of,), attributes))
+    return register_task("lab/Own")(type("Declared", (of,), attributes))
 
 
 @pytest.mark.parametrize(
-    ("attributes", "says"),
+    ("attributes", "message"),
     [
         ({"Options": dict}, "Options of lab/Own must be a class made of Options"),
         ({"Reset": None}, "Reset of lab/Own must be a class made of ResetOptions"),
@@ -101,33 +101,32 @@ def declare(of=Own, **attributes):
         ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
     ],
 )
-def test_declaration_of_the_wrong_type_is_refused(attributes, says):
-    with pytest.raises(InputError, match=says):
+def test_declaration_of_the_wrong_type_is_refused(attributes, message):
+    with pytest.raises(InputError, match=message):
         declare(**attributes)
 
 
 @pytest.mark.parametrize(
-    ("attributes", "says"),
+    ("attributes", "message"),
     [
         ({"workcell_kind": "planes"}, "a workcell of the kind 'planes', which lab/Own has: did you mean plane"),
         (
-            {"of": Ignorant, "workcell_kind": "plane"},
+            {"of": TaskWithoutReference, "workcell_kind": "plane"},
             "no guidance can be built for lab/Own: write its reference",
         ),
         ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets the unknown option 'gapp'"),
         ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets the unknown option 'histroy': did you mean history"),
     ],
 )
-def test_task_without_a_possible_environment_is_refused(attributes, says):
+def test_task_without_a_possible_environment_is_refused(attributes, message):
     declare(**attributes)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         EnvConfig.resolve("lab/Own", {})
 
 
 def test_task_that_lacks_methods_is_refused_with_their_names():
-    with pytest.raises(
-        InputError, match=r"lab/Own lacks reset\(\), workcell\(\): every task must define these methods"
-    ):
+    message = r"lab/Own lacks reset\(\), workcell\(\): every task must define these methods"
+    with pytest.raises(InputError, match=message):
         declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
 
 
@@ -142,7 +141,7 @@ def test_scripted_policies_without_an_instance_are_accepted(kind):
     def hold(observation):
         return np.zeros(2)
 
-    declare(scripted_policies=kind(lambda *given: {"hold": hold}))
+    declare(scripted_policies=kind(lambda *arguments: {"hold": hold}))
     assert find_scripted_policy("lab/Own", "scripted") is hold
 
 
@@ -159,7 +158,7 @@ def test_settings_of_another_guidance_are_accepted():
 
 
 @pytest.mark.parametrize(
-    ("attributes", "says"),
+    ("attributes", "message"),
     [
         ({"reward": lambda self, pose: np.nan}, "reward term 'a' of lab/Own is not finite, but nan"),
         ({"reward": lambda self, pose: pose}, "reward term 'a' of lab/Own must be one number, and it is array"),
@@ -173,23 +172,23 @@ def test_settings_of_another_guidance_are_accepted():
             "the condition 'success' of lab/Own is called with .*pose.*, but its .* parameters .position",
         ),
         (
-            {"reset": lambda self, *given: None},
+            {"reset": lambda self, *arguments: None},
             "reset of lab/Own must return the sampled values by name, {} .*, not None",
         ),
     ],
 )
-def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, says):
+def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, message):
     declare(**attributes)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         first_step()
 
 
-HUGE = [RewardTerm(name, {"pose": 2}, lambda pose: 1e308) for name in "ab"]
+HUGE_TERMS = [RewardTerm(name, {"pose": 2}, lambda pose: 1e308) for name in "ab"]
 TERM = RewardTerm("a", {"pose": 2}, lambda pose: 0.0)
 
 
 @pytest.mark.parametrize(
-    ("method", "returned", "says"),
+    ("method", "returned", "message"),
     [
         ("reference", None, r"reference\(\) of lab/Own must return ReferenceTrajectory, not None"),
         ("reference", np.zeros((10, 2)), r"reference\(\) of lab/Own must return ReferenceTrajectory, not array"),
@@ -213,7 +212,7 @@ TERM = RewardTerm("a", {"pose": 2}, lambda pose: 0.0)
         ),
         ("reward_terms", [replace(TERM, value=3.0)], "reward term 'a' of lab/Own needs a function .*, not 3.0"),
         ("reward_terms", [replace(TERM, name=3)], r"a reward of lab/Own needs terms of different names, .*, not \[3\]"),
-        ("reward_terms", HUGE, "the sum of the reward terms of lab/Own is not finite, but inf"),
+        ("reward_terms", HUGE_TERMS, "the sum of the reward terms of lab/Own is not finite, but inf"),
         (
             "termination_terms",
             None,
@@ -222,15 +221,15 @@ TERM = RewardTerm("a", {"pose": 2}, lambda pose: 0.0)
         ("workcell", 5, r"workcell\(\) of lab/Own returns 5, which has no robot_radius: .* what station='plane' works"),
     ],
 )
-def test_method_that_returns_another_type_is_refused(method, returned, says):
+def test_method_that_returns_another_type_is_refused(method, returned, message):
     declare(**{method: lambda self, *arguments: returned})
-    with pytest.raises(InputError, match=says) as error:
+    with pytest.raises(InputError, match=message) as error:
         first_step()
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize(
-    ("attributes", "says"),
+    ("attributes", "message"),
     [
         ({"collision": 3.0}, "collision of lab/Own must be a Threshold, not 3.0"),
         (
@@ -262,20 +261,20 @@ def test_method_that_returns_another_type_is_refused(method, returned, says):
         ),
     ],
 )
-def test_wrong_attribute_or_parameters_are_refused(attributes, says):
+def test_wrong_attribute_or_parameters_are_refused(attributes, message):
     declare(**attributes)
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=message):
         first_step()
 
 
 def test_reward_that_overflows_in_a_step_is_refused():
-    declare(reward_terms=lambda self, num_actions: HUGE[:1])
+    declare(reward_terms=lambda self, num_actions: HUGE_TERMS[:1])
     with pytest.raises(InputError, match="the reward of 5 control steps overflows: scale it down"):
         first_step(action_repeat=5)
 
 
 @pytest.mark.parametrize(
-    ("observed", "says"),
+    ("terms", "message"),
     [
         ((), "the observation of lab/Own is empty: let observation_terms"),
         ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
@@ -301,18 +300,18 @@ def test_reward_that_overflows_in_a_step_is_refused():
         ((ObservationTerm("pose", entries=(True, False)),), "the entries .* are whole numbers from -2 to 1, not"),
     ],
 )
-def test_invalid_observation_term_is_refused(observed, says):
-    declare(observation_terms=lambda self: observed)
-    with pytest.raises(InputError, match=says):
+def test_invalid_observation_term_is_refused(terms, message):
+    declare(observation_terms=lambda self: terms)
+    with pytest.raises(InputError, match=message):
         make_env("lab/Own", guidance="kmp")
 
 
 def test_observation_is_centered_and_scaled_by_entry():
     declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
-    seen, _ = env.reset(seed=0)
+    observation, _ = env.reset(seed=0)
     x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
-    np.testing.assert_allclose(seen, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
+    np.testing.assert_allclose(observation, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "privileged", "rgb_image"])
@@ -324,7 +323,7 @@ def test_reward_term_with_a_reserved_name_is_refused(name):
 
 @pytest.mark.parametrize("name", INFO_KEYS)
 def test_reset_value_with_a_reserved_name_is_refused(name):
-    declare(reset=lambda self, *given: {name: -9.0})
+    declare(reset=lambda self, *arguments: {name: -9.0})
     env = make_env("lab/Own", guidance="kmp")
     with pytest.raises(InputError, match=f"reset of lab/Own returns a value named {name!r}, which is reserved"):
         env.reset(seed=0)
@@ -355,12 +354,12 @@ def test_observation_that_is_not_finite_is_refused(number):
 
 @pytest.mark.parametrize("number", [0, None])
 def test_invalid_num_steps_of_a_constructor_is_refused(number):
-    class Late(Own):
+    class SetInConstructor(Own):
         def __init__(self, config):
             super().__init__(config)
             self.num_steps = number
 
-    declare(of=Late, num_steps=np.int64(NUM_STEPS))
+    declare(of=SetInConstructor, num_steps=np.int64(NUM_STEPS))
     with pytest.raises(InputError, match=f"num_steps of lab/Own must be a whole number of at least 1, not {number}"):
         make_env("lab/Own", guidance="kmp")
 
@@ -376,9 +375,9 @@ def test_workcell_that_is_none_is_refused():
 def test_scope_is_training_without_held_out_conditions():
     declare()
     assert "conditions as in training" in evaluation_scope("lab/Own", {}, resample_offsets=False)
-    words = describe_task_options("lab/Own")
-    assert words["reset: held_out"].startswith("no effect")
-    assert words["reward"] == "the task has a single reward without a name"
+    options = describe_task_options("lab/Own")
+    assert options["reset: held_out"].startswith("no effect")
+    assert options["reward"] == "the task has a single reward without a name"
     declare(has_held_out_distribution=True)
     assert evaluation_scope("lab/Own", {}, resample_offsets=False) == "held-out starts"
     assert describe_task_options("lab/Own")["reset: held_out"].startswith("sample held-out conditions")
@@ -403,23 +402,16 @@ def test_own_task_is_fuzzed_with_every_guidance():
     declare()
     result = fuzz("lab/Own", episodes=3)
     assert result["failures"] == []
-    assert result["cases"].keys() <= {
-        "base_policy",
-        "kgrl",
-        "kgrl_base_policy",
-        "kmp",
-        "residual",
-        "residual_base_policy",
-        "skgrl",
-    }
+    guidance = {"base_policy", "kgrl", "kgrl_base_policy", "kmp", "residual", "residual_base_policy", "skgrl"}
+    assert result["cases"].keys() <= guidance
     assert result["all"]["episodes"] == 3
 
 
 def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
     path = [*sys.path]
-    (tmp_path / "beside_own.py").write_text("PERIOD = 3\n")
+    (tmp_path / "lab_period.py").write_text("PERIOD = 3\n")
     good, wrong = tmp_path / "own_good.py", tmp_path / "own_wrong.py"
-    good.write_text("from beside_own import PERIOD\n")
+    good.write_text("from lab_period import PERIOD\n")
     wrong.write_text("PERIOD = 3\nimport nowhere_to_be_found\n")
     assert import_modules([str(good)]) == (str(good),)
     with pytest.raises(InputError, match=r"importing own_wrong\.py failed: own_wrong\.py, line 2: ModuleNotFoundError"):
@@ -427,18 +419,19 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
     with pytest.raises(InputError, match="there is no module, file or task folder nowhere_to_be_found"):
         import_modules(["nowhere_to_be_found"])
     assert sys.path == path
-    sys.modules.pop("beside_own")
+    sys.modules.pop("lab_period")
 
 
-def test_check_accepts_the_name_of_a_shipped_template(monkeypatch):
+def test_validate_template_accepts_the_name_of_a_template(monkeypatch):
     monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    loaded, none = validate_template(Path("pouring"))["transitions"]
-    assert loaded == "translational → tilt below 0.25 m, back above 0.27 m"
-    assert none == "tilt → pour below 0.075 m, no way back"
+    first, second = validate_template(Path("pouring"))["transitions"]
+    assert first == "translational → tilt below 0.25 m, back above 0.27 m"
+    assert second == "tilt → pour below 0.075 m, no way back"
 
 
 def test_task_keeps_its_name_when_another_name_is_taken():
-    task, _ = TASKS.get("NarrowPassage"), TASKS.get("GridClamp")
+    task = TASKS.get("NarrowPassage")
+    TASKS.get("GridClamp")  # imports the module that registers the task
     with pytest.raises(InputError, match="already"):
         register_task("GridClamp")(task)
     assert task.name == "NarrowPassage"

@@ -1,4 +1,4 @@
-"""Every registry checks what is registered, with one sentence."""
+"""Registries refuse invalid entries with a message of one sentence."""
 
 import pytest
 from pydantic.dataclasses import dataclass
@@ -19,74 +19,80 @@ from guiderail.tools.experiments.engines.engine import ENGINES, make_engine, reg
 from guiderail.tools.learning.learner import LEARNERS, register_learner
 
 
-class HalfDriver(Driver):
+class IncompleteDriver(Driver):
     def read(self):
         return None
 
 
 def build(*arguments, **options):
-    """Build nothing."""
+    """Return None instead of an object."""
 
 
-def learner(config):
-    return type("Mine", (), {"Config": config, "__init__": build})
+def make_class(config):
+    return type("LabLearner", (), {"Config": config, "__init__": build})
 
 
 def add_station(kind="plane", options=None, builder=build):
-    register_station("mine", workcell_kind=kind, options=options)(builder)
+    register_station("lab", workcell_kind=kind, options=options)(builder)
 
 
 @dataclass
-class Loose:
-    algorithm: str = "mine"
+class UnrelatedConfig:
+    algorithm: str = "lab"
 
 
 @pytest.mark.parametrize(
-    ("register", "sentence"),
+    ("register", "message"),
     [
-        (lambda: register_kernel("mine", 3), "'mine' is registered with a function or a class, not with 3"),
-        (lambda: register_base_policy("mine", 3), "registered with a function or a class, not with 3"),
-        (lambda: register_engine("mine")(3), "registered with a function or a class, not with 3"),
-        (lambda: register_driver("mine", 3), "registered with a subclass of Driver, not with 3"),
-        (lambda: register_driver("mine", HalfDriver), "the class HalfDriver lacks write"),
-        (lambda: register_guidance("mine")(3), "registered with a function or a class, not with 3"),
-        (lambda: register_guidance("mine", options=dict)(build), "options of mine must be a class made of Options"),
-        (lambda: GUIDANCE.register("mine", build), "the guidance 'mine' is registered by @register_guidance"),
+        (lambda: register_kernel("lab", 3), "'lab' is registered with a function or a class, not with 3"),
+        (lambda: register_base_policy("lab", 3), "registered with a function or a class, not with 3"),
+        (lambda: register_engine("lab")(3), "registered with a function or a class, not with 3"),
+        (lambda: register_driver("lab", 3), "registered with a subclass of Driver, not with 3"),
+        (lambda: register_driver("lab", IncompleteDriver), "the class IncompleteDriver lacks write"),
+        (lambda: register_guidance("lab")(3), "registered with a function or a class, not with 3"),
+        (lambda: register_guidance("lab", options=dict)(build), "options of lab must be a class made of Options"),
+        (lambda: GUIDANCE.register("lab", build), "the guidance 'lab' is registered by @register_guidance"),
         (lambda: add_station(builder=3), "registered with a function or a class, not with 3"),
-        (lambda: add_station(options=3), "options of mine must be a class made of Options, not 3"),
-        (lambda: add_station(kind=3), "workcell_kind of mine must be a word, such as 'plane', not 3"),
-        (lambda: STATIONS.register("mine", build), "the station 'mine' is registered by @register_station"),
-        (lambda: register_task("mine")(3), "the task 'mine' is registered with a class derived from Task, not with 3"),
+        (lambda: add_station(options=3), "options of lab must be a class made of Options, not 3"),
+        (lambda: add_station(kind=3), "workcell_kind of lab must be a word, such as 'plane', not 3"),
+        (lambda: STATIONS.register("lab", build), "the station 'lab' is registered by @register_station"),
+        (lambda: register_task("lab")(3), "the task 'lab' is registered with a class derived from Task, not with 3"),
         (lambda: register_robot(3), "a robot is registered as a Robot object, not 3"),
         (lambda: register_end_effector(3), "an end effector is registered as an EndEffector object, not 3"),
-        (lambda: register_learner("mine", 3), "registered with a function or a class, not with 3"),
-        (lambda: register_learner("mine", build), "the learner mine has no Config"),
-        (lambda: register_learner("mine", learner(dict)), "Config of mine must be a pydantic dataclass based on Learn"),
-        (lambda: register_learner("mine", learner(None)), "Config of mine must be a pydantic dataclass .*, not None"),
-        (lambda: register_learner("mine", learner(Loose)), "Config of mine must be a pydantic dataclass"),
+        (lambda: register_learner("lab", 3), "registered with a function or a class, not with 3"),
+        (lambda: register_learner("lab", build), "the learner lab has no Config"),
+        (
+            lambda: register_learner("lab", make_class(dict)),
+            "Config of lab must be a pydantic dataclass based on Learn",
+        ),
+        (
+            lambda: register_learner("lab", make_class(None)),
+            "Config of lab must be a pydantic dataclass .*, not None",
+        ),
+        (lambda: register_learner("lab", make_class(UnrelatedConfig)), "Config of lab must be a pydantic dataclass"),
     ],
 )
-def test_registration_refuses_what_cannot_be_used(register, sentence):
-    with pytest.raises(InputError, match=sentence):
+def test_registration_refuses_an_invalid_entry(register, message):
+    with pytest.raises(InputError, match=message):
         register()
     for registry in (KERNELS, BASE_POLICIES, ENGINES, DRIVERS, GUIDANCE, STATIONS, TASKS, LEARNERS):
-        assert "mine" not in registry.names()
+        assert "lab" not in registry.names()
 
 
 @pytest.fixture
-def restored():
+def remove_entries():
     """Remove the entries that a test registers."""
     yield
     for registry in (STATIONS, ENGINES, GUIDANCE):
-        for name in {"a", "mine"} & set(registry._entries):
+        for name in {"a", "lab"} & set(registry._entries):
             del registry._entries[name], registry._origins[name]
 
 
-@pytest.mark.usefixtures("restored")
+@pytest.mark.usefixtures("remove_entries")
 def test_environment_refuses_a_station_that_is_none():
     add_station()
-    with pytest.raises(InputError, match="station='mine' must build a Station, not None"):
-        guiderail.make_env("NarrowPassage", guidance="kgrl", station="mine")
+    with pytest.raises(InputError, match="station='lab' must build a Station, not None"):
+        guiderail.make_env("NarrowPassage", guidance="kgrl", station="lab")
 
 
 class NoPorts(Station):
@@ -98,29 +104,29 @@ class NoReset(PlaneStation):
     set_pose = Station.set_pose
 
 
-@pytest.mark.usefixtures("restored")
+@pytest.mark.usefixtures("remove_entries")
 @pytest.mark.parametrize(
     ("builder", "message"),
     [
-        (NoPorts, "station='mine' lacks the port desired_pose, command_time, pose, wrench"),
-        (NoReset, "station='mine' lacks the method set_pose"),
-        (lambda: None, "station='mine' is built from a workcell and its options: too many positional arguments"),
+        (NoPorts, "station='lab' lacks the port desired_pose, command_time, pose, wrench"),
+        (NoReset, "station='lab' lacks the method set_pose"),
+        (lambda: None, "station='lab' is built from a workcell and its options: too many positional arguments"),
     ],
 )
 def test_environment_refuses_a_station_that_lacks_a_part(builder, message):
     add_station(builder=builder)
     with pytest.raises(InputError, match=message):
-        guiderail.make_env("NarrowPassage", guidance="kgrl", station="mine")
+        guiderail.make_env("NarrowPassage", guidance="kgrl", station="lab")
 
 
-@pytest.mark.usefixtures("restored")
+@pytest.mark.usefixtures("remove_entries")
 def test_study_refuses_an_engine_that_is_none():
-    register_engine("mine", build)
-    with pytest.raises(InputError, match="the engine 'mine' must be an Engine, not None"):
-        make_engine("mine")
+    register_engine("lab", build)
+    with pytest.raises(InputError, match="the engine 'lab' must be an Engine, not None"):
+        make_engine("lab")
 
 
-@pytest.mark.usefixtures("restored")
+@pytest.mark.usefixtures("remove_entries")
 def test_registration_does_not_change_the_defaults():
     add_station()
     register_guidance("a")(build)

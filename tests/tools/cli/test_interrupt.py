@@ -1,4 +1,4 @@
-"""Ctrl-C: every command ends with exit code 130 and one line, which says how to resume if that is possible."""
+"""Ctrl-C ends a command with exit code 130 and one line, which names how to resume if the command can be resumed."""
 
 import os
 import signal
@@ -11,9 +11,10 @@ import pytest
 from research.studies import study_path
 
 TESTS = str(Path(__file__).parents[2])
-TRAINS = """
+# Program that runs a command and prints a line after every checkpoint.
+TRAINING_PROGRAM = """
 import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in a shell's background ignore SIGINT
 import bead
 bead.register()
 from guiderail.tools.cli.main import main
@@ -26,23 +27,23 @@ def save(*arguments, write=trainer.write_checkpoint):
 trainer.write_checkpoint = save
 main(sys.argv[1:])
 """
-# The function that the command calls sends the signal to its own process.
-STOPS = """
+# Program that runs a command in which the function of the first two arguments sends SIGINT to its own process.
+INTERRUPTED_PROGRAM = """
 import os, signal, sys
 from importlib import import_module
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from guiderail.tools.cli.main import main
-module, name, *words = sys.argv[1:]
-setattr(import_module(module), name, lambda *given, **named: os.kill(os.getpid(), signal.SIGINT))
-main(words)
+module, name, *arguments = sys.argv[1:]
+setattr(import_module(module), name, lambda *values, **options: os.kill(os.getpid(), signal.SIGINT))
+main(arguments)
 """
 
 
 def test_interrupted_training_names_resume(tmp_path):
     paths = os.pathsep.join([TESTS, f"{TESTS}/tools", *filter(None, sys.path)])
-    words = ["train", "Bead", "--out", tmp_path / "run", "--episodes", "1000000", "--set", "net_arch=8"]
+    arguments = ["train", "Bead", "--out", tmp_path / "run", "--episodes", "1000000", "--set", "net_arch=8"]
     with subprocess.Popen(
-        [sys.executable, "-c", TRAINS, *words],
+        [sys.executable, "-c", TRAINING_PROGRAM, *arguments],
         env=os.environ | {"PYTHONPATH": paths},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -57,7 +58,7 @@ def test_interrupted_training_names_resume(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("place", "words", "expected"),
+    ("function", "arguments", "hint"),
     [
         ("experiments.study.study_command", ["study", study_path("connector")], "; the same command resumes it"),
         ("evaluation.evaluate.evaluate", ["evaluate", "NarrowPassage", "--policy", "zero"], ""),
@@ -65,8 +66,8 @@ def test_interrupted_training_names_resume(tmp_path):
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
-def test_interrupted_command_ends_with_a_line(place, words, expected, forks, tmp_path):
-    module, _, name = f"guiderail.tools.{place}".rpartition(".")
-    out = [] if words[0] == "evaluate" else ["--out", tmp_path / "out"]
-    result = forks.run("-c", STOPS, module, name, *words, *out, folder=tmp_path)
-    assert (result.returncode, result.stderr) == (130, f"guiderail: stopped{expected}\n")
+def test_interrupted_command_ends_with_a_line(function, arguments, hint, forks, tmp_path):
+    module, _, name = f"guiderail.tools.{function}".rpartition(".")
+    out = [] if arguments[0] == "evaluate" else ["--out", tmp_path / "out"]
+    result = forks.run("-c", INTERRUPTED_PROGRAM, module, name, *arguments, *out, folder=tmp_path)
+    assert (result.returncode, result.stderr) == (130, f"guiderail: stopped{hint}\n")

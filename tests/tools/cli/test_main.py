@@ -24,16 +24,11 @@ CONNECTOR = str(study_path("connector"))
 
 
 def call(capsys, *arguments):
-    """Exit code, standard output and standard error of the command."""
+    """Run a command; return its exit code, standard output and standard error."""
     with pytest.raises(SystemExit) as end:
         main([str(argument) for argument in arguments])
     out, err = capsys.readouterr()
     return end.value.code, out, err
-
-
-@pytest.fixture
-def trained(bead_run):
-    return bead_run
 
 
 @pytest.mark.parametrize(
@@ -92,8 +87,8 @@ def trained(bead_run):
         (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
         (["evaluate", "new", "--station", "hardware", "--sim", "--seed", "7"], "--seed and --resample-offsets out"),
         *(
-            (["evaluate", "new", "--station", "hardware", "--sim", *words], f"{words[0]}, ")
-            for words in (["--signal", "measured"], ["--processes", "2"], ["--trust-policy"])
+            (["evaluate", "new", "--station", "hardware", "--sim", *options], f"{options[0]}, ")
+            for options in (["--signal", "measured"], ["--processes", "2"], ["--trust-policy"])
         ),
         (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
         (["evaluate", "mypol.py", "--task", "Bead"], "mypol.py:FUNCTION"),
@@ -135,8 +130,8 @@ def trained(bead_run):
         (["teleoperate", "Puring"], "did you mean Pouring?"),
         (["teleoperate", "Pouring", "--json"], "give --record too"),
         *(
-            ([*words, "--import", "none.py"], "there is no module, file or task folder none.py")
-            for words in (
+            ([*command, "--import", "none.py"], "there is no module, file or task folder none.py")
+            for command in (
                 ["visualize", "lab/Own"],
                 ["certify", "lab/Own"],
                 ["teleoperate", "lab/Own"],
@@ -159,8 +154,8 @@ def trained(bead_run):
         (["deploy", "new", "--sim", "--robot-url", "udpm://239.255.76.67:7667"], "a bus of its own"),
         (["list", "metrix"], "did you mean metrics?"),
         *(
-            ([*words, ""], f"{words[-1]} is empty: give a value, or leave it out")
-            for words in (
+            ([*command, ""], f"{command[-1]} is empty: give a value, or leave it out")
+            for command in (
                 ["train", "NarrowPassage", "--out"],
                 ["evaluate", "new", "--save"],
                 ["create-task", "plug.stl", "socket.stl", "--out"],
@@ -183,22 +178,20 @@ def test_command_prints_one_sentence_when_input_is_wrong(arguments, message, cap
     assert list(tmp_path.iterdir()) == []
 
 
-def test_visualize_refuses_a_baseline_for_a_run(capsys, trained):
-    code, _, err = call(capsys, "visualize", trained, "--policy", "zero", "--image", "picture.png")
-    assert (code, err) == (
-        2,
-        "guiderail: --policy acts in a task: name the task instead of a folder, or leave --policy out\n",
-    )
+def test_visualize_refuses_a_baseline_for_a_run(capsys, bead_run):
+    code, _, err = call(capsys, "visualize", bead_run, "--policy", "zero", "--image", "picture.png")
+    assert code == 2
+    assert err == "guiderail: --policy acts in a task: name the task instead of a folder, or leave --policy out\n"
 
 
 @pytest.mark.parametrize("policy", ["none", "uniform_random,scripted", "unifrm_random"])
-def test_evaluate_refuses_unknown_policy_when_on_hardware(policy, capsys, trained):
+def test_evaluate_refuses_unknown_policy_on_hardware(policy, capsys, bead_run):
     hardware = ["--station", "hardware", "--sim"]
-    code, out, err = call(capsys, "evaluate", trained, *hardware, "--episodes", 1, "--policy", policy)
+    code, out, err = call(capsys, "evaluate", bead_run, *hardware, "--episodes", 1, "--policy", policy)
     assert (code, out) == (2, "")
     assert f"Bead has no policy {policy!r}" in err
     assert err.count("\n") == 1
-    assert not (trained / "hardware").exists()
+    assert not (bead_run / "hardware").exists()
 
 
 def test_json_has_null_for_nan_and_infinity_at_any_depth():
@@ -208,7 +201,7 @@ def test_json_has_null_for_nan_and_infinity_at_any_depth():
 
 
 @pytest.mark.parametrize("command", ["list", "evaluate", "visualize", "train", "report", "study"])
-def test_command_refuses_a_path_when_it_is_too_long(command, capsys):
+def test_command_refuses_a_path_that_is_too_long(command, capsys):
     options = ["--out", "out"] if command in ("train", "study") else []
     code, out, err = call(capsys, command, 5000 * "x", *options)
     assert (code, out) == (2, "")
@@ -216,19 +209,19 @@ def test_command_refuses_a_path_when_it_is_too_long(command, capsys):
     assert "(File name too long): name another path" in err
 
 
-def test_train_refuses_an_existing_folder(capsys, trained):
-    before = {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
-    code, _, err = call(capsys, "train", "Bead", "--out", trained)
+def test_train_refuses_an_existing_folder(capsys, bead_run):
+    before = {path: path.read_bytes() for path in bead_run.rglob("*") if path.is_file()}
+    code, _, err = call(capsys, "train", "Bead", "--out", bead_run)
     assert code == 2
     assert "--resume" in err
-    assert before == {path: path.read_bytes() for path in trained.rglob("*") if path.is_file()}
+    assert before == {path: path.read_bytes() for path in bead_run.rglob("*") if path.is_file()}
 
 
-def test_demo_refuses_the_folder_of_another_run(capsys, trained):
-    code, _, err = call(capsys, "demo", "--out", trained)
+def test_demo_refuses_the_folder_of_another_run(capsys, bead_run):
+    code, _, err = call(capsys, "demo", "--out", bead_run)
     assert code == 2
     assert "already exists" in err
-    assert (trained / "episodes.csv").exists()
+    assert (bead_run / "episodes.csv").exists()
 
 
 def test_train_writes_all_files_of_a_run(capsys, tmp_path):
@@ -242,7 +235,7 @@ def test_train_writes_all_files_of_a_run(capsys, tmp_path):
     assert expected <= {path.name for path in (tmp_path / "run").iterdir()}
 
 
-def test_train_evaluates_its_policy_on_request(capsys, tmp_path):
+def test_train_evaluates_the_policy_when_requested(capsys, tmp_path):
     options = ["--episodes", 1, "--set", "net_arch=8", "--no-pictures", "--json"]
     code, out, _ = call(capsys, "train", "Bead", "--out", tmp_path / "run", "--evaluate", 3, *options)
     assert code == 0
@@ -254,45 +247,40 @@ def test_train_evaluates_its_policy_on_request(capsys, tmp_path):
     assert result["held_out_mean_return"] == evaluated["mean_return"]
 
 
-def test_evaluate_prints_one_json_object(capsys, trained):
-    code, out, err = call(capsys, "evaluate", trained, "--episodes", 3, "--json")
+def test_evaluate_prints_one_json_object(capsys, bead_run):
+    code, out, err = call(capsys, "evaluate", bead_run, "--episodes", 3, "--json")
     assert code == 0
     assert "series 1 of 4: policy 3/3" in err
     result = json.loads(out)
-    assert {
-        "success_rate",
-        "demonstration_success_rate",
-        "episodes",
-        "max_commanded_violation",
-        "peak_force",
-    } <= result.keys()
+    statistics = {"success_rate", "demonstration_success_rate", "episodes", "max_commanded_violation", "peak_force"}
+    assert statistics <= result.keys()
     assert result["episodes"] == 3
     assert 0 <= result["success_rate"] <= 1
 
 
-def test_evaluate_is_reproducible_and_depends_on_seed(capsys, trained):
-    first, second = (call(capsys, "evaluate", trained, "--episodes", 3, "--json")[1] for _ in range(2))
-    other = call(capsys, "evaluate", trained, "--episodes", 3, "--json", "--seed", 9)[1]
+def test_evaluate_is_reproducible_and_depends_on_seed(capsys, bead_run):
+    first, second = (call(capsys, "evaluate", bead_run, "--episodes", 3, "--json")[1] for _ in range(2))
+    third = call(capsys, "evaluate", bead_run, "--episodes", 3, "--json", "--seed", 9)[1]
     assert first == second
-    assert json.loads(first)["mean_return"] != json.loads(other)["mean_return"]
+    assert json.loads(first)["mean_return"] != json.loads(third)["mean_return"]
 
 
-def test_evaluate_refuses_a_damaged_policy(capsys, trained):
-    weights = trained / "policy.safetensors"
+def test_evaluate_refuses_a_damaged_policy(capsys, bead_run):
+    weights = bead_run / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-10])
-    code, _, err = call(capsys, "evaluate", trained)
+    code, _, err = call(capsys, "evaluate", bead_run)
     assert code == 2
     assert "damaged" in err
 
 
 def commands():
-    """Return the words of every command, those of groups included."""
+    """Yield the name of every command, after the name of its group if it has one, as a tuple."""
     for name, command in typer.main.get_command(load_commands()).commands.items():
         yield from ((name, part) for part in command.commands) if hasattr(command, "commands") else [(name,)]
 
 
 @pytest.mark.parametrize("command", [*commands()], ids=" ".join)
-def test_help_has_a_valid_example_and_starts_nothing(command, capsys, tmp_path, monkeypatch):
+def test_help_has_a_valid_example_and_writes_nothing(command, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code, out, err = call(capsys, *command, "--help")
     assert (code, err) == (0, "")
@@ -304,7 +292,7 @@ def test_help_has_a_valid_example_and_starts_nothing(command, capsys, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_number_of_commands_stays_small():
+def test_number_of_commands_is_sixteen():
     assert len(typer.main.get_command(load_commands()).commands) == 16
 
 
@@ -317,28 +305,28 @@ def test_every_command_is_listed_with_its_module():
 
 
 def test_help_lists_the_choices(capsys):
-    for command, words in (
+    for command, choices in (
         (["train"], ("NarrowPassage", "skgrl", "tqc", "tqc_contact", "aligned", "center_of_pressure", "hand_shaped")),
         (["visualize"], (".jpg", ".webp")),
         (["template", "validate"], ("pouring",)),
         (["evaluate"], ("uniform_random", "bang_bang")),
     ):
         out = call(capsys, *command, "--help")[1]
-        assert all(word in out for word in words), command
+        assert all(choice in out for choice in choices), command
 
 
 def test_help_imports_neither_pytorch_nor_drake():
     code = """
 import sys
 from guiderail.tools.cli.main import main
-for words in ("--version", "--help", "study --help", "evaluate --help", "list tasks", "train --help"):
+for line in ("--version", "--help", "study --help", "evaluate --help", "list tasks", "train --help"):
     try:
-        main(words.split())
+        main(line.split())
     except SystemExit:
         pass
     heavy = {'torch', 'stable_baselines3', 'matplotlib'}
-    heavy |= set() if words == "train --help" else {'pydrake'}  # rewards and observations are declared by the tasks
-    assert not heavy & set(sys.modules), words
+    heavy |= set() if line == "train --help" else {'pydrake'}  # the help names rewards and observations of tasks
+    assert not heavy & set(sys.modules), line
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -371,7 +359,7 @@ def test_as_value_reads_plain_text_as_yaml_does(text):
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [
         ["train", "Foreign", "--out", "new"],
         ["visualize", "Foreign", "--policy", "zero", "--html", "new.html"],
@@ -379,11 +367,11 @@ def test_as_value_reads_plain_text_as_yaml_does(text):
         ["teleoperate", "Foreign"],
     ],
 )
-def test_environment_without_a_task_is_refused(words, capsys, tmp_path, monkeypatch):
+def test_environment_without_a_task_is_refused(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
     gymnasium.register(environment_id("Foreign"), entry_point=entry)
-    code, _, err = call(capsys, *words)
+    code, _, err = call(capsys, *arguments)
     gymnasium.registry.pop(environment_id("Foreign"))
     assert (code, err.count("\n")) == (2, 1)
     assert "Foreign has no task of guiderail" in err
@@ -391,30 +379,30 @@ def test_environment_without_a_task_is_refused(words, capsys, tmp_path, monkeypa
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this machine has no /dev/full")
-def test_full_disk_of_standard_output_is_named():
+def test_error_of_writing_standard_output_is_named():
     with open("/dev/full", "w") as full:
-        words = [sys.executable, "-m", "guiderail", "list", "tasks"]
-        result = subprocess.run(words, stdout=full, stderr=subprocess.PIPE, text=True)
+        command = [sys.executable, "-m", "guiderail", "list", "tasks"]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True)
     assert result.returncode == 2
     assert result.stderr.startswith("guiderail: the output cannot be written (No space left on device): ")
     assert result.stderr.count("\n") == 1
 
 
 def test_train_refuses_mistakes_before_slow_imports(tmp_path):
-    (tmp_path / "notes.txt").write_text("")  # the working directory holds files, so it is refused as a run's folder
+    (tmp_path / "notes.txt").write_text("")  # `--out .` is refused, because the folder is not empty
     code = """
 import sys
 from guiderail.tools.cli.main import main
-for words in (
+for line in (
     "", "--guidance nope", "--env guidance=nope", "--station nope", "--algorithm nope", "--preset nope", "--set nope=1",
     "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope", "--out .",
     "--env nope=1", "--env friction=9", "--env time_step=-1", "--env slack_width=-1", "--env offset_range=1",
 ):
     try:
-        main(["train", "BncConnector", *(["--out", "run"] if words else []), *words.split()])
+        main(["train", "BncConnector", *(["--out", "run"] if line else []), *line.split()])
     except SystemExit as end:
-        assert end.code == 2, words
-    assert not {"pydrake", "pandas", "torch", "scipy"} & set(sys.modules), words
+        assert end.code == 2, line
+    assert not {"pydrake", "pandas", "torch", "scipy"} & set(sys.modules), line
 """
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
@@ -429,14 +417,14 @@ def test_train_draws_no_pictures_when_none_are_wanted(capsys, tmp_path):
 
 
 def test_completion_offers_commands_and_choices(monkeypatch, capsys):
-    for words, expected in (("guiderail tra", "train"), ("guiderail train Nar", "NarrowPassage")):
+    for line, expected in (("guiderail tra", "train"), ("guiderail train Nar", "NarrowPassage")):
         monkeypatch.setenv("_GUIDERAIL_COMPLETE", "complete_bash")
-        monkeypatch.setenv("COMP_WORDS", words)
-        monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+        monkeypatch.setenv("COMP_WORDS", line)
+        monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
         assert call(capsys)[1].split() == [expected]
 
 
-def test_version_is_that_of_the_package(capsys):
+def test_version_is_the_version_of_the_package(capsys):
     assert call(capsys, "--version")[1] == f"guiderail {guiderail.__version__}\n"
 
 
@@ -468,7 +456,7 @@ def test_env_values_are_read_as_yaml(text, value):
     assert (read, type(read)) == (value, type(value))
 
 
-def test_list_names_broken_entry_points_and_leaves_them_out(capsys, tmp_path, monkeypatch):
+def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch):
     information = tmp_path / "lab_broken-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: lab_broken\nVersion: 1.0\n")
@@ -506,15 +494,15 @@ def test_list_prints_json_options_and_metrics(capsys):
     assert {"NarrowPassage", "Pouring"} <= set(listed["tasks"])
     assert "1" in json.loads(call(capsys, "list", "Bead", "--json")[1])["action_repeat"]
     assert "first ten consecutive successes" in call(capsys, "list", "metrics")[1]
-    # What `hard` stands for can be given option by option.
+    # The options that `difficulty=hard` sets are listed.
     connector = call(capsys, "list", "BncConnector")[1]
     assert "offset_range=[0.0026,0.003]" in connector
     assert "with station=arm or hardware: " in connector
     assert json.loads(call(capsys, "list", "GridClamp", "--json")[1])["difficulties"]["hard"]["force_limit"] == 10.0
 
 
-def test_evaluate_prints_a_column_for_each_baseline(capsys, trained):
-    out = call(capsys, "evaluate", trained, "--episodes", 2)[1]
+def test_evaluate_prints_a_column_for_each_baseline(capsys, bead_run):
+    out = call(capsys, "evaluate", bead_run, "--episodes", 2)[1]
     before, header, table = out.partition("policy               demonstration alone  uniform_random       constant\n")
     assert header
     assert before.strip() == ""
@@ -528,45 +516,45 @@ from guiderail.diagrams.stations.registry import register_station
 
 
 @register_station("desk", workcell_kind="insertion", is_simulated=False)
-def desk(world):
+def desk(workcell):
     raise NotImplementedError
 """
 
 
 @pytest.mark.parametrize(
-    ("typed", "robot"),
+    ("options", "robot"),
     [([], "iiwa14"), (["--robot", "panda"], "panda"), (["--env", "robot=panda"], "panda")],
 )
-def test_train_passes_robot_and_imports_to_hardware(typed, robot, capsys, tmp_path, monkeypatch):
-    asked = {}
+def test_train_passes_robot_and_imports_to_hardware(options, robot, capsys, tmp_path, monkeypatch):
+    passed = {}
 
-    def learn(task, out, other, **more):
-        asked.update(more, other=other)
+    def train_on_robot(task, out, connection, **keywords):
+        passed.update(keywords, connection=connection)
         return {"run": str(out)}
 
-    monkeypatch.setattr("guiderail.tools.hardware.train.train_on_robot", learn)
-    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # undone after the test
+    monkeypatch.setattr("guiderail.tools.hardware.train.train_on_robot", train_on_robot)
+    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "desk.py"
     file.write_text(STATION)
-    options = ["--station", "desk", "--import", file, "--out", "new", "--robot-url", "memq://"]
-    assert call(capsys, "train", "BncConnector", *options, *typed)[0] == 0
-    assert (asked["other"].robot, asked["other"].robot_url) == (robot, "memq://")
-    assert asked["given"]["imports"] == (str(file),)
+    hardware = ["--station", "desk", "--import", file, "--out", "new", "--robot-url", "memq://"]
+    assert call(capsys, "train", "BncConnector", *hardware, *options)[0] == 0
+    assert (passed["connection"].robot, passed["connection"].robot_url) == (robot, "memq://")
+    assert passed["given"]["imports"] == (str(file),)
 
 
-def test_evaluate_imports_the_station_before_it_is_used(capsys, tmp_path, monkeypatch, trained):
-    asked = {}
+def test_evaluate_imports_the_station_before_its_use(capsys, tmp_path, monkeypatch, bead_run):
+    passed = {}
 
-    def evaluate(run, other, episodes, **more):
-        asked.update(more)
+    def evaluate_on_robot(run, connection, episodes, **keywords):
+        passed.update(keywords)
         return {"episodes": episodes}
 
-    monkeypatch.setattr("guiderail.tools.hardware.evaluate.evaluate_on_robot", evaluate)
-    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # undone after the test
+    monkeypatch.setattr("guiderail.tools.hardware.evaluate.evaluate_on_robot", evaluate_on_robot)
+    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "other_desk.py"
     file.write_text(STATION)
-    assert call(capsys, "evaluate", trained, "--station", "desk", "--import", file, "--robot-url", "memq://")[0] == 0
-    assert asked["station"] == "desk"
+    assert call(capsys, "evaluate", bead_run, "--station", "desk", "--import", file, "--robot-url", "memq://")[0] == 0
+    assert passed["station"] == "desk"
 
 
 def test_policy_file_without_its_ending_is_named(capsys, tmp_path):
@@ -576,36 +564,36 @@ def test_policy_file_without_its_ending_is_named(capsys, tmp_path):
     assert f"to evaluate the file {tmp_path / 'sac.zip'}, give its whole name" in err
 
 
-def test_visualize_prints_what_it_does_before_it_simulates(capsys, tmp_path, monkeypatch):
-    def simulate(*given, **named):
+def test_visualize_prints_a_line_before_the_simulation(capsys, tmp_path, monkeypatch):
+    def simulate(*arguments, **options):
         raise InputError("stopped")
 
     monkeypatch.setattr("guiderail.tools.visualization.replay.rollout", simulate)
-    words = ["visualize", "NarrowPassage", "--policy", "zero", "--html", tmp_path / "replay.html"]
-    code, _, err = call(capsys, *words)
+    arguments = ["visualize", "NarrowPassage", "--policy", "zero", "--html", tmp_path / "replay.html"]
+    code, _, err = call(capsys, *arguments)
     assert code == 2
     assert err.startswith("guiderail: simulating held-out episodes (1) before and after learning, then writing ")
     assert err.endswith("\nguiderail: stopped\n")
 
 
 @pytest.mark.parametrize(
-    ("typed", "checkpoint", "words"),
+    ("command", "has_checkpoint", "message"),
     [
         (["train", "BncConnector", "--out"], True, "stopped; resume with --resume"),
-        (["train", "BncConnector", "--out"], False, "stopped"),  # as on hardware, where a run has no checkpoint
+        (["train", "BncConnector", "--out"], False, "stopped"),  # a run on hardware has no checkpoint
         (["study", "connector", "--out"], False, "stopped; the same command resumes it"),
         (["evaluate"], False, "stopped"),
     ],
 )
-def test_interrupted_command_prints_how_to_resume(typed, checkpoint, words, capsys, tmp_path, monkeypatch):
-    def stop(**given):
+def test_interrupted_command_prints_how_to_resume(command, has_checkpoint, message, capsys, tmp_path, monkeypatch):
+    def interrupt(**options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("guiderail.tools.cli.main.app", stop)
-    if checkpoint:
+    monkeypatch.setattr("guiderail.tools.cli.main.app", interrupt)
+    if has_checkpoint:
         (tmp_path / "checkpoint").mkdir()
-    for last in ([*typed, str(tmp_path)], [*typed[:-1], f"{typed[-1]}={tmp_path}"]):
+    for arguments in ([*command, str(tmp_path)], [*command[:-1], f"{command[-1]}={tmp_path}"]):
         with pytest.raises(SystemExit) as end:
-            main(last)
+            main(arguments)
         assert end.value.code == 130
-        assert capsys.readouterr().err.strip().removeprefix("guiderail: ") == words
+        assert capsys.readouterr().err.strip().removeprefix("guiderail: ") == message

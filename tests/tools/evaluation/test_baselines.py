@@ -27,7 +27,7 @@ from guiderail.tools.visualization import replay
 def scripted_network():
     """Return the scripted policy as the weights of a network."""
     first, last = (2.0 * step / NUM_STEPS - 1.0 for step in PRESSING)
-    features = np.zeros((7, 13), np.float32)  # both torques with either sign; too early, too late, too low
+    features = np.zeros((7, 13), np.float32)  # torques of both signs; too early, too late, too low
     features[[0, 1, 2, 3], [TORQUE_Y, TORQUE_Y, TORQUE_X, TORQUE_X]] = [-1.0, 1.0, 1.0, -1.0]
     features[[4, 5, 6], [TIME, TIME, Z]] = [-1.0, 1.0, -1.0]
     thresholds = np.array([0.0, 0.0, 0.0, 0.0, first, -last, SCALED_RIM], np.float32)
@@ -38,7 +38,7 @@ def scripted_network():
     return Policy(layers, {"format": FORMAT, "pool": 1} | spaces)
 
 
-def test_policy_of_a_gantry_run_drives_the_arm(tmp_path):
+def test_policy_of_a_gantry_run_succeeds_on_the_arm(tmp_path):
     folder = RunFolder(tmp_path / "run")
     config = configure("BncConnector", {"guidance": "kgrl", "fixture_offset": "per_episode"}, episodes=1, seed=3)
     folder.create(config)
@@ -58,7 +58,7 @@ def test_policy_of_a_gantry_run_drives_the_arm(tmp_path):
     assert html == folder.path / "replay-arm.html"
 
 
-def test_scripted_policy_is_found_by_its_name_or_as_the_default():
+def test_scripted_policy_is_found_by_name_or_as_the_default():
     assert find_scripted_policy("GridClamp", "scripted") is scripted_search
     assert find_scripted_policy("GridClamp", "scripted", "hard") is scripted_gentle_search
     assert find_scripted_policy("GridClamp", "straight_descent") is straight_descent
@@ -69,7 +69,7 @@ def test_scripted_policy_is_found_by_its_name_or_as_the_default():
 
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"])
-def test_scripted_policies_are_the_same_for_every_difficulty(task):
+def test_scripted_policies_have_the_same_names_per_difficulty(task):
     names = [set(scripted_policies(task, difficulty)) for difficulty in TASKS.get(task).difficulties]
     assert names[0]
-    assert all(each == names[0] for each in names)
+    assert all(names_of_difficulty == names[0] for names_of_difficulty in names)

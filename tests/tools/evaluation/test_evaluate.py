@@ -30,44 +30,46 @@ from guiderail.tools.learning.train import Run
 @pytest.mark.parametrize("make_policy", [zero_policy, partial(BaselinePolicy, uniform_random)])
 def test_episode_depends_on_its_seed_alone(make_policy):
     env = make_environment("Bead", {})
-    four = evaluate_policy(env, make_policy(env), episodes=4, seed=20)
-    assert four["return"].nunique() == 4
+    first = evaluate_policy(env, make_policy(env), episodes=4, seed=20)
+    assert first["return"].nunique() == 4
     second = evaluate_policy(env, make_policy(env), episodes=2, seed=22)
-    assert second["return"].tolist() == four["return"][2:].tolist()
+    assert second["return"].tolist() == first["return"][2:].tolist()
 
 
-@pytest.mark.parametrize(("seed", "first"), [(HELD_OUT_SEED, 0), (HELD_OUT_SEED + 8, 8), (0, 2**32 - HELD_OUT_SEED)])
-def test_random_numbers_of_an_episode_are_seeded_by_its_seed(seed, first):
+@pytest.mark.parametrize(
+    ("seed", "first_number"), [(HELD_OUT_SEED, 0), (HELD_OUT_SEED + 8, 8), (0, 2**32 - HELD_OUT_SEED)]
+)
+def test_random_numbers_of_an_episode_are_seeded_by_its_seed(seed, first_number):
     env, numbers = make_environment("Bead", {}), []
     policy = zero_policy(env)
     policy.start_episode = numbers.append
     evaluate_policy(env, policy, episodes=2, seed=seed)
-    assert numbers == [first, first + 1]
+    assert numbers == [first_number, first_number + 1]
     evaluate_policy(env, policy, episodes=2, seed=seed, first_number=0)
     assert numbers[2:] == [0, 1]
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
-def test_evaluate_policy_refuses_numbers_out_of_range(wrong):
+@pytest.mark.parametrize("options", [{"episodes": 0}, {"episodes": 1, "seed": -1}, {"episodes": 1, "seed": 2**31}])
+def test_evaluate_policy_refuses_numbers_out_of_range(options):
     with pytest.raises(InputError):
-        evaluate_policy(make_environment("Bead", {}), lambda observation: np.zeros(2), **wrong)
+        evaluate_policy(make_environment("Bead", {}), lambda observation: np.zeros(2), **options)
 
 
-@pytest.mark.parametrize("wrong", [1.5, "3", True, np.nan, None])
-@pytest.mark.parametrize("name", ["episodes", "seed", "processes"])
-def test_evaluate_refuses_numbers_that_are_not_whole(name, wrong):
-    if (name, wrong) == ("processes", None):
-        return
-    with pytest.raises(InputError, match=f"must be a whole number, not {wrong!r}"):
-        evaluate(lambda observation: np.zeros(2), "Bead", **{"episodes": 1, name: wrong})
+INVALID_NUMBERS = [(name, value) for name in ("episodes", "seed", "processes") for value in (1.5, "3", True, np.nan)]
 
 
-def test_evaluate_takes_whole_numbers_of_numpy():
-    own, other = (
+@pytest.mark.parametrize(("name", "value"), [*INVALID_NUMBERS, ("episodes", None), ("seed", None)])
+def test_evaluate_refuses_numbers_that_are_not_whole(name, value):
+    with pytest.raises(InputError, match=f"must be a whole number, not {value!r}"):
+        evaluate(lambda observation: np.zeros(2), "Bead", **{"episodes": 1, name: value})
+
+
+def test_evaluate_accepts_whole_numbers_of_numpy():
+    of_python, of_numpy = (
         evaluate(lambda observation: np.zeros(2), "Bead", number(2), seed=number(5), processes=number(1), baselines=())
         for number in (int, np.int64)
     )
-    assert json.dumps(other.statistics) == json.dumps(own.statistics)
+    assert json.dumps(of_numpy.statistics) == json.dumps(of_python.statistics)
 
 
 def test_load_or_compute_computes_once(tmp_path):
@@ -89,40 +91,40 @@ def test_demonstration_runs_on_the_episodes_of_the_policy(bead_run, capsys):
     assert "series 2 of 2: demonstration alone 3/3" in printed
     for name in COMPARED:
         assert result[f"demonstration_{name}"] is not None, name
-    elsewhere = evaluate(Run(bead_run), episodes=3, environment={"wall": -0.5})
-    assert elsewhere["success_rate"] == elsewhere["demonstration_success_rate"] == 0.0
-    assert elsewhere["mean_return"] != result["mean_return"]
+    blocked = evaluate(Run(bead_run), episodes=3, environment={"wall": -0.5})
+    assert blocked["success_rate"] == blocked["demonstration_success_rate"] == 0.0
+    assert blocked["mean_return"] != result["mean_return"]
 
 
 def test_stored_episodes_that_lost_rows_are_evaluated_again(bead_run):
-    others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
-    first = evaluate(bead_run, episodes=3, baselines=others)
+    baselines = {"uniform_random": partial(BaselinePolicy, uniform_random)}
+    first = evaluate(bead_run, episodes=3, baselines=baselines)
     files = [*(bead_run / "baselines").glob("*.csv")]
     whole = [file.read_bytes() for file in files]
     for file in files:
         file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
-    assert evaluate(bead_run, episodes=3, baselines=others).statistics == first.statistics
+    assert evaluate(bead_run, episodes=3, baselines=baselines).statistics == first.statistics
     assert [file.read_bytes() for file in files] == whole
 
 
 def test_evaluate_once_evaluates_a_table_that_lost_rows_again(bead_config, tmp_path):
-    how = {"about": None, "episodes": 3, "seed": 5}
-    first = evaluate_once(tmp_path, "zero", bead_config, zero_policy, bead_config.environment, **how)
+    arguments = "zero", bead_config, zero_policy, bead_config.environment
+    options = {"about": None, "episodes": 3, "seed": 5}
+    first = evaluate_once(tmp_path, *arguments, **options)
     (file,) = tmp_path.glob("*.csv")
     file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
-    again = evaluate_once(tmp_path, "zero", bead_config, zero_policy, bead_config.environment, **how)
-    pd.testing.assert_frame_equal(again, first)
+    pd.testing.assert_frame_equal(evaluate_once(tmp_path, *arguments, **options), first)
 
 
 def test_baselines_are_evaluated_once(bead_run, capsys):
     policies = {
         "zero": zero_policy,
         "uniform_random": partial(BaselinePolicy, uniform_random),
-        "other": lambda env: lambda observation: np.zeros(7),
+        "incompatible": lambda env: lambda observation: np.zeros(7),
     }
     first = evaluate(bead_run, episodes=3, baselines=policies)
     assert first["baselines"] == ["demonstration", "zero", "uniform_random"]
-    assert first["skipped_baselines"] == ["other"]
+    assert first["skipped_baselines"] == ["incompatible"]
     for name in COMPARED:
         assert first[f"zero_{name}"] == first[f"demonstration_{name}"]
     assert first["uniform_random_mean_return"] != first["zero_mean_return"]
@@ -141,10 +143,10 @@ def test_baselines_are_evaluated_once(bead_run, capsys):
 
 def test_rows_of_another_function_are_not_used_again(bead_run):
     seeded = [partial(BaselinePolicy, uniform_random, seed=seed) for seed in (1, 2)]
-    makers = [*seeded, *(lambda env, value=value: lambda _: np.full(2, value) for value in (0.5, 1.0))]
-    how = [["uniform_random"], *({"uniform_random": make} for make in makers)]
-    returns = [evaluate(bead_run, episodes=1, baselines=one)["uniform_random_mean_return"] for one in how]
-    assert len(set(returns)) == len(how)
+    functions = [*seeded, *(lambda env, value=value: lambda _: np.full(2, value) for value in (0.5, 1.0))]
+    series = [["uniform_random"], *({"uniform_random": function} for function in functions)]
+    returns = [evaluate(bead_run, episodes=1, baselines=each)["uniform_random_mean_return"] for each in series]
+    assert len(set(returns)) == len(series)
     assert len(list(bead_run.glob("baselines/uniform_random-*.csv"))) == 1 + len(seeded)
 
 
@@ -154,32 +156,33 @@ def test_evaluate_refuses_a_baseline_that_cannot_name_a_file(bead_run, name):
         evaluate(bead_run, episodes=1, baselines={name: zero_policy})
 
 
-def fails(*arguments):
+def fail(*arguments):
     raise KeyError("gain")
 
 
-def fails_late(observation):
-    return np.zeros(2) if observation.min() == observation.max() else fails()
+def fail_in_episode(observation):
+    """Return an action for the constant observation of the compatibility check only."""
+    return np.zeros(2) if observation.min() == observation.max() else fail()
 
 
 @pytest.mark.parametrize(
-    ("make_policy", "name", "stored"),
+    ("make_policy", "name", "num_stored"),
     [
-        (fails, "'mine'", 0),
-        (lambda env: fails, "'mine'", 0),
-        (lambda env: fails_late, "'mine'", 1),
-        (partial(BaselinePolicy, fails), "fails", 1),
-        (partial(BaselinePolicy, lambda rng, size: fails_late), "'mine'", 1),
+        (fail, "'lab'", 0),
+        (lambda env: fail, "'lab'", 0),
+        (lambda env: fail_in_episode, "'lab'", 1),
+        (partial(BaselinePolicy, fail), "fail", 1),
+        (partial(BaselinePolicy, lambda rng, size: fail_in_episode), "'lab'", 1),
     ],
 )
-def test_failure_of_a_given_baseline_is_named(make_policy, name, stored, bead_run):
+def test_failure_of_a_given_baseline_is_named(make_policy, name, num_stored, bead_run):
     message = rf"the baseline policy {name} failed: test_evaluate\.py, line \d+: KeyError: 'gain'"
     with pytest.raises(InputError, match=message):
-        evaluate(bead_run, episodes=2, baselines={"zero": zero_policy, "mine": make_policy}, processes=1)
-    assert len(list(bead_run.glob("baselines/zero-*.csv"))) == stored
+        evaluate(bead_run, episodes=2, baselines={"zero": zero_policy, "lab": make_policy}, processes=1)
+    assert len(list(bead_run.glob("baselines/zero-*.csv"))) == num_stored
 
 
-def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
+def test_stored_episodes_belong_to_the_policy_of_the_run(bead_run):
     folder = RunFolder(bead_run)
     evaluate(bead_run, episodes=2, baselines=["constant"])
     evaluate(bead_run, episodes=2, environment={"wall": -0.5})
@@ -192,7 +195,7 @@ def test_stored_episodes_are_those_of_the_runs_own_policy(bead_run):
     assert "policy" not in dict(stored_episodes(folder, folder.config(), HELD_OUT_SEED))
 
 
-def test_evaluate_takes_a_policy_without_a_run(bead_run, tmp_path):
+def test_evaluate_accepts_a_policy_without_a_run(bead_run, tmp_path):
     (tmp_path / "exported").mkdir()
     Policy.load(bead_run).save(tmp_path / "exported")
     own = evaluate(bead_run, episodes=2)
@@ -211,9 +214,9 @@ def test_evaluate_saves_successful_episodes(tmp_path):
     result = evaluate("zero", "NarrowPassage", environment={"guidance": "kmp"}, episodes=1, save=str(file))
     assert result["success_rate"] == 1.0
     assert result["saved"] == Demonstrations.load(file).num_demonstrations == 1
-    for wrong, message in (({"save": file}, "already exists"), ({"save": tmp_path / "x.yaml"}, r"\.npz or \.csv")):
+    for path, message in ((file, "already exists"), (tmp_path / "x.yaml", r"\.npz or \.csv")):
         with pytest.raises(InputError, match=message):
-            evaluate("zero", "NarrowPassage", **wrong)
+            evaluate("zero", "NarrowPassage", save=path)
     with pytest.raises(InputError, match="no signal 'wrench'"):
         evaluate("zero", "NarrowPassage", save=tmp_path / "other.npz", signal="wrench")
 
@@ -243,26 +246,26 @@ def test_evaluate_describes_differences_when_asked(bead_run):
 
 
 def test_results_do_not_depend_on_the_number_of_processes(tmp_path):
-    def run(processes):
+    def evaluate_in(processes):
         return evaluate(
             "uniform_random", "NarrowPassage", 2, baselines=["constant", "scripted"],
             environment={"action_repeat": 40}, processes=processes, save=tmp_path / f"{processes}.npz",
         )  # fmt: skip
 
-    one, several = run(1), run(2)
-    assert one == several
-    assert one.rows.keys() == several.rows.keys() == {"policy", "demonstration", "constant"}
-    assert one["skipped_baselines"] == ["scripted"]
-    for name, rows in one.rows.items():
+    single, several = evaluate_in(1), evaluate_in(2)
+    assert single == several
+    assert single.rows.keys() == several.rows.keys() == {"policy", "demonstration", "constant"}
+    assert single["skipped_baselines"] == ["scripted"]
+    for name, rows in single.rows.items():
         pd.testing.assert_frame_equal(rows, several.rows[name], check_exact=True)
-    assert one["saved"] == several["saved"] > 0
+    assert single["saved"] == several["saved"] > 0
     saved = [Demonstrations.load(tmp_path / f"{processes}.npz") for processes in (1, 2)]
     for first, second in zip(saved[0].outputs, saved[1].outputs, strict=True):
         np.testing.assert_array_equal(first, second)
 
 
-def test_baseline_draws_the_same_numbers_in_any_process():
-    """Each episode has a generator of its own, whichever episodes its process has run before."""
+def test_actions_of_a_baseline_are_independent_of_processes():
+    """Each episode has a random generator of its own, whatever episodes its process has run before."""
     env = make_environment("Bead", {})
     rows = {
         processes: evaluate_policy(env, BaselinePolicy(uniform_random, env), episodes=6, processes=processes)
@@ -272,15 +275,16 @@ def test_baseline_draws_the_same_numbers_in_any_process():
     pd.testing.assert_frame_equal(rows[1], rows[3], check_exact=True)
 
 
-def won(*successes):
+def outcomes(*successes):
+    """Return a table of episodes with these successes."""
     return pd.DataFrame({"success": successes})
 
 
-def test_comparison_is_an_exact_paired_test_against_each_baseline():
+def test_comparison_is_an_exact_paired_test_per_baseline():
     """The policy wins 9 of 10 discordant episodes: p = (1 + 10) / 2**10."""
-    policy, weak, other = won(*[1] * 9, 0, 1), won(*[0] * 9, 1, 1), won(*[0] * 11)
-    comparison = compare({"policy": policy, "weak": weak, "other": other})
-    assert comparison.baseline == "weak"
+    policy, best, worst = outcomes(*[1] * 9, 0, 1), outcomes(*[0] * 9, 1, 1), outcomes(*[0] * 11)
+    comparison = compare({"policy": policy, "best": best, "worst": worst})
+    assert comparison.baseline == "best"
     assert comparison.successes == 2
     assert comparison.p == pytest.approx(11 / 2**10)
     assert compare({"policy": policy, "same": policy}).p == 1.0
@@ -288,11 +292,11 @@ def test_comparison_is_an_exact_paired_test_against_each_baseline():
 
 
 def test_comparison_counts_the_baseline_that_is_hardest_to_beat():
-    """The baseline with most successes has 5 to 0 discordant episodes, another one 4 to 0, which is less certain."""
-    policy = won(*[1] * 10)
-    best, other = won(*[0] * 5, *[1] * 5), won(*[0] * 6, *[1] * 4)
-    assert compare({"policy": policy, "other": other, "best": best}).p == pytest.approx(1 / 2**5)
-    losing = won(*[1] * 5, *[0] * 5)
+    """Against the baseline with most successes, the policy wins 5 of 5 discordant episodes: p = 1 / 2**5."""
+    policy = outcomes(*[1] * 10)
+    best, worse = outcomes(*[0] * 5, *[1] * 5), outcomes(*[0] * 6, *[1] * 4)
+    assert compare({"policy": policy, "worse": worse, "best": best}).p == pytest.approx(1 / 2**5)
+    losing = outcomes(*[1] * 5, *[0] * 5)
     assert compare({"policy": losing, "better": policy, "best": best}).p == 1.0
 
 
@@ -317,13 +321,13 @@ def test_table_omits_collisions_that_are_not_counted():
     assert list(table) == ["success_rate", "success_low", "success_high"]
 
 
-@pytest.mark.parametrize(("force", "words"), [({"peak_force": 2.0}, ", peak force 2.0 N"), ({}, "")])
-def test_outcome_names_the_force_if_it_is_known(force, words):
-    assert outcome({"termination": "success", "steps": 3, **force}) == f"success after 3 control steps{words}"
+@pytest.mark.parametrize(("force", "text"), [({"peak_force": 2.0}, ", peak force 2.0 N"), ({}, "")])
+def test_outcome_names_the_force_when_known(force, text):
+    assert outcome({"termination": "success", "steps": 3, **force}) == f"success after 3 control steps{text}"
 
 
 def test_sentence_names_the_best_baseline():
-    rows = {"policy": won(*[1] * 12), "zero": won(1, *[0] * 11)}
+    rows = {"policy": outcomes(*[1] * 12), "zero": outcomes(1, *[0] * 11)}
     statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": 2e-3}
     sentence = Evaluation(statistics, rows).sentence
     assert (
@@ -333,33 +337,37 @@ def test_sentence_names_the_best_baseline():
     assert "was 0.002 m or rad." in sentence
 
 
-def test_sentence_says_that_a_violation_is_not_a_number():
+def test_sentence_states_that_a_violation_is_not_a_number():
     statistics = {"success_low": 0.7, "success_high": 1.0, "max_commanded_violation": float("nan")}
-    sentence = Evaluation(statistics, {"policy": won(1, 1)}).sentence
+    sentence = Evaluation(statistics, {"policy": outcomes(1, 1)}).sentence
     assert sentence.endswith("; the largest constraint violation of a command is unknown, because it is not a number.")
 
 
-@pytest.mark.parametrize("other", ["residual", "kgrl", "none"])
-def test_another_guidance_is_refused(other):
+@pytest.mark.parametrize("guidance", ["residual", "kgrl", "none"])
+def test_another_guidance_is_refused(guidance):
     refuse_guidance_change({"guidance": "skgrl"}, {"guidance": "skgrl"})
-    with pytest.raises(InputError, match=f"its actions have another meaning with {other}"):
-        refuse_guidance_change({"guidance": "skgrl"}, {"guidance": other})
+    with pytest.raises(InputError, match=f"its actions have another meaning with {guidance}"):
+        refuse_guidance_change({"guidance": "skgrl"}, {"guidance": guidance})
 
 
-def test_scope_differs_between_one_offset_and_any(bead_run):
-    one = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=False)
-    for_any = evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=True)
-    assert "the one offset that is hidden in this run" in one
-    assert for_any == evaluation_scope("GridClamp", {"fixture_offset": "per_episode"}, resample_offsets=False) != one
+def test_scope_differs_for_a_fixed_and_a_resampled_offset(bead_run):
+    fixed, resampled = (
+        evaluation_scope("BncConnector", {"fixture_offset": "per_run"}, resample_offsets=value)
+        for value in (False, True)
+    )
+    assert "the one offset that is hidden in this run" in fixed
+    assert (
+        resampled == evaluation_scope("GridClamp", {"fixture_offset": "per_episode"}, resample_offsets=False) != fixed
+    )
     assert evaluate(bead_run, episodes=1)["evaluation_scope"] == "held-out starts"
     with pytest.raises(InputError, match="no hidden offset to resample: leave --resample-offsets out"):
         evaluate(bead_run, episodes=1, resample_offsets=True)
 
 
-def test_resampled_offsets_exclude_that_of_the_run(bead_run, monkeypatch):
-    monkeypatch.setattr("guiderail.tools.evaluation.evaluate.evaluation_scope", lambda *given: "any")
-    own = RunFolder(bead_run).config().seed
-    for seed, episodes in ((own, 1), (own - 2, 3)):
+def test_resampled_offsets_exclude_the_offset_of_the_run(bead_run, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.evaluation.evaluate.evaluation_scope", lambda *arguments: "any")
+    run_seed = RunFolder(bead_run).config().seed
+    for seed, episodes in ((run_seed, 1), (run_seed - 2, 3)):
         with pytest.raises(InputError, match="has the offset of the run itself"):
             evaluate(bead_run, episodes=episodes, seed=seed, resample_offsets=True)
 
@@ -372,8 +380,8 @@ def test_hidden_offset_is_resampled_only_with_new_run():
         assert len({tuple(offset) for offset in sampled}) == number
 
 
-@pytest.mark.parametrize(("size", "names"), [(6, POSE_NAMES), (2, ("y1", "y2"))])
-def test_saved_poses_have_their_names(tmp_path, size, names):
-    motion = np.arange(3.0), np.arange(3.0 * size).reshape(3, size)
+@pytest.mark.parametrize(("num_outputs", "names"), [(6, POSE_NAMES), (2, ("y1", "y2"))])
+def test_saved_poses_have_their_names(tmp_path, num_outputs, names):
+    motion = np.arange(3.0), np.arange(3.0 * num_outputs).reshape(3, num_outputs)
     assert _save_demonstrations([None, motion], tmp_path / "saved.csv") == 1
     assert Demonstrations.load(tmp_path / "saved.csv").names == names

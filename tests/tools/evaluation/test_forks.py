@@ -15,7 +15,7 @@ def test_forked_map_yields_results_in_order(processes):
 
 def test_forked_map_uses_several_processes():
     def slow(index):
-        time.sleep(0.05)  # otherwise the first process takes them all
+        time.sleep(0.05)  # [s], so that the first process cannot finish all calls alone
         return os.getpid()
 
     result = set(forked_map(slow, 6, 3))
@@ -30,15 +30,17 @@ def test_forked_map_raises_the_error_of_a_process():
 
     with pytest.raises(InputError, match="is refused"):
         list(forked_map(refuse, 3, 2))
-    with pytest.raises(SystemExit, match="condition 'x > 0' failed"):  # a failed assertion of Drake, not a killed fork
+    with pytest.raises(SystemExit, match="condition 'x > 0' failed"):  # as a failed assertion of Drake raises
         list(forked_map(lambda index: sys.exit("condition 'x > 0' failed"), 3, 2))
     with pytest.raises(RuntimeError, match="_Unpicklable"):
         list(forked_map(lambda index: _raise(), 3, 2))
 
 
 class _UnpicklableError(Exception):
-    def __init__(self, one, two):
-        super().__init__("neither")
+    """Exception that cannot be unpickled, because `args` has fewer entries than the constructor has parameters."""
+
+    def __init__(self, first, second):
+        super().__init__("message")
 
 
 def _raise():
@@ -50,7 +52,7 @@ def test_forked_map_raises_when_a_process_is_killed():
         list(forked_map(lambda index: os.kill(os.getpid(), 9), 3, 2))
 
 
-def test_forked_map_leaves_no_process_when_it_is_abandoned():
+def test_forked_map_ends_its_processes_when_closed():
     results = forked_map(lambda index: os.getpid(), 50, 2)
     worker = next(results)
     results.close()
@@ -58,7 +60,7 @@ def test_forked_map_leaves_no_process_when_it_is_abandoned():
         os.kill(worker, 0)
 
 
-def test_check_processes_counts_the_cores():
+def test_check_processes_returns_the_number_of_cores():
     assert check_processes(None) == num_cores() >= 1
     assert check_processes(3) == 3
     with pytest.raises(InputError, match="at least one process, not 0"):

@@ -1,4 +1,4 @@
-"""Policies of other origin: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
+"""Policies of other packages: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
 
 import math
 import threading
@@ -46,9 +46,9 @@ def test_zip_of_stable_baselines3_acts_as_the_model(kind, env, tmp_path):
     np.testing.assert_array_equal(act(OBSERVATION), model.predict(OBSERVATION, deterministic=True)[0])
 
 
-def test_zip_is_read_only_if_code_is_allowed(env, tmp_path, monkeypatch):
+def test_zip_is_read_only_with_trust(env, tmp_path, monkeypatch):
     SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, device="cpu").save(tmp_path / "model")
-    monkeypatch.setattr(SAC, "load", lambda *_, **options: pytest.fail("the pickle is read"))
+    monkeypatch.setattr(SAC, "load", lambda *_, **options: pytest.fail("the pickle was read"))
     with pytest.raises(InputError, match=r"model.zip is a pickle, .* give --trust-policy if you trust its origin"):
         load_policy(tmp_path / "model.zip")
 
@@ -65,13 +65,13 @@ def test_damaged_files_are_refused(name, message, tmp_path):
 
 
 class Script(torch.nn.Module):
-    """Double the first two numbers."""
+    """Network that doubles the first two entries of the observation."""
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         return 2 * observation[:, :2]
 
 
-def test_torchscript_acts_if_code_is_allowed(env, tmp_path):
+def test_torchscript_is_loaded_only_with_trust(env, tmp_path):
     file = tmp_path / "policy.pt"
     torch.jit.trace(Script(), torch.zeros(1, 3)).save(file)
     with pytest.raises(InputError, match="is a program: give --trust-policy"):
@@ -81,7 +81,7 @@ def test_torchscript_acts_if_code_is_allowed(env, tmp_path):
 
 
 class Pair(torch.nn.Module):
-    """Return two tensors."""
+    """Network that returns two tensors."""
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         return observation, observation
@@ -112,8 +112,8 @@ def test_onnx_acts_as_its_network(batch, env, tmp_path):
     file.write_bytes(linear_policy(weight, bias, batch))
     act = check_compatible(load_policy(file), env)
     np.testing.assert_allclose(act(OBSERVATION), np.tanh(OBSERVATION @ weight + bias), rtol=1e-6)
-    one, two = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
-    assert one == two
+    single, double = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
+    assert single == double
 
 
 @pytest.fixture
@@ -123,16 +123,16 @@ def base_policies(monkeypatch):
     return BASE_POLICIES
 
 
-def test_base_policy_of_a_file_needs_trust_if_it_executes(tmp_path, monkeypatch, base_policies):
+def test_base_policy_of_a_file_needs_trust_when_executable(tmp_path, monkeypatch, base_policies):
     (tmp_path / "policy.onnx").write_bytes(linear_policy(np.zeros((3, 4), np.float32), np.zeros(4, np.float32), 1))
     torch.jit.trace(Script(), torch.zeros(1, 3)).save(tmp_path / "policy.pt")
-    (tmp_path / "base_of_mine.py").write_text("raise RuntimeError\n")
+    (tmp_path / "lab_base.py").write_text("raise RuntimeError\n")
     monkeypatch.chdir(tmp_path)
     environment = {"guidance": "kgrl_base_policy", "base_policy": "policy.onnx"}
     resolved = check_environment("NarrowPassage", environment)["base_policy"]
     assert resolved == str(tmp_path / "policy.onnx")
     assert chunk_samples(find_base_policy(resolved), np.zeros(3, np.float32), 2).shape == (1, 2, 2)
-    for source in ("policy.pt", "base_of_mine.py:chunk"):
+    for source in ("policy.pt", "lab_base.py:chunk"):
         with pytest.raises(InputError, match="give --trust-imports"):
             check_environment("NarrowPassage", environment | {"base_policy": source})
     with trust_imports():
@@ -140,13 +140,13 @@ def test_base_policy_of_a_file_needs_trust_if_it_executes(tmp_path, monkeypatch,
     assert str(tmp_path / "policy.pt") in base_policies.names()
 
 
-def test_base_policy_of_a_function_is_stored_with_its_path_and_its_code(tmp_path, monkeypatch, base_policies):
-    file = tmp_path / "chunk_of_mine.py"
+def test_base_policy_of_a_function_is_stored_with_path_and_code(tmp_path, monkeypatch, base_policies):
+    file = tmp_path / "lab_chunk.py"
     file.write_text("import numpy as np\ndef chunk(observation):\n    return np.zeros((1, 2, 2))\n")
     monkeypatch.chdir(tmp_path)
     with trust_imports():
         environment = check_environment(
-            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "chunk_of_mine.py:chunk"}
+            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "lab_chunk.py:chunk"}
         )
     assert environment["base_policy"] == f"{file}:chunk"
     before = task_content("NarrowPassage", environment, ())
@@ -154,7 +154,7 @@ def test_base_policy_of_a_function_is_stored_with_its_path_and_its_code(tmp_path
     assert task_content("NarrowPassage", environment, ()) != before
 
 
-def test_functions_of_files_with_equal_names_are_different_policies(tmp_path):
+def test_functions_in_files_of_equal_name_are_separate_policies(tmp_path):
     for folder, value in (("a", 1), ("b", 2)):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "pol.py").write_text(f"def act(observation):\n    return [{value}.0]\n")
@@ -185,12 +185,12 @@ def test_function_of_a_file_is_a_policy(env, tmp_path):
     [("model.zip", True), ("lab.policies:act", True), ("runs/a.py:act", True), ("runs/connector", False),
      ("scripted", False), ("pretrained:connector", False), ("lab/Peg", False)],
 )  # fmt: skip
-def test_is_policy_file_tells_files_from_names(source, expected):
+def test_is_policy_file_is_true_for_files_only(source, expected):
     assert is_policy_file(source) is expected
 
 
-class Counter:
-    """Return the number of actions in the episode, as a recurrent policy would."""
+class RecurrentCounter:
+    """Recurrent policy that returns the number of its actions in the episode."""
 
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         assert deterministic
@@ -199,13 +199,13 @@ class Counter:
 
 
 def test_state_of_a_recurrent_policy_is_reset_with_the_episode(env):
-    act = as_policy(Counter())
-    seen = []
+    act = as_policy(RecurrentCounter())
+    episodes = []
     for _ in range(2):
         steps = rollout(env, act, seed=0)["steps"]
-        seen.append((steps, act._state))
-    assert seen[0] == seen[1]
-    assert seen[0][1] == math.ceil(seen[0][0] / env.unwrapped.action_repeat) - 1
+        episodes.append((steps, act._state))
+    assert episodes[0] == episodes[1]
+    assert episodes[0][1] == math.ceil(episodes[0][0] / env.unwrapped.action_repeat) - 1
 
 
 def test_recurrent_model_of_sb3_contrib_is_a_policy(env, tmp_path):
@@ -213,18 +213,16 @@ def test_recurrent_model_of_sb3_contrib_is_a_policy(env, tmp_path):
     RecurrentPPO("MlpLstmPolicy", env, policy_kwargs=networks, seed=0, device="cpu").save(tmp_path / "recurrent")
     act = load_policy(tmp_path / "recurrent.zip", trust_policy=True)
     first = act(OBSERVATION)
-    assert not np.array_equal(act(OBSERVATION), first)  # its state has changed
+    assert not np.array_equal(act(OBSERVATION), first)  # in another state
     act.on_episode_start()
     np.testing.assert_array_equal(act(OBSERVATION), first)
 
 
 def test_python_model_is_evaluated_in_a_task(env):
     model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu")
-    as_model = evaluate(model, "Bead", 2, baselines=())
-    as_function = evaluate(
-        lambda observation: model.predict(observation, deterministic=True)[0], "Bead", 2, baselines=()
-    )
-    assert as_model["mean_return"] == as_function["mean_return"]
+    functions = (model, lambda observation: model.predict(observation, deterministic=True)[0])
+    first, second = (evaluate(policy, "Bead", 2, baselines=())["mean_return"] for policy in functions)
+    assert first == second
     with pytest.raises(InputError, match="is no policy: give the folder of a run"):
         evaluate(3, "Bead", 2)
     with pytest.raises(InputError, match=r"acts in a task: name the task \(--task\)"):
@@ -240,18 +238,18 @@ def test_model_with_other_action_bounds_is_refused(env, tmp_path):
 
 
 def test_spaces_that_differ_are_named_with_options_that_fit():
-    """The hard connector observes the center of pressure."""
+    """With difficulty=hard, the observation of the connector includes the center of pressure."""
     policy = SAC("MlpPolicy", make_environment("BncConnector", {"observation": "center_of_pressure"}), device="cpu")
     env = make_environment("BncConnector", {})
     with pytest.raises(InputError) as error:
         check_compatible(PredictPolicy(policy), env)
-    (sees,), (has,) = policy.observation_space.shape, env.observation_space.shape
-    assert f"takes observations ({sees},) and returns actions (2,)" in str(error.value)
-    assert f"this environment has observations ({has},) and actions (2,)" in str(error.value)
+    (policy_size,), (env_size,) = policy.observation_space.shape, env.observation_space.shape
+    assert f"takes observations ({policy_size},) and returns actions (2,)" in str(error.value)
+    assert f"this environment has observations ({env_size},) and actions (2,)" in str(error.value)
     assert "it fits with --env difficulty=hard or --env observation=center_of_pressure" in str(error.value)
 
 
-def test_mismatch_names_the_only_size_that_a_network_takes(env, tmp_path):
+def test_mismatch_names_the_only_size_that_a_network_accepts(env, tmp_path):
     torch.jit.script(torch.nn.Linear(5, 2)).save(tmp_path / "policy.pt")
     message = r"takes observations \({}\) and returns actions \({}\), .* observations \(3,\) and actions \(2,\)"
     with pytest.raises(InputError, match=message.format("5,", "2,") + ": give another policy"):
@@ -269,7 +267,7 @@ def test_mismatch_of_the_action_names_the_shape_to_return(shape, env):
         check_compatible(lambda observation: np.zeros(shape), env)
 
 
-def test_mismatch_with_every_option_does_not_name_options():
+def test_mismatch_names_no_options_when_none_fit():
     env = make_environment("NarrowPassage", {})
     with pytest.raises(InputError, match=r"returns actions \(2, 2\), .*: it must return an array of shape \(2,\)$"):
         check_compatible(lambda observation: np.zeros((2, 2)), env)
@@ -277,21 +275,21 @@ def test_mismatch_with_every_option_does_not_name_options():
         check_compatible(lambda observation: np.ones((2, 77)) @ observation, env)
 
 
-def raises(observation):
-    raise ValueError("boom")
+def fail(observation):
+    raise ValueError("wrong value")
 
 
-def raises_late(observation):
+def fail_in_episode(observation):
     if observation[0] > 0.0:
-        raise RuntimeError("late")
+        raise RuntimeError("wrong state")
     return np.zeros(2)
 
 
-def leaves(observation):
+def exit_program(observation):
     raise SystemExit
 
 
-class Raising:
+class FailingModel:
     """Model whose code has an error."""
 
     def predict(self, observation):
@@ -301,11 +299,11 @@ class Raising:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (raises, r"^the policy raises raised ValueError: boom, for observations of shape \(3,\)$"),
-        (raises_late, r"^the policy raises_late raised RuntimeError: late(?!,)"),
-        (leaves, r"^the policy leaves raised SystemExit, for"),
+        (fail, r"^the policy fail raised ValueError: wrong value, for observations of shape \(3,\)$"),
+        (fail_in_episode, r"^the policy fail_in_episode raised RuntimeError: wrong state(?!,)"),
+        (exit_program, r"^the policy exit_program raised SystemExit, for"),
         (lambda: np.zeros(2), r"^the policy raised TypeError: .*takes 0 positional arguments"),
-        (Raising(), r"^the policy Raising raised KeyError: 'x', for"),
+        (FailingModel(), r"^the policy FailingModel raised KeyError: 'x', for"),
     ],
 )
 def test_exception_of_a_policy_is_named(policy, message, env):
@@ -315,8 +313,8 @@ def test_exception_of_a_policy_is_named(policy, message, env):
         evaluate(policy, "Bead", 2, baselines=(), processes=2)
 
 
-class Asserting(torch.nn.Module):
-    """Fail for every observation."""
+class FailingNetwork(torch.nn.Module):
+    """Network whose assertion fails for every observation."""
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         assert bool(observation.sum() > 1e9), "too small"
@@ -325,7 +323,10 @@ class Asserting(torch.nn.Module):
 
 @pytest.mark.parametrize(
     ("module", "message"),
-    [(Asserting(), "RuntimeError: AssertionError: too small"), (torch.nn.Linear(3, 2).double(), ".*Float and Double")],
+    [
+        (FailingNetwork(), "RuntimeError: AssertionError: too small"),
+        (torch.nn.Linear(3, 2).double(), ".*Float and Double"),
+    ],
 )
 def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
     torch.jit.script(module).save(tmp_path / "policy.pt")
@@ -334,30 +335,26 @@ def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
 
 
 def test_class_of_a_file_that_cannot_be_constructed_is_named(tmp_path):
-    (tmp_path / "model_of_mine.py").write_text(
-        "class Model:\n    def __init__(self):\n        raise OSError('no disk')\n"
-    )
-    with pytest.raises(InputError, match=r"model_of_mine\.py:Model cannot be constructed: it raised OSError: no disk"):
-        load_policy(f"{tmp_path}/model_of_mine.py:Model")
+    (tmp_path / "lab_model.py").write_text("class Model:\n    def __init__(self):\n        raise OSError('no disk')\n")
+    with pytest.raises(InputError, match=r"lab_model\.py:Model cannot be constructed: it raised OSError: no disk"):
+        load_policy(f"{tmp_path}/lab_model.py:Model")
 
 
-def test_function_that_returns_a_pair_gets_a_hint(env):
-    with pytest.raises(
-        InputError, match="only a predict method returns an action and a state: return the action alone"
-    ):
+def test_message_has_a_hint_when_a_function_returns_a_pair(env):
+    message = "only a predict method returns an action and a state: return the action alone"
+    with pytest.raises(InputError, match=message):
         check_compatible(lambda observation: (np.zeros(2), None), env)
 
 
-@pytest.mark.parametrize("where", ["Bead", None])
-def test_function_may_return_a_batch_of_one_action(where):
-    target, rows = where or Pointer(), []
-    for policy in (lambda observation: -observation[:2], lambda observation: -observation[None, :2]):
-        rows.append(evaluate(policy, target, 2, baselines=())["mean_return"])
-    assert rows[0] == rows[1]
+@pytest.mark.parametrize("task", ["Bead", None])
+def test_function_may_return_a_batch_of_one_action(task):
+    policies = (lambda observation: -observation[:2], lambda observation: -observation[None, :2])
+    single, batch = (evaluate(policy, task or PointToOrigin(), 2, baselines=())["mean_return"] for policy in policies)
+    assert single == batch
 
 
-class Pointer(gymnasium.Env):
-    """Environment of another origin: the action moves a point to the origin."""
+class PointToOrigin(gymnasium.Env):
+    """Environment of another package: actions are displacements of a point, which is to reach the origin."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
@@ -365,33 +362,33 @@ class Pointer(gymnasium.Env):
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         assert not options
-        self.point, self.left = self.np_random.uniform(-1, 1, 2), 10
+        self.point, self.num_steps = self.np_random.uniform(-1, 1, 2), 0
         return self.point.astype(np.float32), {}
 
     def step(self, action):
-        self.point, self.left = self.point + 0.3 * np.clip(action, -1, 1), self.left - 1
+        self.point, self.num_steps = self.point + 0.3 * np.clip(action, -1, 1), self.num_steps + 1
         distance = float(np.linalg.norm(self.point))
         info = {"success": distance < 0.1, "constraint_violation": distance - 3.0}
-        return self.point.astype(np.float32), -distance, distance < 0.1, not self.left, info
+        return self.point.astype(np.float32), -distance, distance < 0.1, self.num_steps == 10, info
 
 
-def test_environment_of_another_origin_is_evaluated():
-    result = evaluate(lambda point: -3.0 * point, Pointer(), 6, processes=2)
+def test_environment_of_another_package_is_evaluated():
+    result = evaluate(lambda point: -3.0 * point, PointToOrigin(), 6, processes=2)
     assert result["success_rate"] == 1.0
     assert result["baselines"] == ["zero", "uniform_random", "constant"]
     assert -3.0 < result["max_commanded_violation"] < 0.0
     assert result["peak_force"] is None
     assert result["p"] < 0.05
     assert "better than the best baseline" in result.sentence
-    assert result == evaluate(lambda point: -3.0 * point, Pointer(), 6, processes=1)
-    assert evaluate("constant", Pointer(), 2, baselines=["zero"])["baselines"] == ["zero"]
+    assert result == evaluate(lambda point: -3.0 * point, PointToOrigin(), 6, processes=1)
+    assert evaluate("constant", PointToOrigin(), 2, baselines=["zero"])["baselines"] == ["zero"]
     with pytest.raises(InputError, match="no baseline policy 'scripted'"):
-        evaluate("zero", Pointer(), 2, baselines=["scripted"])
+        evaluate("zero", PointToOrigin(), 2, baselines=["scripted"])
     with pytest.raises(InputError, match="given as an object"):
-        evaluate("zero", Pointer(), 2, environment={"station": "arm"})
+        evaluate("zero", PointToOrigin(), 2, environment={"station": "arm"})
 
 
-class Still(gymnasium.Wrapper):
+class WithoutSuccess(gymnasium.Wrapper):
     """Environment that reports no success."""
 
     def step(self, action):
@@ -400,7 +397,7 @@ class Still(gymnasium.Wrapper):
 
 @pytest.mark.parametrize("episodes", [1, 3])
 def test_environment_without_success_has_no_success_rate(episodes):
-    result = evaluate(lambda point: -3.0 * point, Still(Pointer()), episodes)
+    result = evaluate(lambda point: -3.0 * point, WithoutSuccess(PointToOrigin()), episodes)
     mean = result["mean_return"]
     assert result.sentence == (
         f"The environment reports no success; the policy's mean return of {episodes} episodes is {mean:.4g}."
@@ -411,12 +408,12 @@ def test_environment_without_success_has_no_success_rate(episodes):
 
 
 def test_sentence_has_no_held_out_episodes_for_an_environment():
-    result = evaluate(lambda point: -3.0 * point, Pointer(), 4)
+    result = evaluate(lambda point: -3.0 * point, PointToOrigin(), 4)
     assert "succeeds in 4 of 4 episodes (95 % interval" in result.sentence
-    assert "succeeds in 0 of 4 episodes" in evaluate(lambda point: 3.0 * point, Pointer(), 4).sentence
+    assert "succeeds in 0 of 4 episodes" in evaluate(lambda point: 3.0 * point, PointToOrigin(), 4).sentence
 
 
-class Counting:
+class CallCounter:
     """Policy that counts its calls."""
 
     calls = 0
@@ -428,10 +425,10 @@ class Counting:
 
 @pytest.mark.parametrize("is_declared", [False, True])
 def test_policy_is_called_in_the_episodes_only(is_declared):
-    policy, env = Counting(), gymnasium.make("CartPole-v1")
+    policy, env = CallCounter(), gymnasium.make("CartPole-v1")
     if is_declared:
         policy.observation_space, policy.action_space = env.observation_space, env.action_space
-        policy.lock = threading.Lock()  # which cannot be copied
+        policy.lock = threading.Lock()  # a lock cannot be copied
     result = evaluate(policy, env, 2, baselines=(), processes=1)
     assert policy.calls == result["mean_steps"] * 2
 
@@ -439,22 +436,27 @@ def test_policy_is_called_in_the_episodes_only(is_declared):
 def test_registered_environment_is_evaluated_by_its_id():
     result = evaluate(lambda observation: 0, "CartPole-v1", 2)
     assert dict(result) == dict(evaluate(lambda observation: 0, gymnasium.make("CartPole-v1"), 2))
-    own, named = (evaluate("zero", name, 1, baselines=()) for name in ("guiderail/NarrowPassage-v0", "NarrowPassage"))
-    assert dict(own) == dict(named)
+    by_id, by_name = (
+        evaluate("zero", name, 1, baselines=()) for name in ("guiderail/NarrowPassage-v0", "NarrowPassage")
+    )
+    assert dict(by_id) == dict(by_name)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("zero", gymnasium.vector.SyncVectorEnv([Pointer] * 2)), "single environment, and .* is a vector environment"),
-        (("zero", Pointer), r"Pointer is a class: give an environment, such as Pointer\(\)"),
-        ((Pointer(), lambda point: point), "needs a policy and then the name of a task, .*, not <function"),
+        (
+            ("zero", gymnasium.vector.SyncVectorEnv([PointToOrigin] * 2)),
+            "single environment, and .* is a vector environment",
+        ),
+        (("zero", PointToOrigin), r"PointToOrigin is a class: give an environment, such as PointToOrigin\(\)"),
+        ((PointToOrigin(), lambda point: point), "needs a policy and then the name of a task, .*, not <function"),
         (("NarrowPassage", lambda point: point), "needs a policy and then the name of a task"),
         (("zero", "CartPole-v99"), "no environment 'CartPole-v99' is registered with Gymnasium: check the id"),
         (("zero", "NarowPassage"), "did you mean NarrowPassage"),
     ],
 )
-def test_evaluation_in_something_else_is_refused(arguments, message):
+def test_evaluation_in_an_invalid_environment_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
         evaluate(*arguments, episodes=1)
 
@@ -462,11 +464,11 @@ def test_evaluation_in_something_else_is_refused(arguments, message):
 @pytest.mark.parametrize("returned", [0.0, np.zeros(3), None, np.zeros((2, 2)), [0.0, [0.0]]])
 def test_action_of_a_function_with_another_shape_is_refused(returned):
     with pytest.raises(InputError, match=r"the policy returned .*, and the actions .* have the shape \(2,\)"):
-        evaluate(lambda point: returned, Pointer(), 1, baselines=(), processes=1)
+        evaluate(lambda point: returned, PointToOrigin(), 1, baselines=(), processes=1)
 
 
-class Constant:
-    """Model of another package."""
+class ZeroModel:
+    """Model of another package, which always returns zero."""
 
     def predict(self, observation):
         return np.zeros(2)
@@ -477,27 +479,27 @@ class Constant:
     [
         ("constant", "baselines are a list of names"),
         (5, "baselines are a list of names"),
-        ({"still": 5}, "baseline still must be a function from an environment to a policy, not 5"),
-        ({"still": lambda point: np.zeros(2)}, "must return a policy, not array"),
+        ({"lab": 5}, "baseline lab must be a function from an environment to a policy, not 5"),
+        ({"lab": lambda point: np.zeros(2)}, "must return a policy, not array"),
     ],
 )
 def test_baselines_of_another_type_are_refused(baselines, message):
     with pytest.raises(InputError, match=message):
-        evaluate(Constant(), Pointer(), 1, baselines=baselines, processes=1)
+        evaluate(ZeroModel(), PointToOrigin(), 1, baselines=baselines, processes=1)
 
 
 def test_class_is_no_policy():
-    with pytest.raises(InputError, match=r"Constant is a class: give a policy, such as Constant\(\)"):
-        evaluate(Constant, Pointer(), 1)
+    with pytest.raises(InputError, match=r"ZeroModel is a class: give a policy, such as ZeroModel\(\)"):
+        evaluate(ZeroModel, PointToOrigin(), 1)
 
 
 def test_policy_of_another_environment_is_refused():
     policy = Policy.load(find_run("pretrained:passage"))
     with pytest.raises(InputError, match=r"the policy takes observations \(\d+,\)"):
-        evaluate(policy, Pointer(), 1, baselines=(), processes=1)
+        evaluate(policy, PointToOrigin(), 1, baselines=(), processes=1)
 
 
-def test_environment_that_cannot_be_made_is_refused():
+def test_environment_that_cannot_be_constructed_is_refused():
     gymnasium.register("Broken-v0", entry_point="package_that_does_not_exist:Broken")
     try:
         with pytest.raises(InputError, match=r"environment Broken-v0 cannot be made: .*package_that_does_not_exist"):
@@ -518,7 +520,7 @@ def test_name_of_a_pretrained_policy_loads_it():
     np.testing.assert_array_equal(named(observation), loaded(observation))
 
 
-def test_pretrained_policy_is_evaluated_without_writing_into_the_package(bead_run, tmp_path, monkeypatch):
+def test_evaluation_of_a_pretrained_policy_writes_no_file(bead_run, tmp_path, monkeypatch):
     folder = tmp_path / "package" / "bead"
     folder.mkdir(parents=True)
     for name in ("config.yaml", "policy.json", "policy.safetensors"):

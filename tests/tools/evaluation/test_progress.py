@@ -21,7 +21,7 @@ def printed(terminal):
     return text.getvalue()
 
 
-def test_log_file_gets_the_lines_of_the_bar():
+def test_log_file_contains_the_lines_of_the_bar():
     text = printed(terminal=False)
     assert "\x1b" not in text
     first, last = text.splitlines()[0], text.splitlines()[-1]
@@ -32,15 +32,15 @@ def test_log_file_gets_the_lines_of_the_bar():
 
 
 def test_status_averages_all_episodes_without_a_window():
-    last, whole = EpisodeProgress(40), EpisodeProgress(40, window=None)
+    windowed, whole = EpisodeProgress(40), EpisodeProgress(40, window=None)
     for i in range(40):
-        for progress in (last, whole):
+        for progress in (windowed, whole):
             progress.update({"episode": i, "success": int(i >= 30), "return": 0.0, "max_commanded_violation": -1.0})
-    assert last.status().startswith("last 10: success 100%")
+    assert windowed.status().startswith("last 10: success 100%")
     assert whole.status().startswith("success 25%")
 
 
-def test_terminal_gets_a_bar():
+def test_terminal_shows_a_bar():
     text = printed(terminal=True)
     for word in ("4/4", "success 50%", "return 10.0", "violation 2.0e-03 m"):
         assert word in text
@@ -53,7 +53,7 @@ def test_violation_that_is_not_a_number_is_shown():
     assert "largest violation nan" in progress.status()
 
 
-def test_success_is_left_out_if_the_environment_reports_none():
+def test_status_omits_success_when_none_is_reported():
     progress = EpisodeProgress(2)
     row = {"episode": 0, "success": 0, "return": 2.0, "reports_success": 0}
     progress.update(row)

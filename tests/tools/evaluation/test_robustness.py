@@ -37,33 +37,28 @@ def run(bead_run, monkeypatch):
 
 
 def test_robustness_evaluates_each_point_once(run, capsys):
-    sentences = []
-    how = {
-        "episodes": 3,
-        "baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)},
-        "log": sentences.append,
-    }
-    first = robustness([run], **how)
+    options = {"episodes": 3, "baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}}
+    first = robustness([run], **options)
     assert {row["policy"] for row in first["rows"]} == {"policy", "demonstration", "uniform_random"}
     assert [row["value"] for row in first["rows"] if row["policy"] == "policy"] == [-0.5, 1.0]
     assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])
     assert "4/6 wall 1 policy 3/3" in capsys.readouterr().err
-    assert robustness([run], **how)["rows"] == first["rows"]
+    assert robustness([run], **options)["rows"] == first["rows"]
     assert "policy 3/3" not in capsys.readouterr().err
     assert len(pd.read_csv(first["table"])) == 6
     assert first["picture"].stat().st_size > 10_000
-    assert robustness([run], **{**how, "episodes": 2})["rows"] != first["rows"]
+    assert robustness([run], **{**options, "episodes": 2})["rows"] != first["rows"]
 
 
 def test_table_is_named_after_the_arguments(run, monkeypatch):
-    asked = [{}, {"axes": "wall"}, {"environment": {"action_repeat": 2}}]
-    asked += [{"episodes": 2}, {"seed": 7}, {"baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}}]
+    options = [{}, {"axes": "wall"}, {"environment": {"action_repeat": 2}}, {"episodes": 2}, {"seed": 7}]
+    options.append({"baselines": {"uniform_random": partial(BaselinePolicy, uniform_random)}})
     monkeypatch.setattr(module, "EPISODES", 1)
-    tables = [robustness([run], **{"episodes": 1, **one})["table"] for one in asked]
-    words = ["", "-wall", "-action_repeat=2", "-episodes=2", "-seed=7", "-uniform_random"]
-    assert [table.stem for table in tables] == [f"robustness{one}" for one in words]
+    tables = [robustness([run], **{"episodes": 1, **each})["table"] for each in options]
+    suffixes = ["", "-wall", "-action_repeat=2", "-episodes=2", "-seed=7", "-uniform_random"]
+    assert [table.stem for table in tables] == [f"robustness{suffix}" for suffix in suffixes]
     for table in tables:
-        assert all(table.with_suffix(kind).is_file() for kind in (".csv", ".md", ".png"))
+        assert all(table.with_suffix(ending).is_file() for ending in (".csv", ".md", ".png"))
 
 
 def test_draw_accepts_a_name_with_dollar_signs(run, tmp_path):
@@ -71,14 +66,14 @@ def test_draw_accepts_a_name_with_dollar_signs(run, tmp_path):
     assert draw(tmp_path / "picture.png", rows).is_file()
 
 
-def test_table_has_nan_if_one_episode_has(run, monkeypatch):
+def test_table_has_nan_when_an_episode_has_nan(run, monkeypatch):
     columns = {"success": [1, 1], "steps": [5, 5], "peak_force": [np.nan, 2.0], "max_commanded_violation": [-1, np.nan]}
     monkeypatch.setattr(module, "evaluate_once", lambda *_, **options: pd.DataFrame(columns))
     for row in robustness([run], episodes=2)["rows"]:
         assert np.isnan([row["peak_force"], row["max_commanded_violation"]]).all()
 
 
-def test_values_below_names_where_the_policy_fails(run):
+def test_values_below_names_values_at_which_the_policy_fails(run):
     result = robustness([run], episodes=2)
     assert -0.5 in values_below(result["rows"], "policy")["wall"]
 
@@ -90,46 +85,47 @@ def test_robustness_re_evaluates_a_changed_policy(run, capsys):
     policy.save(run)
     capsys.readouterr()
     robustness([run], episodes=2)
-    said = capsys.readouterr().err
-    assert "policy 2/2" in said
-    assert "demonstration 2/2" not in said
+    printed = capsys.readouterr().err
+    assert "policy 2/2" in printed
+    assert "demonstration 2/2" not in printed
 
 
 def test_robustness_compares_several_runs(run, bead_config, tmp_path, capsys):
-    other = replace(bead_config, environment={**bead_config.environment, "guidance": "kmp"})
-    run_training(RunFolder(tmp_path / "other"), other)
+    config = replace(bead_config, environment={**bead_config.environment, "guidance": "kmp"})
+    run_training(RunFolder(tmp_path / "other"), config)
     sentences, out = [], tmp_path / "both"
     robustness([run], episodes=2, out=out)
     capsys.readouterr()
     with pytest.raises(InputError, match="--out"):
         robustness([run, tmp_path / "other"], episodes=2)
     result = robustness([run, tmp_path / "other"], episodes=2, out=out, log=sentences.append)
-    said = capsys.readouterr().err
+    printed = capsys.readouterr().err
     assert result["policies"] == ["sKGRL", "demonstration alone"]
     assert sentences == ["the runs differ in guidance"]
-    assert "demonstration 2/2" not in said
-    assert "demonstration alone 2/2" in said
+    assert "demonstration 2/2" not in printed
+    assert "demonstration alone 2/2" in printed
     assert [row["policy"] for row in result["rows"]] == ["sKGRL", "demonstration alone", "demonstration"] * 2
     assert robustness([run, tmp_path / "other"], episodes=2, out=out)["rows"] == result["rows"]
     assert capsys.readouterr().err == ""
 
 
-def test_policies_by_name_have_their_own_episodes_and_tables(run, tmp_path):
-    how = {"task": "Bead", "episodes": 1, "out": tmp_path}
-    first, second = (robustness([name], **how) for name in ("zero", "random_corner"))
+def test_policies_by_name_have_separate_episodes_and_tables(run, tmp_path):
+    options = {"task": "Bead", "episodes": 1, "out": tmp_path}
+    first, second = (robustness([name], **options) for name in ("zero", "random_corner"))
     assert first["rows"][2]["max_commanded_violation"] != second["rows"][2]["max_commanded_violation"]
     assert first["table"] != second["table"]
-    assert second["rows"] == robustness(["random_corner"], **how | {"out": tmp_path / "new"})["rows"]
+    assert second["rows"] == robustness(["random_corner"], **options | {"out": tmp_path / "new"})["rows"]
 
 
 def test_baseline_among_the_policies_is_evaluated_once(run, tmp_path, monkeypatch):
-    how = {"task": "Bead", "episodes": 1, "out": tmp_path}
+    options = {"task": "Bead", "episodes": 1, "out": tmp_path}
     monkeypatch.setattr(module, "is_demonstrated", lambda guidance: False)
-    rows = robustness(["random_corner", "constant"], baselines=["uniform_random", "constant", "zero"], **how)["rows"]
+    baselines = ["uniform_random", "constant", "zero"]
+    rows = robustness(["random_corner", "constant"], baselines=baselines, **options)["rows"]
     assert [row["policy"] for row in rows] == ["random_corner", "constant", "uniform_random", "zero"] * 2
     for names, baseline in ((["zero", "constant"], "constant"), ([run], "policy")):
         with pytest.raises(InputError, match=f"two policies are called '{baseline}': rename a policy"):
-            robustness(names, baselines={baseline: zero_policy}, **how)
+            robustness(names, baselines={baseline: zero_policy}, **options)
 
 
 def test_episodes_of_another_function_are_not_used_again(run):
@@ -152,23 +148,23 @@ def test_robustness_refuses_other_tasks_and_the_same_folder(run, tmp_path):
         robustness([run, copy], out=tmp_path)
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"axes": "frictoin"}])
-def test_robustness_refuses_wrong_arguments(run, wrong):
+@pytest.mark.parametrize("options", [{"episodes": 0}, {"axes": "frictoin"}])
+def test_robustness_refuses_invalid_arguments(run, options):
     with pytest.raises(InputError):
-        robustness([run], **wrong)
+        robustness([run], **options)
 
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
-def test_points_cover_every_value_or_state_why_not(task):
+def test_points_cover_every_value_or_name_a_reason(task):
     arguments = check_environment(task, {})
     result, left_out = points(task, arguments, AXES)
     values_left_out = sum(sentence.partition(" left out: ")[0].count(" ") for sentence in left_out)
     assert len(result) + values_left_out == sum(len(axis.values) for axis in AXES)
     for axis in AXES:
-        at = {point.value: point.environment for point in result if point.axis is axis}
-        if axis.default in at:
-            assert at[axis.default] == arguments
-        assert all(at[value] != arguments for value in at if value != axis.default)
+        environments = {point.value: point.environment for point in result if point.axis is axis}
+        if axis.default in environments:
+            assert environments[axis.default] == arguments
+        assert all(environments[value] != arguments for value in environments if value != axis.default)
     names = {sentence.split()[0] for sentence in left_out}
     assert names.isdisjoint({point.axis.name for point in result} - {"clearance"})
     assert names <= {"payload", "clearance", "offsets"}
@@ -187,10 +183,10 @@ def test_axis_without_a_disturbed_point_is_left_out(tmp_path):
 def test_points_replace_a_range_by_each_value():
     arguments = check_environment("BncConnector", {"friction_factor": (0.5, 2.0), "stiffness_factor": 1.7})
     result, _ = points("BncConnector", arguments, select_axes("friction,stiffness,lost"))
-    at = {(point.axis.name, point.value): point for point in result}
-    assert at["friction", 1.0].environment["friction_factor"] == (1.0, 1.0)
-    assert at["stiffness", 1.0].environment["stiffness_factor"] == 1.0
-    assert at["lost", 0.0].environment == arguments
+    environments = {(point.axis.name, point.value): point.environment for point in result}
+    assert environments["friction", 1.0]["friction_factor"] == (1.0, 1.0)
+    assert environments["stiffness", 1.0]["stiffness_factor"] == 1.0
+    assert environments["lost", 0.0] == arguments
     assert {point.axis.name: point.trained for point in result} == {"friction": None, "stiffness": None, "lost": 0.0}
 
 
@@ -201,46 +197,47 @@ def test_only_the_offset_axis_resamples_hidden_offsets(fixture_offset, is_resamp
         assert point.options == ({"new_run": True} if is_resampled and point.axis.name == "offsets" else {})
 
 
-def test_all_policies_get_the_same_resampled_offsets(bead_config, tmp_path, monkeypatch):
+def test_all_policies_are_evaluated_at_the_same_offsets(bead_config, tmp_path, monkeypatch):
     # Episodes end at the first contact.
     short = {"action_repeat": 25, "bounded_force": False, "force_limit": 5.0}
     environment = check_environment("BncConnector", {"fixture_offset": "per_run", "guidance": "kgrl", **short})
     config = replace(bead_config, task="BncConnector", environment=environment)
-    met = {"policy": [], "uniform_random": []}
+    sampled = {"policy": [], "uniform_random": []}
 
-    def watching(name):
-        def acts(env):
+    def recording_policy(name):
+        def make_policy(env):
             def act(_):
-                met[name].append(tuple(env.unwrapped.sampled["jack_offset"]))
+                sampled[name].append(tuple(env.unwrapped.sampled["jack_offset"]))
                 return np.zeros(env.action_space.shape)
 
             return act
 
-        return acts
+        return make_policy
 
-    def one(*_, **options):
-        return Subject("policy", config, watching("policy"))
+    def find(*_, **options):
+        return Subject("policy", config, recording_policy("policy"))
 
-    (offsets,) = select_axes("offsets")
-    monkeypatch.setattr("guiderail.tools.evaluation.robustness.find_subject", one)
-    monkeypatch.setattr(module, "AXES", (replace(offsets, values=(2.0,)),))
-    baselines = {"uniform_random": watching("uniform_random")}
+    (axis,) = select_axes("offsets")
+    monkeypatch.setattr(module, "find_subject", find)
+    monkeypatch.setattr(module, "AXES", (replace(axis, values=(2.0,)),))
+    baselines = {"uniform_random": recording_policy("uniform_random")}
     robustness([tmp_path], episodes=2, baselines=baselines, out=tmp_path, processes=1)
-    # The first offset is that of the compatibility check, in the run's own environment.
-    places = {name: set(seen) - {seen[0]} for name, seen in met.items()}
-    assert len(places["policy"]) == 2
-    assert places["policy"] == places["uniform_random"]
-    assert all(2.0 * MM <= np.hypot(*place) <= 3.0 * MM for place in places["policy"])
+    # The first offset belongs to the compatibility check, which acts in the run's own environment.
+    offsets = {name: set(values) - {values[0]} for name, values in sampled.items()}
+    assert len(offsets["policy"]) == 2
+    assert offsets["policy"] == offsets["uniform_random"]
+    assert all(2.0 * MM <= np.hypot(*offset) <= 3.0 * MM for offset in offsets["policy"])
     (point,), _ = points("BncConnector", environment, module.AXES)
-    before = episodes_file(tmp_path / "episodes", "policy", config, point.environment, episodes=2, seed=HELD_OUT_SEED)
-    kept = list((tmp_path / "episodes").glob("policy-*.csv"))
-    assert len(kept) == 1
-    assert before not in kept
+    of_fixed_offset = episodes_file(
+        tmp_path / "episodes", "policy", config, point.environment, episodes=2, seed=HELD_OUT_SEED
+    )
+    (stored,) = (tmp_path / "episodes").glob("policy-*.csv")
+    assert stored != of_fixed_offset
 
 
-@pytest.mark.parametrize(("kind", "trained"), [("per_episode", 1.5e-3), ("none", 0.3e-3)])
-def test_offsets_reach_twice_the_trained_ones(kind, trained):
+@pytest.mark.parametrize(("fixture_offset", "trained_offset"), [("per_episode", 1.5e-3), ("none", 0.3e-3)])
+def test_offset_axis_ends_at_twice_the_trained_offset(fixture_offset, trained_offset):
     (offsets,) = select_axes("offsets")
-    result, _ = points("BncConnector", {"fixture_offset": kind}, [offsets])
-    assert result[-1].environment["offset_range"] == (0.0, 2.0 * trained)
+    result, _ = points("BncConnector", {"fixture_offset": fixture_offset}, [offsets])
+    assert result[-1].environment["offset_range"] == (0.0, 2.0 * trained_offset)
     assert result[-1].environment["fixture_offset"] == "per_episode"

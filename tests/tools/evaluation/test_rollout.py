@@ -11,32 +11,34 @@ from guiderail.tools.evaluation.metrics import COLUMNS
 from guiderail.tools.evaluation.rollout import Callback, rollout
 
 
-class Diary(Callback):
+class Recorder(Callback):
+    """Callback that records its calls."""
+
     def __init__(self):
-        self.said = []
+        self.calls = []
 
     def on_episode_start(self):
-        self.said.append("begin")
+        self.calls.append("start")
 
-    def on_step(self, decision):
-        self.said.append(decision)
+    def on_step(self, transition):
+        self.calls.append(transition)
 
     def on_episode_end(self, row):
-        self.said.append("end")
-        return {"decisions": len(self.said) - 2}
+        self.calls.append("end")
+        return {"transitions": len(self.calls) - 2}
 
 
 def test_callbacks_are_called_from_start_to_end():
-    env, diary = make_environment("Bead", {"action_repeat": 2}), Diary()
-    row = rollout(env, lambda observation: np.array([0.5, -1.0]), diary, index=7, seed=3)
-    first, *decisions, last = diary.said
-    assert (first, last) == ("begin", "end")
-    assert [decision.is_last for decision in decisions] == [False] * (len(decisions) - 1) + [True]
-    for before, after in itertools.pairwise(decisions):
+    env, recorder = make_environment("Bead", {"action_repeat": 2}), Recorder()
+    row = rollout(env, lambda observation: np.array([0.5, -1.0]), recorder, index=7, seed=3)
+    first, *transitions, last = recorder.calls
+    assert (first, last) == ("start", "end")
+    assert [transition.is_last for transition in transitions] == [False] * (len(transitions) - 1) + [True]
+    for before, after in itertools.pairwise(transitions):
         assert before.next_observation is after.observation
-    assert row["decisions"] == len(decisions) == -(-row["steps"] // 2)
-    assert row["return"] == sum(decision.reward for decision in decisions)
-    assert list(row) == [*(c.name for c in COLUMNS), "reward_goal_distance", "decisions"]
+    assert row["transitions"] == len(transitions) == -(-row["steps"] // 2)
+    assert row["return"] == sum(transition.reward for transition in transitions)
+    assert list(row) == [*(column.name for column in COLUMNS), "reward_goal_distance", "transitions"]
     assert row["episode"] == 7
 
 
@@ -49,7 +51,7 @@ def test_callback_cannot_replace_a_column():
         rollout(make_environment("Bead", {}), lambda observation: np.zeros(2), Score(), seed=3)
 
 
-class Predicting:
+class Model:
     def predict(self, observation):
         return 0, None
 
@@ -68,12 +70,11 @@ class Predicting:
         ({"act": lambda observation: "left"}, "returned 'left', and the actions"),
     ],
 )
-def test_rollout_takes_and_refuses_what_an_evaluation_does(change, message):
-    given = {"env": gymnasium.make("CartPole-v1"), "act": Predicting(), "seed": np.int64(3)}
-    own = rollout(**given)
-    assert own == rollout(given["env"], lambda observation: 0, seed=3)
+def test_rollout_accepts_models_and_refuses_invalid_arguments(change, message):
+    arguments = {"env": gymnasium.make("CartPole-v1"), "act": Model(), "seed": np.int64(3)}
+    assert rollout(**arguments) == rollout(arguments["env"], lambda observation: 0, seed=3)
     with pytest.raises(InputError, match=message):
-        rollout(**given | change)
+        rollout(**arguments | change)
 
 
 def test_reward_that_is_not_a_number_is_refused():
@@ -93,11 +94,11 @@ def test_seed_repeats_an_episode_and_held_out_differs():
 
 
 def test_policy_that_is_a_callback_is_called_once():
-    env, messages = make_environment("Bead", {}), []
+    env, calls = make_environment("Bead", {}), []
 
     class Policy(Callback):
         def on_episode_start(self):
-            messages.append("begin")
+            calls.append("start")
 
         def __call__(self, observation):
             return np.zeros(2)
@@ -105,7 +106,7 @@ def test_policy_that_is_a_callback_is_called_once():
     policy = Policy()
     rollout(env, policy, seed=0)
     rollout(env, policy, policy, seed=0)
-    assert messages == ["begin", "begin"]
+    assert calls == ["start", "start"]
 
 
 def test_failed_simulation_has_a_row():
@@ -121,7 +122,7 @@ def test_failed_simulation_has_a_row():
     assert (row["max_commanded_violation"], row["peak_force"]) == (env.unwrapped.x[0] - 1.0, 1.0)
 
 
-def test_rollout_has_the_violations_of_the_start_when_it_fails_at_once():
+def test_row_has_violations_of_the_start_when_no_step_completes():
     class Failing(gymnasium.Wrapper):
         def step(self, action):
             observation, _, _, _, info = super().step(action)
@@ -133,7 +134,8 @@ def test_rollout_has_the_violations_of_the_start_when_it_fails_at_once():
     assert (row["steps"], row["max_commanded_violation"], row["max_measured_violation"]) == (0, 0.25, 0.5)
 
 
-def acted(policy: BaselinePolicy, episodes: int) -> np.ndarray:
+def actions_of(policy: BaselinePolicy, episodes: int) -> np.ndarray:
+    """Return the first five actions of several episodes, (episodes, 5, A)."""
     actions = []
     for _ in range(episodes):
         policy.on_episode_start()
@@ -144,7 +146,7 @@ def acted(policy: BaselinePolicy, episodes: int) -> np.ndarray:
 def test_baseline_policies_match_their_names():
     env = make_environment("Bead", {})
     zero, uniform_random, constant = (
-        acted(BaselinePolicy(BASELINES[name], env, 3), 4) for name in ("zero", "uniform_random", "constant")
+        actions_of(BaselinePolicy(BASELINES[name], env, 3), 4) for name in ("zero", "uniform_random", "constant")
     )
     assert not zero.any()
     assert len(np.unique(uniform_random.reshape(-1, 2), axis=0)) == 20
@@ -152,5 +154,5 @@ def test_baseline_policies_match_their_names():
     assert len(np.unique(constant[:, 0], axis=0)) == 4
     for name, actions in (("uniform_random", uniform_random), ("constant", constant)):
         assert np.abs(actions).max() <= 1.0
-        np.testing.assert_array_equal(acted(BaselinePolicy(BASELINES[name], env, 3), 4), actions)
-        assert not np.array_equal(acted(BaselinePolicy(BASELINES[name], env, 4), 4), actions)
+        np.testing.assert_array_equal(actions_of(BaselinePolicy(BASELINES[name], env, 3), 4), actions)
+        assert not np.array_equal(actions_of(BaselinePolicy(BASELINES[name], env, 4), 4), actions)

@@ -33,23 +33,23 @@ def test_interquartile_mean_omits_a_quarter_at_each_end():
 
 
 @pytest.mark.parametrize("scale", [1.0, -1.0])
-def test_interval_of_few_seeds_is_that_of_all_resamples(scale):
+def test_interval_of_few_seeds_is_computed_from_all_resamples(scale):
     values = scale * np.array([-16.67216437, -15.0276135, -2.031366, 36.33370554, 52.79995048])
-    means = [np.sort(each)[1:4].mean() for each in itertools.product(values, repeat=5)]
+    means = [np.sort(resample)[1:4].mean() for resample in itertools.product(values, repeat=5)]
     np.testing.assert_allclose(interquartile_mean(values)[1], np.percentile(means, [2.5, 97.5]))
 
 
 def test_survival_censors_runs_that_never_converged():
-    """By hand: of four runs one converges after 10; then of three one is over at 20, and of two one converges at 30."""
-    steps, left = survival([10, 30, None, None], [60, 60, 30, 60])
+    """By hand: 1 of 4 runs converges at 10, 1 is censored at 30 − 10 = 20, and 1 of the remaining 2 converges at 30."""
+    steps, fractions = survival([10, 30, None, None], [60, 60, 30, 60])
     np.testing.assert_allclose(steps[steps <= 30], [0, 10, 20, 30])
-    np.testing.assert_allclose(left[steps <= 30], [1, 0.75, 0.75, 0.375])
-    assert median_survival(steps, left) == 30
+    np.testing.assert_allclose(fractions[steps <= 30], [1, 0.75, 0.75, 0.375])
+    assert median_survival(steps, fractions) == 30
     assert median_survival(*survival([None, None], [20, 20])) is None
 
 
 @pytest.mark.parametrize("converged", [12, 13])
-def test_median_survival_is_the_half_in_spite_of_rounding(converged):
+def test_median_survival_includes_a_half_despite_rounding(converged):
     runs = [*range(1, converged + 1), *[None] * (24 - converged)]
     assert median_survival(*survival(runs, [100] * 24)) == 12
 

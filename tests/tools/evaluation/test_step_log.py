@@ -8,7 +8,7 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import MEANINGS, StepLog, read_step_log, remove_step_logs, step_log_file
 
 
-def act(env, seed=0):
+def random_policy(env, seed):
     rng = np.random.default_rng(seed)
     return lambda observation: rng.uniform(-1, 1, env.action_space.shape)
 
@@ -17,7 +17,9 @@ def act(env, seed=0):
 def logged(tmp_path_factory):
     folder = tmp_path_factory.mktemp("steps")
     env = make_environment("NarrowPassage", {"guidance": "kgrl", "action_repeat": 5})
-    rows = [rollout(env, act(env, index), StepLog(env, folder), index=index, seed=index) for index in range(2)]
+    rows = [
+        rollout(env, random_policy(env, index), StepLog(env, folder), index=index, seed=index) for index in range(2)
+    ]
     trace = env.unwrapped.trace
     return folder, rows, trace
 
@@ -39,7 +41,7 @@ def test_step_log_has_every_step_and_agrees_with_the_rows(logged):
     last = step_log[step_log["episode"] == 1]
     np.testing.assert_array_equal(last[["desired_pose_0", "desired_pose_1"]], trace.commanded)
     np.testing.assert_array_equal(last[["pose_0", "pose_1"]], trace.measured)
-    # The zone is x ≥ 0.6: computed from the commanded pose itself.
+    # The restricted zone is x > 0.6 m.
     np.testing.assert_allclose(step_log["commanded_violation"], step_log["desired_pose_0"] - 0.6, atol=1e-12)
 
 
@@ -51,8 +53,7 @@ def test_every_step_log_column_has_a_meaning(logged):
 
 def test_step_log_has_collisions_and_wrenches(tmp_path):
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 5})
-    aside = np.array([1.0, 0.0])
-    row = rollout(env, lambda observation: aside, StepLog(env, tmp_path), seed=0)
+    row = rollout(env, lambda observation: np.array([1.0, 0.0]), StepLog(env, tmp_path), seed=0)
     step_log = read_step_log(tmp_path)
     assert row["collision_steps"] == step_log["collision"].sum() > 0
     assert np.linalg.norm(step_log.loc[step_log["collision"], ["wrench_0", "wrench_1"]], axis=1).max() > 0
@@ -69,6 +70,6 @@ def test_removal_of_step_logs_leaves_other_files(tmp_path):
 def test_step_log_is_refused_when_absent_or_damaged(logged, tmp_path):
     with pytest.raises(InputError, match="has no step log"):
         read_step_log(tmp_path)
-    step_log_file(tmp_path, 0).write_bytes(b"PAR1 and not much more")
+    step_log_file(tmp_path, 0).write_bytes(b"PAR1 and nothing else")
     with pytest.raises(InputError, match="damaged"):
         read_step_log(tmp_path)

@@ -30,19 +30,19 @@ def test_log_has_the_attempts_and_the_outcome(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("error", "sentence", "traced"),
+    ("error", "message", "is_traced"),
     [
         (InputError("learning diverged: train with less"), "learning diverged: train with less", False),
         (ZeroDivisionError("by\nzero"), "ZeroDivisionError: by zero (the traceback is in ", True),
         (SystemExit("abort: Failure at plant.cc"), "SystemExit: abort: Failure at plant.cc (", True),
     ],
 )
-def test_failure_of_any_kind_is_one_sentence(error, sentence, traced, tmp_path):
+def test_failure_of_any_kind_is_one_sentence(error, message, is_traced, tmp_path):
     job = Job(tmp_path / "log.txt", error)
     failure = attempt(job, work=work, versions=installed_versions(), call="first").failure
-    assert failure.startswith(sentence)
+    assert failure.startswith(message)
     assert "\n" not in failure
-    assert ("Traceback" in job.log.read_text()) == traced
+    assert ("Traceback" in job.log.read_text()) == is_traced
 
 
 def test_worker_with_other_versions_is_refused(tmp_path):
@@ -52,7 +52,7 @@ def test_worker_with_other_versions_is_refused(tmp_path):
     assert not job.log.exists()
 
 
-def test_worker_without_the_folder_is_refused(tmp_path):
+def test_worker_without_the_study_folder_is_refused(tmp_path):
     job = Job(tmp_path / "elsewhere" / "log.txt")
     failure = attempt(job, work=work, versions=installed_versions(), call="first").failure
     assert "--out must be a folder that all workers share" in failure

@@ -16,11 +16,11 @@ from oracles.same_runs import differences
 
 @pytest.fixture
 def parallel_config(bead_config):
-    """Return the configuration of a run of 8 episodes with greedy and constant ones, for a number of actors."""
+    """Return a function from a number of actors to the configuration of a run of 8 episodes, half of them greedy."""
 
     def config(num_envs, **settings):
-        more = {"greedy_episode_fraction": 0.5, "selection_window": 2, "num_envs": num_envs, **settings}
-        return replace(bead_config, learner=replace(bead_config.learner, **more))
+        options = {"greedy_episode_fraction": 0.5, "selection_window": 2, "num_envs": num_envs, **settings}
+        return replace(bead_config, learner=replace(bead_config.learner, **options))
 
     return config
 
@@ -29,38 +29,38 @@ def rows(folder):
     return pd.DataFrame(folder.episodes()).drop(columns="wall_time")
 
 
-class Stop(Exception):
+class Stopped(Exception):
     pass
 
 
-def stop(row):
+def stop_in_episode_4(row):
     if row["episode"] == 4:
-        raise Stop
+        raise Stopped
 
 
 @pytest.mark.parametrize("num_envs", [1, 3])
 def test_run_with_actors_resumes_bit_for_bit(num_envs, parallel_config, tmp_path):
-    """The stopped run has episodes in simulation that nothing was learned from; they are simulated again."""
+    """Episodes that are in simulation when the run stops are simulated again after the resume."""
     config = parallel_config(num_envs)
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)
-    with pytest.raises(Stop):
-        run_training(stopped, config, report=stop)
+    with pytest.raises(Stopped):
+        run_training(stopped, config, report=stop_in_episode_4)
     run_training(stopped, config, resume=True)
     assert differences(whole.path, stopped.path) == []
 
 
 def test_lock_is_released_after_the_actors_end(parallel_config, tmp_path, monkeypatch):
-    folder, close, were_locked = RunFolder(tmp_path / "run"), ParallelLearner.close, []
+    folder, close, locked = RunFolder(tmp_path / "run"), ParallelLearner.close, []
 
-    def close_and_look(self):
+    def close_and_record(self):
         close(self)
-        were_locked.append((folder.path / LOCK).exists())
+        locked.append((folder.path / LOCK).exists())
 
-    monkeypatch.setattr(ParallelLearner, "close", close_and_look)
-    with pytest.raises(Stop):
-        run_training(folder, parallel_config(2), report=stop)
-    assert were_locked == [True]
+    monkeypatch.setattr(ParallelLearner, "close", close_and_record)
+    with pytest.raises(Stopped):
+        run_training(folder, parallel_config(2), report=stop_in_episode_4)
+    assert locked == [True]
     assert not (folder.path / LOCK).exists()
 
 
@@ -69,31 +69,31 @@ def test_actors_act_with_weights_of_a_fixed_age(parallel_config, tmp_path):
     for number, folder in folders.items():
         # Learning starts within the first episode, and constant episodes are independent of the weights.
         run_training(folder, parallel_config(number, learning_starts=1, constant_episodes=0))
-    one, two = (rows(folder) for folder in folders.values())
-    pd.testing.assert_frame_equal(one[:2], two[:2])  # acted before anything was learned
-    assert not one[2:3].equals(two[2:3])  # acted with what was learned from episode 0 with one actor only
+    single, double = (rows(folder) for folder in folders.values())
+    pd.testing.assert_frame_equal(single[:2], double[:2])  # both acted with the initial weights
+    assert not single[2:3].equals(double[2:3])  # only a single actor has learned from episode 0
 
 
 def test_demonstrator_acts_in_actors(parallel_config, tmp_path):
     config = parallel_config(2, demonstration_episodes=2)
     result = run_training(
-        RunFolder(tmp_path / "run"), config, demonstrator=lambda env: lambda seen: env.action_space.low
+        RunFolder(tmp_path / "run"), config, demonstrator=lambda env: lambda observation: env.action_space.low
     )
     assert [row["is_demonstration"] for row in result] == [1, 1, 0, 0, 0, 0, 0, 0]
 
 
-def test_killed_actor_ends_the_run_with_one_sentence(parallel_config, tmp_path, monkeypatch):
+def test_run_ends_with_one_sentence_when_an_actor_is_killed(parallel_config, tmp_path, monkeypatch):
     monkeypatch.setattr(ParallelLearner, "_simulate", lambda self, assignment: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(InputError, match="an actor was killed: resume"):
         run_training(RunFolder(tmp_path / "run"), parallel_config(2))
 
 
-def test_error_of_an_actor_is_raised_here(parallel_config, tmp_path, monkeypatch):
+def test_error_of_an_actor_is_raised_in_the_main_process(parallel_config, tmp_path, monkeypatch):
     def refuse(self, assignment):
-        raise InputError("it is refused")
+        raise InputError("the episode is refused")
 
     monkeypatch.setattr(ParallelLearner, "_simulate", refuse)
-    with pytest.raises(InputError, match="it is refused"):
+    with pytest.raises(InputError, match="the episode is refused"):
         run_training(RunFolder(tmp_path / "run"), parallel_config(2))
     assert not (tmp_path / "run").exists()
 
@@ -103,7 +103,7 @@ def test_diverged_run_with_actors_is_reported(parallel_config, tmp_path):
         run_training(RunFolder(tmp_path / "run"), parallel_config(2, learning_rate=1e30, constant_episodes=0))
 
 
-def test_actors_are_refused_when_they_cannot_be(parallel_config, tmp_path):
+def test_actors_are_refused_with_conflicting_settings(parallel_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(InputError, match="num_envs does not work with"):
         run_training(folder, parallel_config(2, pipelined=True))
@@ -112,14 +112,14 @@ def test_actors_are_refused_when_they_cannot_be(parallel_config, tmp_path):
     assert not folder.path.exists()
 
 
-def test_actors_continue_the_count_of_episodes_of_the_first_run(parallel_config, bead_run, monkeypatch, tmp_path):
+def test_actors_continue_the_episode_count_of_init_from(parallel_config, bead_run, monkeypatch, tmp_path):
     simulate = ParallelLearner._simulate
 
-    def say(self, assignment):
+    def raise_episode_number(self, assignment):
         simulate(self, assignment)
         raise InputError(f"the actor is in episode {self._learner.episodes}")
 
-    monkeypatch.setattr(ParallelLearner, "_simulate", say)
+    monkeypatch.setattr(ParallelLearner, "_simulate", raise_episode_number)
     episodes = len(RunFolder(bead_run).episodes())
     with pytest.raises(InputError, match=f"in episode {episodes + 1}$"):
         run_training(RunFolder(tmp_path / "second"), parallel_config(1, init_from=str(bead_run)))

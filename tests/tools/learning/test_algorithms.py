@@ -1,13 +1,13 @@
-"""Learners of further algorithms of Stable-Baselines3, demonstrations in every batch, and dropout."""
+"""TD3, CrossQ, PPO, TRPO and behavior cloning; demonstrations in every batch; dropout of the critics."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
@@ -21,11 +21,6 @@ ON_POLICY = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}
 SETTINGS = {"td3": OFF_POLICY, "crossq": OFF_POLICY, "ppo": ON_POLICY, "trpo": ON_POLICY}
 ALGORITHMS = list(SETTINGS)
 OBSERVATION = np.array([0.3, -0.2, 0.9], np.float32)
-
-
-class SpacesOnlyEnv(gymnasium.Env):
-    observation_space = spaces.Box(-1, 1, (3,))
-    action_space = spaces.Box(-1, 1, (2,))
 
 
 def make(config, seed=0):
@@ -62,7 +57,7 @@ def test_learner_acts_learns_and_resumes_bit_for_bit(algorithm):
     restored = make(config, seed=9)
     restored.restore(arrays, values)
     np.testing.assert_array_equal(learn(restored, 3, np.random.default_rng(1)), expected)
-    policies = [one.policy({"observation_shape": [3]}) for one in (learner, restored)]
+    policies = [each.policy({"observation_shape": [3]}) for each in (learner, restored)]
     np.testing.assert_array_equal(*[policy(OBSERVATION) for policy in policies])
     assert not learner.has_diverged()
 
@@ -78,14 +73,14 @@ def test_exported_policy_acts_as_the_model(algorithm):
 
 
 @pytest.mark.parametrize("algorithm", ["td3", "crossq"])
-def test_algorithms_have_settings_of_their_own(algorithm):
+def test_policy_delay_is_a_setting_of_td3_and_crossq_only(algorithm):
     learner = make(resolve_preset(None, algorithm, {**SETTINGS[algorithm], "policy_delay": 7}))
     assert learner.model.policy_delay == 7
     with pytest.raises(InputError, match="no setting 'policy_delay'"):
         resolve_preset(None, "sac", {"policy_delay": 7})
 
 
-def test_td3_explores_with_noise_of_the_given_size():
+def test_td3_explores_with_the_configured_noise():
     for noise in (0.0, 0.5):
         learner = make(resolve_preset(None, "td3", {**SETTINGS["td3"], "exploration_noise": noise}))
         actions = np.array([learner.explore(OBSERVATION) for _ in range(300)])
@@ -116,14 +111,6 @@ def test_on_policy_learner_bootstraps_a_time_limit():
         assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
 
 
-def test_on_policy_learner_leaves_a_failed_simulation_out():
-    learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
-    learner.on_episode_start()
-    failure = {"simulation_failure": "diverged"}
-    learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 0.0, OBSERVATION, False, True, failure))
-    assert learner.model.rollout_buffer.pos == 0
-
-
 def test_on_policy_learner_bootstraps_before_a_failed_simulation():
     learner = make(make_config("ppo", {"n_steps": 8, "gamma": 0.5, "net_arch": "4"}))
     reached, failure = np.full(3, 0.5, np.float32), {"simulation_failure": "diverged"}
@@ -131,7 +118,7 @@ def test_on_policy_learner_bootstraps_before_a_failed_simulation():
     for is_last, expected in ((False, 2.0 + 0.5 * float(learner._value(reached))), (True, 2.0)):
         learner.on_episode_start()
         learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 2.0, reached, is_last, False, {}))
-        if is_last:  # another episode fails at once
+        if is_last:  # the next episode fails in its first step
             learner.on_episode_start()
         learner.on_step(Transition(reached, learner.act(reached), 0.0, reached, False, True, failure))
         assert buffer.rewards[buffer.pos - 1, 0] == pytest.approx(expected)
@@ -156,9 +143,9 @@ def test_every_batch_has_its_fraction_of_demonstrations(fraction):
     learner = make_with_demonstrations(fraction)
     fill(learner, 5)
     assert learner.model.replay_buffer.num_demonstrated == 10
-    # Ten batches in one draw, as the fast step samples them.
-    for part in learner.model.replay_buffer.sample(10 * 8).rewards.view(10, 8):
-        assert (part < 2).float().mean() == fraction
+    # Ten batches in one sample, as in the fast training step.
+    for batch in learner.model.replay_buffer.sample(10 * 8).rewards.view(10, 8):
+        assert (batch < 2).float().mean() == fraction
     arrays, values = learner.state()
     restored = make_with_demonstrations(fraction)
     restored.restore(arrays, values)
@@ -180,23 +167,23 @@ def test_demonstrations_that_fill_the_buffer_are_refused():
     assert learner.model.replay_buffer.num_demonstrated == 8
 
 
-def test_action_before_a_failed_simulation_is_not_paired_with_a_later_transition():
+def test_on_policy_learner_discards_the_action_before_a_failure():
     learner = make(make_config("ppo", {"n_steps": 8, "net_arch": "4"}))
     learner.on_episode_start()
-    action = learner.act(OBSERVATION)
-    failed = {"simulation_failure": "no solution"}
-    learner.on_step(Transition(OBSERVATION, action, 0.0, OBSERVATION, False, True, failed))
+    failure = {"simulation_failure": "no solution"}
+    learner.on_step(Transition(OBSERVATION, learner.act(OBSERVATION), 0.0, OBSERVATION, False, True, failure))
+    assert learner.model.rollout_buffer.pos == 0
     learner.on_episode_start()
-    corrected = np.ones(2, np.float32)  # a supervisor's action, for which the learner is not asked
-    learner.on_step(Transition(OBSERVATION, corrected, 0.0, OBSERVATION, False, False, {}))
+    correction = np.ones(2, np.float32)  # action of a supervisor, without a call of the learner's `act`
+    learner.on_step(Transition(OBSERVATION, correction, 0.0, OBSERVATION, False, False, {}))
     assert learner.model.rollout_buffer.pos == 0
 
 
-def test_returns_of_a_full_buffer_do_not_continue_in_the_demonstrations():
+def test_n_step_returns_of_a_full_buffer_omit_demonstrations():
     box = spaces.Box(-1.0, 1.0, (1,))
     buffer = DemonstrationReplayBuffer(8, box, box, device="cpu", n_steps=3, gamma=1.0)
     buffer.num_demonstrated = 2
-    for step in range(9):  # the last one overwrites row 2
+    for step in range(9):  # the last transition overwrites row 2
         is_demonstrated = step < 2
         observations = (np.full((1, 1), float(step + k)) for k in range(2))
         reward, done = np.array([1000.0 if is_demonstrated else 1.0]), np.array([step == 1])
@@ -208,14 +195,10 @@ def test_returns_of_a_full_buffer_do_not_continue_in_the_demonstrations():
     assert not buffer.timeouts.any()
 
 
-def test_demonstration_fraction_needs_demonstrations():
-    with pytest.raises(InputError, match="needs demonstrations: give --set demonstration_episodes"):
-        resolve_preset(None, "tqc", {"demonstration_fraction": 0.5})
-
-
 @pytest.mark.parametrize(
-    ("settings", "words"),
+    ("settings", "message"),
     [
+        ({"demonstration_fraction": 0.5}, "needs demonstrations: give --set demonstration_episodes"),
         ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "dropout": 0.01}, "leave dropout=0.01 out"),
@@ -224,13 +207,13 @@ def test_demonstration_fraction_needs_demonstrations():
         ({"algorithm": "trpo", "symmetry": "near"}, "trpo learns from no symmetric copies"),
     ],
 )
-def test_settings_that_exclude_each_other_are_named(settings, words):
+def test_settings_that_exclude_each_other_are_named(settings, message):
     settings = {"algorithm": "tqc"} | settings
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         resolve_preset(None, settings.pop("algorithm"), settings)
 
 
-def test_newest_row_of_a_full_buffer_is_the_last_one():
+def test_newest_row_is_the_last_added_also_in_a_full_buffer():
     box = spaces.Box(-1.0, 1.0, (1,))
     buffer = DemonstrationReplayBuffer(4, box, box, device="cpu")
     for step in range(6):
@@ -253,7 +236,7 @@ def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
     assert not np.array_equal(critic(*batch)[0].detach().numpy(), critic(*batch)[0].detach().numpy())
 
 
-def test_configuration_of_a_run_holds_the_new_settings():
+def test_configuration_is_restored_from_its_values():
     values = config_values(resolve_preset(None, "td3"))
     assert values["exploration_noise"] == 0.1
     assert make_config("td3", {k: v for k, v in values.items() if k != "algorithm"}) == resolve_preset(None, "td3")
@@ -263,7 +246,7 @@ def demonstrator_action(observation):
     return np.array([0.5 * observation[0], -0.8 * observation[1] * observation[2]], np.float32)
 
 
-def clone(learner, episodes, rng, length=20):
+def record_demonstrations(learner, episodes, rng, length=20):
     for _ in range(episodes):
         learner.on_episode_start()
         for step in range(length):
@@ -277,24 +260,24 @@ def test_behavior_cloning_acts_as_the_demonstrator():
     config = make_config("bc", {"demonstration_episodes": 4, "gradient_steps": 400, "net_arch": "32,32"})
     learner = make(config)
     rng = np.random.default_rng(0)
-    clone(learner, 3, rng)
+    record_demonstrations(learner, 3, rng)
     with pytest.raises(InputError, match="bc trains after 4 demonstrations: give at least that many --episodes"):
         learner.policy({})
     arrays, values = learner.state()
     arrays = {key: value.copy() for key, value in arrays.items()}
-    clone(learner, 1, np.random.default_rng(5))
-    clone(learner, 1, rng)  # only the first four episodes, the demonstrations, are learned from
-    observation = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
+    record_demonstrations(learner, 1, np.random.default_rng(5))
+    record_demonstrations(learner, 1, rng)  # no effect: bc learns from the first four episodes only
+    observations = np.random.default_rng(1).uniform(-0.8, 0.8, (50, 3)).astype(np.float32)
     policy = learner.policy({"observation_shape": [3]})
-    errors = [policy(one) - demonstrator_action(one) for one in observation]
+    errors = [policy(observation) - demonstrator_action(observation) for observation in observations]
     assert np.sqrt(np.mean(np.square(errors))) < 0.1
-    np.testing.assert_allclose(learner.act(observation[0]), policy(observation[0]), atol=1e-6)
+    np.testing.assert_allclose(learner.act(observations[0]), policy(observations[0]), atol=1e-6)
     assert learner.metrics()["train/loss"] < 0.02
     assert learner.metrics() == {}
     restored = make(config)
     restored.restore(arrays, values)
-    clone(restored, 1, np.random.default_rng(5))
-    np.testing.assert_array_equal(restored.act(observation[1]), learner.act(observation[1]))
+    record_demonstrations(restored, 1, np.random.default_rng(5))
+    np.testing.assert_array_equal(restored.act(observations[1]), learner.act(observations[1]))
 
 
 def test_behavior_cloning_refuses_zero_demonstrations():
@@ -304,22 +287,20 @@ def test_behavior_cloning_refuses_zero_demonstrations():
 
 
 @pytest.mark.parametrize("algorithm", ["bc", "ppo", "trpo", "chunk"])
-def test_images_are_refused_without_networks_for_them(algorithm):
+def test_images_are_refused_by_learners_without_image_encoder(algorithm):
     learner = make_config(algorithm, {"demonstration_episodes": 1} if algorithm in ("bc", "chunk") else {})
     task = SimpleNamespace(observation_space=spaces.Box(0, 255, (8, 8, 3), np.uint8))
     with pytest.raises(InputError, match=f"{algorithm} takes no images"):
         learner_arguments(SimpleNamespace(learner=learner), task)
 
 
-def test_actions_become_certain_over_the_base_motion_steps():
+def test_probability_of_an_action_grows_over_base_motion_steps():
     settings = {"net_arch": "8", "learning_starts": 10_000, "base_motion_steps": 2000}
-    learner = LEARNERS.get("sac")(
-        resolve_preset(None, "sac", settings), SpacesOnlyEnv(), action_repeat=1, seed=0, max_transitions=80
-    )
+    learner = make(resolve_preset(None, "sac", settings))
     learner._constant_action = None
-    shares = []
+    fractions = []
     for learner.transitions in (0, 1000, 2000):
-        shares.append(np.mean([learner.act(OBSERVATION).any() for _ in range(300)]))
-    assert shares[0] == 0.0
-    assert 0.4 < shares[1] < 0.6
-    assert shares[2] == 1.0
+        fractions.append(np.mean([learner.act(OBSERVATION).any() for _ in range(300)]))
+    assert fractions[0] == 0.0
+    assert 0.4 < fractions[1] < 0.6
+    assert fractions[2] == 1.0

@@ -26,9 +26,9 @@ def test_save_checkpoint_leaves_no_other_file(checkpoint):
     assert [path.name for path in checkpoint.parent.iterdir()] == ["state.safetensors"]
 
 
-@pytest.mark.parametrize("kept", [0, 7, 100, -1])
-def test_load_checkpoint_refuses_a_truncated_file(checkpoint, kept):
-    checkpoint.write_bytes(checkpoint.read_bytes()[:kept])
+@pytest.mark.parametrize("num_bytes", [0, 7, 100, -1])
+def test_load_checkpoint_refuses_a_truncated_file(checkpoint, num_bytes):
+    checkpoint.write_bytes(checkpoint.read_bytes()[:num_bytes])
     with pytest.raises(InputError, match="damaged"):
         load_checkpoint(checkpoint)
 
@@ -46,61 +46,59 @@ def test_load_checkpoint_names_a_missing_file(tmp_path):
         load_checkpoint(tmp_path / "state.safetensors")
 
 
-def run_greedy_episodes(selection, outcomes, first=0, row=0):
+def run_greedy_episodes(selection, outcomes, first=0, num_successes=0):
     """Run greedy episodes with these outcomes; the weight of each actor is the number of its episode."""
     for number, success in enumerate(outcomes, first):
         actor = torch.nn.Linear(1, 1)
         torch.nn.init.constant_(actor.weight, number)
-        selection.begin(actor, row)
+        selection.begin(actor, num_successes)
         selection.finish(success)
-        row = row + 1 if success else 0
+        num_successes = num_successes + 1 if success else 0
     return selection
 
 
-def selected(selection):
+def selected_episode(selection):
+    """Return the number of the episode whose actor is selected_episode, or None."""
     result = selection.result()
     return None if result is None else int(result["weight"])
 
 
 def test_selection_is_empty_without_successes_on_both_sides():
-    assert selected(run_greedy_episodes(CheckpointSelection(3), [1])) is None
-    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
-    assert selected(run_greedy_episodes(CheckpointSelection(3), [0, 1, 1])) == 2
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(3), [1])) is None
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(3), [0, 1, 0, 1, 0])) is None
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(3), [0, 1, 1])) == 2
 
 
-def test_selection_takes_the_middle_of_the_longest_streak():
-    #                                  0  1  2  3  4  5  6  7  8  9 10 11
-    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
-    assert selected(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7  # two on each side
+def test_selection_is_the_middle_of_the_longest_streak():
+    # The longest streaks are the episodes 1 to 6, and 4 to 8; the later of two middle episodes is selected.
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 1, 1, 1, 1, 0, 0, 1, 1, 1])) == 4
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(5), [0, 1, 1, 0, 1, 1, 1, 1, 1])) == 7
 
 
-def test_selection_keeps_a_long_streak_over_a_later_short_one():
-    # The actor of episode 9 was followed by six that succeeded, but nothing before it did.
-    assert selected(run_greedy_episodes(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
+def test_selection_is_in_the_longest_streak_also_if_earlier():
+    # Episode 9 is followed by six successes, but preceded by a failure.
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(6), [1] * 8 + [0] + [1] * 6)) == 4
 
 
-def test_selection_takes_the_latest_beyond_the_window():
-    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9)) == 7
-    assert selected(run_greedy_episodes(CheckpointSelection(2), [1] * 9 + [0])) == 7
+def test_selection_is_the_latest_when_streaks_exceed_the_window():
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(2), [1] * 9)) == 7
+    assert selected_episode(run_greedy_episodes(CheckpointSelection(2), [1] * 9 + [0])) == 7
 
 
 def test_selection_continues_when_restored():
     first = run_greedy_episodes(CheckpointSelection(3), [0, 1, 1, 0, 1])
     second = CheckpointSelection(3)
     second.restore(*first.state())
-    for one in (first, second):
-        run_greedy_episodes(one, [1, 1, 1, 1, 1], first=5, row=1)
-    assert selected(first) == selected(second) == 7
+    for selection in (first, second):
+        run_greedy_episodes(selection, [1, 1, 1, 1, 1], first=5, num_successes=1)
+    assert selected_episode(first) == selected_episode(second) == 7
     assert first.state()[1] == second.state()[1]
 
 
 def test_selection_ignores_an_excluded_episode():
-    plain, excluded = (
-        run_greedy_episodes(CheckpointSelection(3), [0, 1, 1]),
-        run_greedy_episodes(CheckpointSelection(3), [0, 1]),
-    )
+    plain, excluded = (run_greedy_episodes(CheckpointSelection(3), outcomes) for outcomes in ([0, 1, 1], [0, 1]))
     excluded.begin(torch.nn.Linear(1, 1), 1)
     excluded.exclude()
-    run_greedy_episodes(excluded, [1], first=2, row=1)
-    assert selected(excluded) == selected(plain) == 2
+    run_greedy_episodes(excluded, [1], first=2, num_successes=1)
+    assert selected_episode(excluded) == selected_episode(plain) == 2
     assert excluded.state()[1] == plain.state()[1]

@@ -1,4 +1,4 @@
-"""Chunk cloning: a base policy from demonstrations, its export as one network, and runs that are resumed."""
+"""Chunk cloning: base policy from demonstrations, export as one network, resumed runs."""
 
 import gymnasium
 import numpy as np
@@ -35,18 +35,18 @@ def test_chunks_follow_the_commands_of_the_demonstrations(trained):
     samples = chunk_samples(find_base_policy(str(run.path)), observation, 2)
     assert samples.shape == (3, 4, 2)
     env.step(demonstrate(observation))
-    across = 1  # the passage is crossed at the same speed on both sides of the obstacle
-    assert np.abs(samples.mean(axis=0) - env.unwrapped.trace.commanded[80:84])[:, across].max() < 0.06
+    y = 1  # entry along the passage; demonstrations pass the obstacle on either side in x, with equal y
+    assert np.abs(samples.mean(axis=0) - env.unwrapped.trace.commanded[80:84])[:, y].max() < 0.06
     assert samples.std(axis=0).max() > 0.0
     assert run.summary["success_in_training"].startswith("only demonstrations")
 
 
-def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
+def test_seed_determines_the_policy_also_when_resumed(trained, tmp_path):
     run, arguments = trained
     second = train("NarrowPassage", "kgrl", out=tmp_path / "again", **arguments, **OPTIONS)
     for path in ("policy.safetensors", "policy.json"):
         assert (run.path / path).read_bytes() == (second.path / path).read_bytes()
-    for episodes in (5, 6):  # the second time, the checkpoint counts an episode after the demonstrations
+    for episodes in (5, 6):  # the second resume starts from a checkpoint with an episode after the demonstrations
         resumed = train("NarrowPassage", out=second.path, resume=True, episodes=episodes, pictures=False)
         assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
@@ -54,29 +54,29 @@ def test_same_seed_gives_the_same_policy_also_when_resumed(trained, tmp_path):
 def test_state_before_the_first_demonstration_is_restored():
     env = make_environment("NarrowPassage", {"guidance": "kgrl"})
     before, after = (
-        ChunkLearner(ChunkConfig(**SETTINGS), env, action_repeat=1, seed=0, max_transitions=10) for _ in "ab"
+        ChunkLearner(ChunkConfig(**SETTINGS), env, action_repeat=1, seed=0, max_transitions=10) for _ in range(2)
     )
     after.restore(*before.state())
     arrays, values = after.state()
-    assert {name: len(values) for name, values in arrays.items()} == {"observations": 0, "actions": 0, "groups": 0}
+    assert {name: len(array) for name, array in arrays.items()} == {"observations": 0, "actions": 0, "groups": 0}
     assert values["episodes"] == 0
 
 
 @pytest.mark.parametrize(
-    ("learner", "config", "words"),
+    ("learner", "config", "message"),
     [
         (ChunkLearner, ChunkConfig(pipelined=True), "^chunk needs .* in this process: leave pipelined out$"),
         (ChunkLearner, ChunkConfig(num_envs=2), "^chunk needs .* in this process: leave num_envs out$"),
         (DistillationLearner, DistillationConfig(num_envs=2), "^distillation needs .*: leave num_envs out$"),
     ],
 )
-def test_learner_is_refused_when_the_commands_are_in_another_process(learner, config, words):
+def test_learner_refuses_simulation_in_another_process(learner, config, message):
     env = make_environment("NarrowPassage", {"guidance": "kgrl"})
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         learner(config, env, action_repeat=1, seed=0, max_transitions=10)
 
 
-def test_learner_is_refused_when_the_environment_is_not_of_a_diagram():
+def test_learner_refuses_an_environment_without_a_diagram():
     env = gymnasium.make("CartPole-v1")
     with pytest.raises(InputError, match="chunk needs an environment that is built"):
         ChunkLearner(ChunkConfig(), env, action_repeat=1, seed=0, max_transitions=10)

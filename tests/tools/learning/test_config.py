@@ -9,9 +9,10 @@ from guiderail.tools.learning.train import train
 @pytest.mark.parametrize(
     ("setting", "value"),
     [
-        ("ent_coef", "_0.5"), ("ent_coef", "auto0.5"),
-        ("ent_coef", "inf"), ("ent_coef", "auto_nan"), ("ent_coef", "-1"), ("net_arch", "1000000,1000000"),
-        ("net_arch", ""), ("dropout", 1.0),
+        ("ent_coef", "_0.5"), ("ent_coef", "auto0.5"), ("ent_coef", "inf"), ("ent_coef", "auto_nan"),
+        ("ent_coef", "-1"), ("ent_coef", "much"), ("net_arch", ""), ("net_arch", "1000000,1000000"), ("dropout", 1.0),
+        ("gamma", 1.5), ("constant_episodes", -1), ("greedy_episode_fraction", 1.5), ("selection_window", -1),
+        ("ez_greedy", 1.5), ("ez_greedy_longest", 0), ("ez_greedy_until", -1), ("batch_size", 2.5),
         ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),
         ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],
@@ -23,26 +24,24 @@ def test_config_refuses_values_out_of_range(setting, value):
 
 
 @pytest.mark.parametrize("setting", ["observation_noise", "action_noise", "copy_noise"])
-def test_noise_is_not_a_bool(setting):
+def test_config_refuses_a_bool_as_noise(setting):
     with pytest.raises(InputError, match=f"learner's {setting} cannot be"):
         resolve_preset(None, "distillation", {setting: True})
 
 
 def test_config_accepts_large_networks():
-    assert resolve_preset("tqc_contact", "tqc", {"net_arch": "4096,4096", "batch_size": "8192"}).net_arch == (
-        4096,
-        4096,
-    )
+    config = resolve_preset("tqc_contact", "tqc", {"net_arch": "4096,4096", "batch_size": "8192"})
+    assert (config.net_arch, config.batch_size) == ((4096, 4096), 8192)
 
 
 def test_learners_are_listed_without_importing_their_modules():
     assert {*LEARNERS._declarations} == {"bc", "chunk", "crossq", "distillation", "ppo", "sac", "td3", "tqc", "trpo"}
 
 
-@pytest.mark.parametrize(("demonstrated", "warns"), [(0, False), (1, True), (99, True)])
-def test_warning_appears_when_only_the_scripted_policy_acts(demonstrated, warns, tmp_path, caplog):
-    settings = {"demonstration_episodes": demonstrated, "net_arch": (8,), "gradient_steps": 1}
+@pytest.mark.parametrize(("num_demonstrations", "is_warned"), [(0, False), (1, True), (99, True)])
+def test_warning_appears_when_only_the_scripted_policy_acts(num_demonstrations, is_warned, tmp_path, caplog):
+    settings = {"demonstration_episodes": num_demonstrations, "net_arch": (8,), "gradient_steps": 1}
     options = {"settings": settings, "pictures": False, "difficulty": "hard"}
     train("NarrowPassage", out=tmp_path / "run", episodes=1, **options)
-    warnings = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert any("in none, because demonstration_episodes is" in one for one in warnings) is warns
+    messages = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
+    assert any("in none, because demonstration_episodes is" in message for message in messages) is is_warned

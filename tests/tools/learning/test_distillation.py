@@ -1,4 +1,4 @@
-"""Policy distillation: labels are the teacher's commands, the student predicts them, and runs that are resumed."""
+"""Policy distillation: commands of the teacher as labels, prediction by the student, resumed runs."""
 
 from contextlib import nullcontext
 
@@ -19,7 +19,7 @@ SETTINGS = {"chunk_steps": 10, "gradient_steps": 1500, "net_arch": (32,), "batch
 
 @pytest.fixture(scope="module")
 def teacher(tmp_path_factory):
-    """Return the folder of a policy that steers to one side, in proportion to what it observes."""
+    """Return the folder of a linear policy with random weights."""
     env = make_environment("NarrowPassage", OPTIONS)
     size = env.observation_space.shape[0]
     weight = 0.3 * np.random.default_rng(0).standard_normal((2, size)).astype(np.float32)
@@ -46,9 +46,8 @@ def test_labels_are_the_commands_of_the_teacher(teacher):
 
 def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
     arguments = {"episodes": 3, "seed": 1, "algorithm": "distillation", "pictures": False, **OPTIONS}
-    settings = SETTINGS | {"teacher": str(teacher)}
-    guidance = arguments.pop("guidance")
-    run = train("NarrowPassage", guidance, out=tmp_path / "run", settings=settings, **arguments)
+    arguments["settings"] = SETTINGS | {"teacher": str(teacher)}
+    run = train("NarrowPassage", out=tmp_path / "run", **arguments)
     learner, env = make(teacher)
     observation, _ = env.reset(seed=7)
     errors, student = [], find_base_policy(str(run.path))
@@ -56,13 +55,13 @@ def test_student_predicts_the_commands_of_the_teacher(teacher, tmp_path):
         chunk = chunk_samples(student, observation, 2)
         errors.append(np.abs(chunk[0] - learner.label(observation, step)).max())
         observation, *_ = env.step(learner._teacher(observation))
-    assert np.median(errors) < 0.02  # the passage is 0.9 m long
-    second = train("NarrowPassage", guidance, out=tmp_path / "again", settings=settings, **arguments | {"episodes": 2})
+    assert np.median(errors) < 0.02  # [m]; the passage is 0.9 m long
+    second = train("NarrowPassage", out=tmp_path / "again", **arguments | {"episodes": 2})
     resumed = train("NarrowPassage", out=second.path, resume=True, episodes=3, pictures=False)
     assert (run.path / "policy.safetensors").read_bytes() == (resumed.path / "policy.safetensors").read_bytes()
 
 
-def test_numbers_that_depend_on_the_step_alone_are_found():
+def test_entries_that_depend_on_the_step_alone_are_found():
     observations = np.array([[0.0, 1.0], [0.5, 2.0], [0.0, 3.0], [0.5, 2.0]])
     assert DistillationLearner._clocks(observations, np.array([0, 10, 0, 10])).tolist() == [True, False]
 
@@ -76,7 +75,7 @@ def test_noise_of_copies_needs_a_second_episode(teacher):
 
 
 @pytest.mark.parametrize(
-    ("settings", "options", "words"),
+    ("settings", "options", "message"),
     [
         ({"teacher": ""}, {}, "teacher=RUN"),
         ({}, {"action_dims": (0,)}, "other observations or actions"),
@@ -84,11 +83,11 @@ def test_noise_of_copies_needs_a_second_episode(teacher):
         ({}, {"max_speed": (5.0,)}, "--guidance kgrl"),
     ],
 )
-def test_distillation_is_refused_when_the_teacher_does_not_fit(teacher, settings, options, words):
-    with pytest.raises(InputError, match=words):
+def test_distillation_is_refused_when_the_teacher_does_not_fit(teacher, settings, options, message):
+    with pytest.raises(InputError, match=message):
         make(settings.pop("teacher", teacher), OPTIONS | options, **settings)
 
 
-def test_demonstrations_are_refused():
+def test_distillation_refuses_demonstrations():
     with pytest.raises(InputError, match="demonstration_episodes"):
         make_config("distillation", {"demonstration_episodes": 1})

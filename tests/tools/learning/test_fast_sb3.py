@@ -42,21 +42,21 @@ def make(kind, preset="tqc_contact", env=Vector, **settings):
     learner = kind(resolve_preset(preset, "tqc", settings), env(), action_repeat=10, seed=0, max_transitions=300)
     random, space = np.random.default_rng(0), env.observation_space
     for index in range(200):
-        seen, then = random.uniform(0, 2, (2, *space.shape)).astype(space.dtype)
+        observations = random.uniform(0, 2, (2, *space.shape)).astype(space.dtype)
         if len(space.shape) == 3:
-            seen, then = (np.moveaxis(image, 0, -1) for image in (seen, then))
+            observations = np.moveaxis(observations, 1, -1)
         action, reward = random.uniform(-1, 1, 2).astype(np.float32), float(3 * random.normal())
-        learner.store(Transition(seen, action, reward, then, index % 50 == 49, False, {}))
+        learner.store(Transition(observations[0], action, reward, observations[1], index % 50 == 49, False, {}))
     return learner
 
 
 def train_both(plain, ensemble, seed=0):
-    """Train both on the same batches: Stable-Baselines3 samples one by one, the fast step all at once."""
+    """Train both on the same batches: Stable-Baselines3 samples them one by one, the fast step all at once."""
     np.random.seed(seed)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     batches = plain.model.replay_buffer.sample(STEPS * BATCH)
-    each = iter(zip(*[of_all.split(BATCH) for of_all in batches], strict=True))
+    single_batches = iter(zip(*[array.split(BATCH) for array in batches], strict=True))
     for learner, sample in (
-        (plain, lambda _, env=None: type(batches)(*next(each))),
+        (plain, lambda _, env=None: type(batches)(*next(single_batches))),
         (ensemble, lambda _, env=None: batches),
     ):
         learner.model.replay_buffer.sample = sample
@@ -65,7 +65,8 @@ def train_both(plain, ensemble, seed=0):
         del learner.model.replay_buffer.sample
 
 
-def same(plain, ensemble, tolerance):
+def assert_equal(plain, ensemble, tolerance):
+    """Compare the parameters of all networks and the entropy coefficient."""
     for network in ("actor", "critic", "critic_target"):
         expected, result = (parameters_to_vector(getattr(x.model, network).parameters()) for x in (plain, ensemble))
         torch.testing.assert_close(result.detach(), expected.detach(), rtol=0, atol=tolerance)
@@ -78,13 +79,13 @@ def same(plain, ensemble, tolerance):
     ("preset", "settings"),
     [("tqc_contact", {}), ("tqc_fast", {"n_steps": 3}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
 )
-def test_fast_step_equals_that_of_stable_baselines3(plain, ensemble, preset, settings):
+def test_fast_step_equals_the_step_of_stable_baselines3(plain, ensemble, preset, settings):
     expected, result = make(plain, preset, **settings), make(ensemble, preset, **settings)
-    same(expected, result, 0.0)
+    assert_equal(expected, result, 0.0)
     for seed in range(2):
         train_both(expected, result, seed)
-        same(expected, result, 2e-6)
-    # A step of Adam is the same whatever a gradient is multiplied with; the actor's is left by both.
+        assert_equal(expected, result, 2e-6)
+    # Adam's step is independent of the gradient's scale, so the gradients of the actor are normalized.
     gradient = torch.cat([p.grad.flatten() for p in expected.model.actor.parameters()])
     largest = gradient.abs().max()
     torch.testing.assert_close(result.model.actor.optimizer.gradient / largest, gradient / largest, rtol=0, atol=2e-5)
@@ -94,10 +95,10 @@ def test_fast_step_equals_that_of_stable_baselines3(plain, ensemble, preset, set
 def test_fast_step_on_images_equals_stable_baselines3(plain, ensemble):
     expected, result = make(plain, env=Image), make(ensemble, env=Image)
     train_both(expected, result)
-    same(expected, result, 2e-6)
+    assert_equal(expected, result, 2e-6)
 
 
-def test_tqc_critic_gradient_is_that_of_its_loss():
+def test_tqc_critic_gradient_is_the_gradient_of_its_loss():
     learner = make(TqcLearner)
     generator = torch.Generator().manual_seed(0)
     values = (2 * torch.randn(2, BATCH, 25, generator=generator)).requires_grad_()
@@ -113,10 +114,11 @@ def test_fast_step_continues_stable_baselines3_state(plain, ensemble):
     expected, result = make(plain), make(ensemble)
     train_both(expected, make(ensemble))
     arrays, values = expected.state()
-    result.restore({key: np.ascontiguousarray(value).copy() for key, value in arrays.items()}, values)  # as in a file
+    contiguous = {key: np.ascontiguousarray(value).copy() for key, value in arrays.items()}  # as in a file
+    result.restore(contiguous, values)
     assert result.state()[0].keys() == arrays.keys()
     train_both(expected, result, seed=1)
-    same(expected, result, 2e-6)
+    assert_equal(expected, result, 2e-6)
 
 
 def test_flat_adam_refuses_moments_of_other_shapes():
@@ -130,11 +132,11 @@ def test_flat_adam_refuses_moments_of_other_shapes():
 
 
 def test_fast_step_refuses_unsupported_activations():
-    class Other(FastTrainingStep, SAC):
+    class UnsupportedSac(FastTrainingStep, SAC):
         pass
 
     with pytest.raises(TypeError, match="GELU"):
-        Other("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
+        UnsupportedSac("MlpPolicy", Vector(), policy_kwargs={"activation_fn": torch.nn.GELU})
 
 
 def test_learning_does_not_import_pytorchs_compiler(forks):

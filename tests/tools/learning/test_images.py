@@ -1,10 +1,10 @@
 """Off-policy learners of observations with images."""
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.diagrams.envs.observation import ImageAndStateSpace
 from guiderail.models.common.errors import InputError
@@ -15,16 +15,11 @@ from guiderail.tools.learning.learner import LEARNERS, described_observation
 
 SHAPE = (16, 17, 3)
 IMAGE = spaces.Box(0, 255, SHAPE, np.uint8)
-BOTH = ImageAndStateSpace(SHAPE, spaces.Box(-3, 3, (2,), np.float32))
+IMAGE_AND_STATE = ImageAndStateSpace(SHAPE, spaces.Box(-3, 3, (2,), np.float32))
 SETTINGS = {
     "image_encoder": "convolutional", "random_shift": 2, "net_arch": "8", "batch_size": 4, "learning_starts": 4,
     "train_freq": 4, "gradient_steps": 2, "constant_episodes": 0,
 }  # fmt: skip
-
-
-class SpacesOnlyEnv(gymnasium.Env):
-    def __init__(self, observation_space):
-        self.observation_space, self.action_space = observation_space, spaces.Box(-1, 1, (2,))
 
 
 def make(space, algorithm="tqc", **settings):
@@ -43,13 +38,13 @@ def learn(learner, space, rng, episodes=2):
     for _ in range(episodes):
         learner.on_episode_start()
         for step in range(6):
-            seen = observe(space, rng)
-            action = learner.act(seen)
-            learner.on_step(Transition(seen, action, 1.0, observe(space, rng), False, step == 5, {}))
+            observation = observe(space, rng)
+            action = learner.act(observation)
+            learner.on_step(Transition(observation, action, 1.0, observe(space, rng), False, step == 5, {}))
         learner.on_episode_end({"success": 0})
 
 
-@pytest.mark.parametrize("space", [IMAGE, BOTH], ids=["image", "image_and_state"])
+@pytest.mark.parametrize("space", [IMAGE, IMAGE_AND_STATE], ids=["image", "image_and_state"])
 @pytest.mark.parametrize(
     ("algorithm", "encoder"), [("tqc", "convolutional"), ("crossq", "convolutional"), ("sac", "average_pooling")]
 )
@@ -60,23 +55,23 @@ def test_policy_acts_as_its_learner(space, algorithm, encoder, tmp_path):
     learner.policy(described_observation(SpacesOnlyEnv(space))).save(tmp_path)
     policy, learner.is_greedy = Policy.load(tmp_path), True
     for _ in range(5):
-        seen = observe(space, rng)
-        np.testing.assert_allclose(policy(seen), learner.act(seen), atol=1e-4)
+        observation = observe(space, rng)
+        np.testing.assert_allclose(policy(observation), learner.act(observation), atol=1e-4)
 
 
 def test_only_the_critic_trains_the_shared_encoder():
-    learner, rng = make(BOTH), np.random.default_rng(0)
+    learner, rng = make(IMAGE_AND_STATE), np.random.default_rng(0)
     encoder = learner.model.critic.features_extractor
     assert learner.model.actor.features_extractor.features is encoder
     trained = {id(value) for group in learner.model.actor.optimizer.param_groups for value in group["params"]}
     assert not trained & {id(value) for value in encoder.parameters()}
     before = [value.clone() for value in encoder.parameters()]
-    learn(learner, BOTH, rng)
+    learn(learner, IMAGE_AND_STATE, rng)
     assert all((old != new).any() for old, new in zip(before, encoder.parameters(), strict=True))
 
 
 def test_images_are_shifted_in_training_only():
-    encoder = make(BOTH).model.critic.features_extractor
+    encoder = make(IMAGE_AND_STATE).model.critic.features_extractor
     packed = torch.randint(0, 256, (1, 3 * 16 * 17 + 8), dtype=torch.uint8)
     packed[:, -8:] = torch.tensor([0.5, -2.0]).view(torch.uint8)
     encoder.eval()
@@ -86,30 +81,30 @@ def test_images_are_shifted_in_training_only():
     assert not all(torch.equal(encoder(packed), encoder(packed)) for _ in range(5))
 
 
-def test_restored_learner_continues_as_the_uninterrupted_one():
-    learner, restored = make(BOTH), make(BOTH)
-    learn(learner, BOTH, np.random.default_rng(0))
+def test_restored_learner_continues_as_without_interruption():
+    learner, restored = make(IMAGE_AND_STATE), make(IMAGE_AND_STATE)
+    learn(learner, IMAGE_AND_STATE, np.random.default_rng(0))
     arrays, values = learner.state()
     arrays = {name: array.copy() for name, array in arrays.items()}
-    learn(learner, BOTH, np.random.default_rng(1))
+    learn(learner, IMAGE_AND_STATE, np.random.default_rng(1))
     restored.restore(arrays, values)
-    learn(restored, BOTH, np.random.default_rng(1))
-    seen = observe(BOTH, np.random.default_rng(2))
-    np.testing.assert_array_equal(restored.act(seen), learner.act(seen))
+    learn(restored, IMAGE_AND_STATE, np.random.default_rng(1))
+    observation = observe(IMAGE_AND_STATE, np.random.default_rng(2))
+    np.testing.assert_array_equal(restored.act(observation), learner.act(observation))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has a CUDA device")
 def test_cuda_is_refused_when_absent():
     with pytest.raises(InputError, match="no CUDA device"):
-        make(BOTH, device="cuda")
+        make(IMAGE_AND_STATE, device="cuda")
 
 
-def test_further_combinations_are_refused():
+def test_image_learner_refuses_unsupported_settings():
     with pytest.raises(InputError, match="cannot use cuda"):
         resolve_preset("tqc_contact", "tqc", {"device": "cuda", "num_envs": 2})
     with pytest.raises(InputError, match="target actor"):
-        make(BOTH, "td3")
+        make(IMAGE_AND_STATE, "td3")
     with pytest.raises(InputError, match="privileged critic takes no images"):
-        make(BOTH, privileged_critic=True)
+        make(IMAGE_AND_STATE, privileged_critic=True)
     with pytest.raises(InputError, match="too small"):
         make(spaces.Box(0, 255, (6, 6, 3), np.uint8))

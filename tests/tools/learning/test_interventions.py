@@ -27,14 +27,14 @@ class ZeroLearner(Learner):
     """Learner that records transitions and always returns the action zero."""
 
     def __init__(self, preset, env, **_):
-        self.env, self.seen = env, []
+        self.env, self.transitions = env, []
         learners.append(self)
 
     def act(self, observation):
         return np.zeros(self.env.action_space.shape, np.float32)
 
     def on_step(self, transition):
-        self.seen.append(transition)
+        self.transitions.append(transition)
 
     def policy(self, description):
         space = self.env.action_space
@@ -57,26 +57,26 @@ learners = []
 
 
 @pytest.fixture(autouse=True)
-def still():
-    LEARNERS.register("still", ZeroLearner)
+def zero_learner():
+    LEARNERS.register("zero", ZeroLearner)
     yield
     learners.clear()
-    del LEARNERS._entries["still"]
+    del LEARNERS._entries["zero"]
 
 
-class Scripted(Supervisor):
+class ScriptedSupervisor(Supervisor):
     """Supervisor with corrections (first step, last step, offset) and labels (step, label) by episode."""
 
-    def __init__(self, pushes, labels=None):
-        self.pushes, self.labels, self.episode = pushes, labels or {}, -1
+    def __init__(self, corrections, labels=None):
+        self.corrections, self.labels, self.episode = corrections, labels or {}, -1
 
     def on_episode_start(self, env):
         self.episode += 1
         self.env = env.unwrapped
 
     def correction(self, observation):
-        first, last, push = self.pushes.get(self.episode, (1, 0, None))
-        return np.array(push) if first <= self.env._control_steps <= last else None
+        first, last, offset = self.corrections.get(self.episode, (1, 0, None))
+        return np.array(offset) if first <= self.env._control_steps <= last else None
 
     def label(self):
         step, label = self.labels.get(self.episode, (None, None))
@@ -85,19 +85,20 @@ class Scripted(Supervisor):
 
 def passage(episodes, **environment):
     return configure(
-        "NarrowPassage", {"guidance": "kgrl", "action_repeat": 2, **environment}, algorithm="still", episodes=episodes,
+        "NarrowPassage", {"guidance": "kgrl", "action_repeat": 2, **environment}, algorithm="zero", episodes=episodes,
         human_in_the_loop=True, step_log=False,
     )  # fmt: skip
 
 
 def test_correction_becomes_transitions_and_via_points(tmp_path):
     folder = RunFolder(tmp_path / "run")
-    rows = run_training(folder, passage(2), supervisor=Scripted({0: (10, 19, [0.5, 3.0])}))
+    rows = run_training(folder, passage(2), supervisor=ScriptedSupervisor({0: (10, 19, [0.5, 3.0])}))
     assert [row["interventions"] for row in rows] == [1, 0]
-    actions = np.array([transition.action for transition in learners[0].seen])
-    pushed = (actions != 0).any(axis=1)
-    np.testing.assert_array_equal(actions[pushed], np.tile([0.5, 1.0], (pushed.sum(), 1)))  # clipped to 1
-    np.testing.assert_array_equal(np.flatnonzero(pushed), [5, 6, 7, 8, 9])  # actions of steps 10 to 19
+    actions = np.array([transition.action for transition in learners[0].transitions])
+    is_corrected = (actions != 0).any(axis=1)
+    np.testing.assert_array_equal(actions[is_corrected], np.tile([0.5, 1.0], (is_corrected.sum(), 1)))  # clipped to 1
+    # Actions 5 to 9 are the control steps 10 to 19.
+    np.testing.assert_array_equal(np.flatnonzero(is_corrected), [5, 6, 7, 8, 9])
     config = folder.config()
     assert config.human_in_the_loop
     points = np.reshape(config.environment["via_points"], (-1, 3))
@@ -105,7 +106,7 @@ def test_correction_becomes_transitions_and_via_points(tmp_path):
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     reference = corrections._reference.means[points[:, 0].astype(int)]
     expected = reference + np.array([0.5, 3.0]) * corrections.reach
-    assert (np.abs(points[:, 1:] - expected).min(axis=0) < 1e-9).all()  # the constraints shorten some
+    assert (np.abs(points[:, 1:] - expected).min(axis=0) < 1e-9).all()  # the constraints reduce some offsets
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
@@ -117,40 +118,40 @@ def test_via_points_change_the_reference_locally():
     np.testing.assert_allclose(moved.means[[200, 205]], [[1.5, 3.9], [1.5, 4.0]], atol=2e-2)
     np.testing.assert_allclose(moved.means[[0, 399]], reference.means[[0, 399]], atol=1e-6)
     np.testing.assert_array_equal(moved.covariances, reference.covariances)
-    for wrong in ([1.0, 2.0], [0.5, 0.0, 0.0], [400, 0.0, 0.0], [3, np.nan, 0.0]):
+    for invalid in ([1.0, 2.0], [0.5, 0.0, 0.0], [400, 0.0, 0.0], [3, np.nan, 0.0]):
         with pytest.raises(InputError, match="via-point"):
-            pass_through(reference, wrong, SquaredExponential(0.5))
+            pass_through(reference, invalid, SquaredExponential(0.5))
 
 
 def test_held_correction_applies_to_the_rest_of_the_motion():
     corrections = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"})
     last = corrections._reference.num_steps - 1
-    kept = np.reshape(corrections.with_offsets({20: np.array([0.1, 0.0])}, is_held=True), (-1, 3))
-    assert (kept[0, 0], kept[-1, 0]) == (20, last)
-    assert np.diff(kept[:-1, 0]).max() <= VIA_POINT_SPACING
-    corrections.points = tuple(kept.ravel())
-    newer = np.reshape(corrections.with_offsets({20: np.array([-0.1, 0.0]), 30: np.array([-0.1, 0.0])}), (-1, 3))
-    assert sum(newer[:, 0] <= 30) == 2
-    assert (newer[newer[:, 0] > 34] == kept[kept[:, 0] > 34]).all()
+    points = np.reshape(corrections.with_offsets({20: np.array([0.1, 0.0])}, is_held=True), (-1, 3))
+    assert (points[0, 0], points[-1, 0]) == (20, last)
+    assert np.diff(points[:-1, 0]).max() <= VIA_POINT_SPACING
+    corrections.points = tuple(points.ravel())
+    updated = np.reshape(corrections.with_offsets({20: np.array([-0.1, 0.0]), 30: np.array([-0.1, 0.0])}), (-1, 3))
+    assert sum(updated[:, 0] <= 30) == 2
+    assert (updated[updated[:, 0] > 34] == points[points[:, 0] > 34]).all()
 
 
 def test_correction_of_a_failed_first_step_is_no_via_point():
-    """By hand: steps are counted from zero, and none was completed."""
-    corrections, seen = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"}), np.zeros(2, np.float32)
-    supervisor = Scripted({0: (0, 400, [0.5, 0.5])})
+    """A failed step has a via-point only if a control step was completed before the failure."""
+    corrections, observation = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"}), np.zeros(2, np.float32)
+    supervisor = ScriptedSupervisor({0: (0, 400, [0.5, 0.5])})
     env = SimpleNamespace(unwrapped=SimpleNamespace(_control_steps=0))
-    policy = InterventionPolicy(env, supervisor, lambda observation: seen, corrections)
-    for control_steps, number in ((0, 0), (1, 1)):
+    policy = InterventionPolicy(env, supervisor, lambda observation: observation, corrections)
+    for control_steps, num_points in ((0, 0), (1, 1)):
         policy.on_episode_start()
         supervisor.episode = 0
         info = {"control_steps": control_steps, "simulation_failure": "diverged"}
-        policy.on_step(Transition(seen, policy(seen), 0.0, seen, False, True, info))
-        assert len(policy._offsets) == number
+        policy.on_step(Transition(observation, policy(observation), 0.0, observation, False, True, info))
+        assert len(policy._offsets) == num_points
         assert min(policy.via_points[::3], default=0.0) >= 0.0
 
 
 @pytest.mark.parametrize("offset", [[np.nan, 0.0], [0.5], 0.5, [[0.5, 0.5]], ["a", "b"]])
-def test_correction_is_refused_unless_it_is_an_offset_of_each_action(offset):
+def test_correction_is_refused_without_an_offset_per_action(offset):
     corrections, env = ViaPointCorrections("NarrowPassage", {"guidance": "kgrl"}), SimpleNamespace(unwrapped=None)
     supervisor = SimpleNamespace(correction=lambda observation: np.array(offset))
     with pytest.raises(InputError, match="a correction"):
@@ -159,27 +160,28 @@ def test_correction_is_refused_unless_it_is_an_offset_of_each_action(offset):
 
 def test_label_ends_the_episode_and_changes_the_reward(tmp_path):
     labels = {0: (10, "success"), 1: (10, "failure"), 2: (10, "stop")}
-    rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=Scripted({}, labels))
+    rows = run_training(RunFolder(tmp_path / "run"), passage(3), supervisor=ScriptedSupervisor({}, labels))
     assert [row["termination"] for row in rows] == ["success", "failure", "stop"]
     assert [row["success"] for row in rows] == [1, 0, 0]
-    last = [transition for transition in learners[0].seen if transition.is_last]
+    last = [transition for transition in learners[0].transitions if transition.is_last]
     assert [transition.terminated for transition in last] == [True, True, False]
     unlabeled = last[2].reward
     np.testing.assert_allclose(
-        [one.reward - unlabeled for one in last], [LABEL_REWARDS["success"], LABEL_REWARDS["failure"], 0.0], atol=5.0
+        [transition.reward - unlabeled for transition in last],
+        [LABEL_REWARDS["success"], LABEL_REWARDS["failure"], 0.0],
+        atol=5.0,
     )
 
 
 def test_supervised_run_resumes_with_its_corrections(tmp_path):
-    pushes = {0: (10, 19, [0.5, 3.0]), 2: (4, 8, [-1.0, 0.0])}
-    whole = run_training(RunFolder(tmp_path / "whole"), passage(3), supervisor=Scripted(pushes))
-    run_training(RunFolder(tmp_path / "parts"), passage(2), supervisor=Scripted(pushes))
-    later = Scripted({episode - 2: push for episode, push in pushes.items()})
-    folder = RunFolder(tmp_path / "parts")
-    second = run_training(folder, passage(3), resume=True, supervisor=later)
-    for one, other in zip(whole, second, strict=True):
-        assert one | {"wall_time": 0} == other | {"wall_time": 0}
-    assert folder.config().environment == RunFolder(tmp_path / "whole").config().environment
+    corrections = {0: (10, 19, [0.5, 3.0]), 2: (4, 8, [-1.0, 0.0])}
+    whole, folder = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "parts")
+    rows = run_training(whole, passage(3), supervisor=ScriptedSupervisor(corrections))
+    run_training(folder, passage(2), supervisor=ScriptedSupervisor(corrections))
+    remaining = ScriptedSupervisor({episode - 2: correction for episode, correction in corrections.items()})
+    resumed = run_training(folder, passage(3), resume=True, supervisor=remaining)
+    assert [row | {"wall_time": 0} for row in resumed] == [row | {"wall_time": 0} for row in rows]
+    assert folder.config().environment == whole.config().environment
     with pytest.raises(InputError, match="--human-in-the-loop"):
         run_training(folder, folder.config(), resume=True)
 
@@ -189,111 +191,115 @@ def test_corrections_are_refused_without_demonstrations():
         ViaPointCorrections("Pouring", {})
 
 
-def test_corrections_rescue_demonstrations_that_are_5_mm_off(tmp_path):
-    """The connector's demonstrations lead 5 mm past the jack; the supervisor corrects until the plug is inserted."""
-    environment = {
-        "guidance": "kgrl",
-        "fixture_offset": "none",
-        "bound": 6e-3,
-        "action_repeat": 10,
-        "action_dims": (0, 1),
-    }
+def test_corrections_compensate_demonstrations_5_mm_off(tmp_path):
+    """The reference leads 5 mm past the jack; after corrections in the second episode, the third succeeds."""
+    environment = {"guidance": "kgrl", "fixture_offset": "none", "bound": 6e-3, "action_repeat": 10}
+    environment["action_dims"] = (0, 1)
     corrections = ViaPointCorrections("BncConnector", environment)
     steps = np.arange(0, corrections._reference.num_steps, VIA_POINT_SPACING)
-    astray = np.column_stack([steps, corrections._reference.means[steps]])
-    astray[:, 1] += 5e-3
-    environment["via_points"] = tuple(astray.ravel())
-    push = [-5e-3 / corrections.reach[0], 0.0]
+    displaced = np.column_stack([steps, corrections._reference.means[steps]])
+    displaced[:, 1] += 5e-3
+    environment["via_points"] = tuple(displaced.ravel())
+    offset = [-5e-3 / corrections.reach[0], 0.0]
     config = configure(
-        "BncConnector", environment, algorithm="still", episodes=3, human_in_the_loop=True, step_log=False
+        "BncConnector", environment, algorithm="zero", episodes=3, human_in_the_loop=True, step_log=False
     )
-    rows = run_training(RunFolder(tmp_path / "run"), config, supervisor=Scripted({1: (0, 10**6, push)}))
+    rows = run_training(RunFolder(tmp_path / "run"), config, supervisor=ScriptedSupervisor({1: (0, 10**6, offset)}))
     assert [row["success"] for row in rows] == [0, 0, 1]
     assert sum(row["interventions"] for row in rows) <= 5
     assert max(row["max_commanded_violation"] for row in rows) <= 1e-9
 
 
-def assert_refused(learner, words, folder, episodes):
+def assert_refused(learner, message, folder, episodes):
     """Train with a learner that is registered for the test only, and expect an `InputError`."""
-    LEARNERS.register("odd")(learner)
+    LEARNERS.register("invalid")(learner)
     try:
-        with pytest.raises(InputError, match=words):
-            run_training(RunFolder(folder), configure("Bead", {}, algorithm="odd", episodes=episodes, seed=1))
+        with pytest.raises(InputError, match=message):
+            run_training(RunFolder(folder), configure("Bead", {}, algorithm="invalid", episodes=episodes, seed=1))
     finally:
-        del LEARNERS._entries["odd"]
+        del LEARNERS._entries["invalid"]
 
 
 @pytest.mark.parametrize(
-    ("columns", "policy", "words"),
+    ("columns", "policy", "message"),
     [
         ([None], Policy, "on_episode_end must return a dictionary, not None"),
         ([{"return": 0.0}], Policy, "returns the column 'return', which"),
         ([{"word": "good"}], Policy, "the column 'word' of an episode must be a number, not 'good'"),
         ([{"a": 1}, {"b": 1}], Policy, "the column 'a' is missing in some episodes"),
-        ([{}, {}], None, "Odd.policy must return a Policy, not None"),
-        ([{}, {}], "no", "Odd.policy failed: a policy has no activation 'no'"),
+        ([{}, {}], None, "Invalid.policy must return a Policy, not None"),
+        ([{}, {}], "no", "Invalid.policy failed: a policy has no activation 'no'"),
     ],
 )
-def test_learner_that_returns_something_else_is_named(columns, policy, words, tmp_path):
-    class Odd(ZeroLearner):
+def test_learner_with_an_invalid_return_value_is_named(columns, policy, message, tmp_path):
+    class Invalid(ZeroLearner):
         def on_episode_end(self, row):
             return columns[row["episode"]]
 
         def policy(self, description):
-            words = {"activation": policy} if isinstance(policy, str) else {}
-            return super().policy({**description, **words}) if policy else None
+            activation = {"activation": policy} if isinstance(policy, str) else {}
+            return super().policy({**description, **activation}) if policy else None
 
-    assert_refused(Odd, words, tmp_path / "run", episodes=2)
+    assert_refused(Invalid, message, tmp_path / "run", episodes=2)
 
 
-class Unfinished(Learner):
+class Incomplete(Learner):
     """Learner without any method."""
 
 
 @pytest.mark.parametrize(
-    ("name", "learner", "words"),
+    ("name", "learner", "message"),
     [
-        ("odd", Unfinished, "the learner Unfinished has no act, has_diverged, policy, restore, state, __init__: see"),
-        ("odd", type("Other", (), {}), "the learner Other has no Config, __init__"),
+        (
+            "invalid",
+            Incomplete,
+            "the learner Incomplete has no act, has_diverged, policy, restore, state, __init__: see",
+        ),
+        ("invalid", type("Other", (), {}), "the learner Other has no Config, __init__"),
         ("Bad Name/..", ZeroLearner, "the name of a learner has letters, digits, '_', '-' and '.', unlike 'Bad Name"),
     ],
 )
-def test_learner_that_cannot_be_constructed_is_not_registered(name, learner, words):
-    with pytest.raises(InputError, match=words):
+def test_learner_that_cannot_be_constructed_is_refused(name, learner, message):
+    with pytest.raises(InputError, match=message):
         LEARNERS.register(name)(learner)
     assert name not in LEARNERS.names()
 
 
 @pytest.mark.parametrize(
-    ("state", "words"),
+    ("state", "message"),
     [
-        (None, "Odd.state must return two dictionaries, not None"),
-        (([], {}), "Odd.state must return two dictionaries"),
-        (({"words": np.array(["a"])}, {}), "the array 'words' of Odd.state has no numbers"),
-        (({}, {"mean": np.zeros(2)}), "the values of Odd.state must be values of JSON: Object of type ndarray"),
-        (({}, {"a": [{"b": (1, 2)}]}), r"the values of Odd.state must not contain the tuple \(1, 2\), because JSON"),
-        (({}, {"a": {3: 4}}), "the values of Odd.state must not contain the key 3, because JSON changes it"),
+        (None, "Invalid.state must return two dictionaries, not None"),
+        (([], {}), "Invalid.state must return two dictionaries"),
+        (({"words": np.array(["a"])}, {}), "the array 'words' of Invalid.state has no numbers"),
+        (({}, {"mean": np.zeros(2)}), "the values of Invalid.state must be values of JSON: Object of type ndarray"),
+        (
+            ({}, {"a": [{"b": (1, 2)}]}),
+            r"the values of Invalid.state must not contain the tuple \(1, 2\), because JSON",
+        ),
+        (({}, {"a": {3: 4}}), "the values of Invalid.state must not contain the key 3, because JSON changes it"),
     ],
 )
-def test_state_that_cannot_be_stored_is_named(state, words, tmp_path):
-    class Odd(ZeroLearner):
+def test_state_that_cannot_be_stored_is_named(state, message, tmp_path):
+    class Invalid(ZeroLearner):
         def state(self):
             return state
 
-    assert_refused(Odd, words, tmp_path / "run", episodes=1)
+    assert_refused(Invalid, message, tmp_path / "run", episodes=1)
 
 
 @pytest.mark.parametrize(
-    ("method", "words"),
+    ("method", "message"),
     [
-        ("__init__", r"constructing the learner Odd failed: test_interventions\.py, line \d+: ZeroDivisionError"),
-        ("act", r"Odd\.act failed: test_interventions\.py, line \d+: ZeroDivisionError: division by zero"),
+        ("__init__", r"constructing the learner Invalid failed: test_interventions\.py, line \d+: ZeroDivisionError"),
+        ("act", r"Invalid\.act failed: test_interventions\.py, line \d+: ZeroDivisionError: division by zero"),
     ],
 )
-def test_error_in_a_method_of_a_learner_is_named(method, words, tmp_path):
-    assert_refused(type("Odd", (ZeroLearner,), {method: lambda *_, **__: 1 / 0}), words, tmp_path / "run", episodes=1)
+def test_error_in_a_method_of_a_learner_is_named(method, message, tmp_path):
+    assert_refused(
+        type("Invalid", (ZeroLearner,), {method: lambda *_, **__: 1 / 0}), message, tmp_path / "run", episodes=1
+    )
 
 
 def test_has_diverged_that_returns_nothing_is_named(tmp_path):
-    odd = type("Odd", (ZeroLearner,), {"has_diverged": lambda self: None})
-    assert_refused(odd, "Odd.has_diverged must return True or False, not None", tmp_path / "run", episodes=1)
+    invalid = type("Invalid", (ZeroLearner,), {"has_diverged": lambda self: None})
+    assert_refused(invalid, "Invalid.has_diverged must return True or False, not None", tmp_path / "run", episodes=1)

@@ -1,11 +1,11 @@
-"""Learning in a second process."""
+"""Pipelined learner: training in a second process."""
 
 from dataclasses import replace
 
-import gymnasium
 import numpy as np
 import pyarrow as pa
 import pytest
+from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.rollout import Transition
@@ -15,23 +15,21 @@ from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 
 
-def make_learner(algorithm="sac", **more):
-    """Return a pipelined learner with two actions, and its acting learner; `algorithm` learns in the second process."""
-    space = gymnasium.Env()
-    space.observation_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
-    space.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+def make_learner(algorithm="sac", **options):
+    """Return a pipelined learner and its acting learner; `algorithm` trains in the second process."""
+    env = SpacesOnlyEnv()
     small = {"net_arch": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_freq": 1}
     preset = resolve_preset("tqc_contact", "sac", small)
-    named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
-    acting = LEARNERS.get("sac")(preset, space, **named)
-    arguments = ((replace(preset, algorithm=algorithm), space), named)
-    return PipelinedLearner(acting, arguments, waits=True, **more), acting
+    keywords = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
+    acting = LEARNERS.get("sac")(preset, env, **keywords)
+    arguments = ((replace(preset, algorithm=algorithm), env), keywords)
+    return PipelinedLearner(acting, arguments, waits=True, **options), acting
 
 
-def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
+def test_step_log_is_absent_when_writing_fails(tmp_path, monkeypatch):
     rows, file = pa.table({"episode": np.zeros(9, np.int32)}), tmp_path / "steps" / "episode-000000.parquet"
 
-    def fail(*names):
+    def fail(*arguments):
         raise OSError("the process was killed")
 
     with monkeypatch.context() as patch:
@@ -43,7 +41,7 @@ def test_a_step_log_is_whole_or_absent(tmp_path, monkeypatch):
     assert len(read_step_log(file.parent)) == 9
 
 
-def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
+def test_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
     (tmp_path / "file").write_text("")
     learner, _ = make_learner()
     learner.write(tmp_path / "file" / "episode-000000.parquet", pa.table({"episode": [0]}))
@@ -51,7 +49,7 @@ def test_a_step_log_that_cannot_be_written_is_reported(forkserver, tmp_path):
         learner.finish()
 
 
-def test_failures_of_a_users_learner_in_the_second_process_are_one_sentence(forkserver, tmp_path):
+def test_failure_of_a_learner_in_the_second_process_is_named(forkserver, tmp_path):
     module = tmp_path / "lab_learner.py"
     module.write_text(
         "from guiderail.tools.learning.learner import register_learner\n"
@@ -67,7 +65,7 @@ def test_failures_of_a_users_learner_in_the_second_process_are_one_sentence(fork
     learner.close()
 
 
-def test_pipelined_learner_learns_episodes_two_later(forkserver):
+def test_pipelined_learner_acts_with_weights_two_episodes_old(forkserver):
     learner, acting = make_learner(excluded=("stopped",))
     before = acting.actor().state_dict()["mu.weight"].clone()
     rng, last = np.random.default_rng(0), {"success": False}

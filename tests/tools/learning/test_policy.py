@@ -1,24 +1,16 @@
 import json
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium import spaces
 from safetensors.numpy import load_file
+from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, _digest
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.networks import export_policy, pack_observation
-
-
-class SpacesOnlyEnv(gymnasium.Env):
-    """Environment with spaces only."""
-
-    def __init__(self, observation_space, action_space):
-        self.observation_space, self.action_space = observation_space, action_space
-
 
 STATE = spaces.Box(-np.inf, np.inf, (5,))
 IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
@@ -31,52 +23,47 @@ IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
 def learner(request):
     algorithm, observation_space, layer_norm = request.param
     env = SpacesOnlyEnv(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
-    return LEARNERS.get(algorithm)(
-        resolve_preset("tqc_contact", algorithm, {"net_arch": "32,16", "layer_norm": layer_norm}),
-        env,
-        action_repeat=1,
-        seed=3,
-        max_transitions=10,
-    )
+    config = resolve_preset("tqc_contact", algorithm, {"net_arch": "32,16", "layer_norm": layer_norm})
+    return LEARNERS.get(algorithm)(config, env, action_repeat=1, seed=3, max_transitions=10)
 
 
-def test_policy_acts_as_stable_baselines3_predicts(learner, tmp_path):
-    space = learner.model.actor.action_space
-    observations = [learner_observation(learner, seed) for seed in range(20)]
-    policy = export_policy(learner.model.actor, {"observation_shape": list(observations[0].shape)})
-    policy.save(tmp_path)
-    loaded = Policy.load(tmp_path)
-    for observation in observations:
-        seen = pack_observation(observation, IMAGE.shape) if observation.ndim == 3 else observation
-        expected, _ = learner.model.predict(seen, deterministic=True)
-        np.testing.assert_allclose(loaded(observation), expected, atol=2e-5 * (space.high - space.low).max())
-
-
-def learner_observation(learner, seed):
+def sample_observation(learner, seed):
     random = np.random.default_rng(seed)
     if learner.model.observation_space.dtype == np.uint8:
         return random.integers(0, 256, IMAGE.shape, dtype=np.uint8)
     return random.normal(scale=3, size=STATE.shape).astype(np.float32)
 
 
-def test_policy_refuses_an_observation_of_another_shape(learner):
-    policy = export_policy(learner.model.actor, {"observation_shape": list(learner_observation(learner, 0).shape)})
+@pytest.fixture
+def policy(learner):
+    return export_policy(learner.model.actor, {"observation_shape": list(sample_observation(learner, 0).shape)})
+
+
+def test_policy_acts_as_stable_baselines3_predicts(learner, policy, tmp_path):
+    space = learner.model.actor.action_space
+    policy.save(tmp_path)
+    loaded = Policy.load(tmp_path)
+    for observation in (sample_observation(learner, seed) for seed in range(20)):
+        packed = pack_observation(observation, IMAGE.shape) if observation.ndim == 3 else observation
+        expected, _ = learner.model.predict(packed, deterministic=True)
+        np.testing.assert_allclose(loaded(observation), expected, atol=2e-5 * (space.high - space.low).max())
+
+
+def test_policy_refuses_an_observation_of_another_shape(policy):
     with pytest.raises(ValueError, match="trained on observations"):
         policy(np.zeros(4))
 
 
-def test_load_refuses_a_truncated_policy(learner, tmp_path):
-    shape = list(learner_observation(learner, 0).shape)
-    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+def test_load_refuses_a_truncated_policy(policy, tmp_path):
+    policy.save(tmp_path)
     weights = tmp_path / "policy.safetensors"
     weights.write_bytes(weights.read_bytes()[:-5])
     with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
 
 
-def test_load_refuses_an_unknown_activation(learner, tmp_path):
-    shape = list(learner_observation(learner, 0).shape)
-    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+def test_load_refuses_an_unknown_activation(policy, tmp_path):
+    policy.save(tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     (tmp_path / "policy.json").write_text(json.dumps(description | {"activation": "gelu"}))
     with pytest.raises(InputError, match="of another version"):
@@ -84,9 +71,8 @@ def test_load_refuses_an_unknown_activation(learner, tmp_path):
 
 
 @pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
-def test_load_refuses_a_flipped_bit(learner, file, tmp_path):
-    shape = list(learner_observation(learner, 0).shape)
-    export_policy(learner.model.actor, {"observation_shape": shape}).save(tmp_path)
+def test_load_refuses_a_flipped_bit(policy, file, tmp_path):
+    policy.save(tmp_path)
     content = bytearray((tmp_path / file).read_bytes())
     position = content.index(b"action_high") + 14 if file.endswith("json") else len(content) - 4
     content[position] ^= 1
@@ -95,15 +81,15 @@ def test_load_refuses_a_flipped_bit(learner, file, tmp_path):
         Policy.load(tmp_path)
 
 
-WRONG = [
+INVALID_ENTRIES = [
     ("pool", 0), ("observation_shape", [10**13]), ("observation_shape", [-5]), ("observation_shape", [6]),
     ("action_low", [0.0]), ("action_high", [-1.0, -2.0]), ("action_high", [float("nan"), 3.0]),
     ("action_low", [-(10**400), -2.0]), ("action_low", {}), ("observation_shape", 5),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("entry", "value"), WRONG)
-def test_policy_refuses_parts_that_do_not_fit(entry, value, tmp_path):
+@pytest.mark.parametrize(("entry", "value"), INVALID_ENTRIES)
+def test_policy_refuses_layers_that_do_not_fit_its_entries(entry, value, tmp_path):
     layers = [(np.ones((4, 5), np.float32), np.zeros(4, np.float32)), (np.ones((2, 4), np.float32), np.zeros(2, "f4"))]
     values = {"observation_shape": [5], "action_low": [-1.0, -2.0], "action_high": [1.0, 3.0], "pool": 1}
     Policy(layers, values).save(tmp_path)
@@ -115,7 +101,7 @@ def test_policy_refuses_parts_that_do_not_fit(entry, value, tmp_path):
     stored = json.loads((tmp_path / "policy.json").read_text())
     del stored["digest"]
     stored |= {entry: value}
-    stored["digest"] = _digest(load_file(tmp_path / "policy.safetensors"), stored)  # a forged file has a valid digest
+    stored["digest"] = _digest(load_file(tmp_path / "policy.safetensors"), stored)  # digest of the changed entries
     (tmp_path / "policy.json").write_text(json.dumps(stored))
     with pytest.raises(InputError, match="damaged"):
         Policy.load(tmp_path)
@@ -137,7 +123,7 @@ def test_policy_refuses_a_bias_that_is_no_vector(shape):
         Policy([(np.ones((1, 3), np.float32), np.zeros(shape, np.float32))], description)
 
 
-def test_save_makes_its_folder(tmp_path):
+def test_save_creates_its_folder(tmp_path):
     description = {"observation_shape": [3], "action_low": [-1.0], "action_high": [1.0]}
     policy = Policy([(np.ones((1, 3), np.float32), np.zeros(1, np.float32))], description)
     policy.save(tmp_path / "new" / "folder")

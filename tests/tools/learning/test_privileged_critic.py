@@ -42,66 +42,63 @@ def make(kind=TqcLearner, env=None, symmetry=None, transitions=40, **settings):
     learner = kind(config, env or Vector(), action_repeat=1, seed=0, max_transitions=100, symmetry=symmetry)
     random = np.random.default_rng(1)
     for _ in range(transitions):
-        seen, then = random.uniform(-1, 1, (2, OBSERVED)).astype(np.float32)
-        hidden, following = random.uniform(-1, 1, (2, HIDDEN)).astype(np.float32)
-        action = random.uniform(-1, 1, 2).astype(np.float32)
-        learner.store(Transition(seen, action, float(hidden.sum()), then, False, False, {}, hidden, following))
+        observation, next_observation = random.uniform(-1, 1, (2, OBSERVED)).astype(np.float32)
+        hidden, next_hidden = random.uniform(-1, 1, (2, HIDDEN)).astype(np.float32)
+        action, reward = random.uniform(-1, 1, 2).astype(np.float32), float(hidden.sum())
+        learner.store(Transition(observation, action, reward, next_observation, False, False, {}, hidden, next_hidden))
     return learner
 
 
 @pytest.mark.parametrize("kind", [TqcLearner, SacLearner, PlainTqc, PlainSac])
-def test_actor_and_saved_policy_do_not_observe_what_is_hidden(kind, tmp_path):
+def test_actor_and_saved_policy_ignore_hidden_values(kind, tmp_path):
     learner = make(kind)
     model = learner.model
     assert model.actor.latent_pi[0].in_features == OBSERVED
-    critic = next(parameter for name, parameter in model.critic.named_parameters() if parameter.ndim == 2)
+    critic = next(parameter for parameter in model.critic.parameters() if parameter.ndim == 2)
     assert critic.shape[1] == OBSERVED + HIDDEN + 2
     policy = learner.policy({"observation_shape": [OBSERVED]})
     policy.save(tmp_path)
-    loaded, seen = Policy.load(tmp_path), np.linspace(-1, 1, OBSERVED, dtype=np.float32)
-    assert loaded(seen).shape == (2,)
-    # The action is that of the actor, whatever is hidden.
+    loaded, observation = Policy.load(tmp_path), np.linspace(-1, 1, OBSERVED, dtype=np.float32)
+    assert loaded(observation).shape == (2,)
     for hidden in (np.zeros(HIDDEN), np.full(HIDDEN, 5.0)):
-        everything = np.concatenate([seen, hidden]).astype(np.float32)
-        action = learner.actor()._predict(model.policy.obs_to_tensor(everything)[0], deterministic=True)
-        np.testing.assert_allclose(action.detach().numpy()[0], loaded(seen), atol=1e-6)
+        extended = np.concatenate([observation, hidden]).astype(np.float32)
+        action = learner.actor()._predict(model.policy.obs_to_tensor(extended)[0], deterministic=True)
+        np.testing.assert_allclose(action.detach().numpy()[0], loaded(observation), atol=1e-6)
     with pytest.raises(ValueError, match="trained on observations"):
         loaded(np.zeros(OBSERVED + HIDDEN, np.float32))
 
 
-def test_critic_depends_on_what_is_hidden():
+def test_critic_depends_on_hidden_values():
     learner = make()
-    values = [
-        learner.model.critic(torch.cat([torch.zeros(1, OBSERVED), torch.full((1, HIDDEN), h)], 1), torch.zeros(1, 2))
-        for h in (0.0, 1.0)
-    ]
+    hidden_values = (torch.full((1, HIDDEN), value) for value in (0.0, 1.0))
+    observations = [torch.cat([torch.zeros(1, OBSERVED), hidden], 1) for hidden in hidden_values]
+    values = [learner.model.critic(observation, torch.zeros(1, 2)) for observation in observations]
     assert not torch.allclose(*values)
 
 
-def test_reward_of_what_is_hidden_is_learned_by_a_privileged_critic_only():
-    """The reward is the sum of the hidden numbers; a critic without them is left with its variance."""
+def test_only_a_privileged_critic_learns_a_hidden_reward():
+    """The reward is the sum of the hidden values; without them, the error of a critic is the reward's variance."""
 
     def error(privileged):
-        env = Vector()
-        learner = make(env=env, transitions=90, gamma=0.01, learning_rate=3e-3, privileged_critic=privileged)
+        learner = make(transitions=90, gamma=0.01, learning_rate=3e-3, privileged_critic=privileged)
         learner.model.train(400, 32)
         buffer = learner.model.replay_buffer
         size = buffer.size()
-        seen, taken = (torch.from_numpy(each[:size, 0]) for each in (buffer.observations, buffer.actions))
+        observations, actions = (torch.from_numpy(array[:size, 0]) for array in (buffer.observations, buffer.actions))
         with torch.no_grad():
-            values = learner.model.critic(seen, taken).mean(dim=(1, 2))
+            values = learner.model.critic(observations, actions).mean(dim=(1, 2))
         return float((values - torch.from_numpy(buffer.rewards[:size, 0])).square().mean())
 
     assert error(True) < 0.3 * error(False)
 
 
 @pytest.mark.parametrize(("plain", "fast"), [(PlainSac, SacLearner), (PlainTqc, TqcLearner)])
-def test_fast_step_equals_that_of_stable_baselines3(plain, fast):
+def test_fast_step_equals_the_step_of_stable_baselines3(plain, fast):
     learners = [make(kind, learning_rate=1e-4) for kind in (plain, fast)]
     np.random.seed(0)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     batches = learners[0].model.replay_buffer.sample(4 * 8)
-    each = iter(zip(*[of_all.split(8) for of_all in batches], strict=True))
-    samplers = (lambda _, env=None: type(batches)(*next(each)), lambda _, env=None: batches)
+    single_batches = iter(zip(*[array.split(8) for array in batches], strict=True))
+    samplers = (lambda _, env=None: type(batches)(*next(single_batches)), lambda _, env=None: batches)
     for learner, sample in zip(learners, samplers, strict=True):
         learner.model.replay_buffer.sample = sample
         torch.manual_seed(0)
@@ -111,32 +108,32 @@ def test_fast_step_equals_that_of_stable_baselines3(plain, fast):
         torch.testing.assert_close(result, expected, rtol=0, atol=2e-6)
 
 
-def test_symmetry_acts_on_what_is_hidden():
+def test_symmetry_transforms_hidden_values():
     signs = [(-1.0, 1.0, 1.0, 1.0, 1.0), (1.0, -1.0), (1.0, -1.0, 1.0)]
     config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"symmetry": True})
     arguments = {"action_repeat": 1, "seed": 0, "max_transitions": 10}
     learner = TqcLearner(config, Vector(), symmetry=Symmetry.of_signs(*signs), **arguments)
-    seen, hidden = np.arange(1.0, 6.0, dtype=np.float32), np.arange(6.0, 9.0, dtype=np.float32)
-    learner.store(Transition(seen, np.ones(2, np.float32), 0.0, -seen, False, False, {}, hidden, -hidden))
+    observation, hidden = np.arange(1.0, 6.0, dtype=np.float32), np.arange(6.0, 9.0, dtype=np.float32)
+    learner.store(Transition(observation, np.ones(2, np.float32), 0.0, -observation, False, False, {}, hidden, -hidden))
     original, mirrored = learner.model.replay_buffer.observations[0]
-    np.testing.assert_array_equal(original, [*seen, *hidden])
-    np.testing.assert_array_equal(mirrored, [*(seen * signs[0]), *(hidden * signs[2])])
+    np.testing.assert_array_equal(original, [*observation, *hidden])
+    np.testing.assert_array_equal(mirrored, [*(observation * signs[0]), *(hidden * signs[2])])
     with pytest.raises(InputError, match="symmetry of what a privileged critic observes"):
         TqcLearner(config, Vector(), symmetry=Symmetry.of_signs(*signs[:2]), **arguments)
 
 
 def test_state_is_restored_exactly():
-    learner, other = make(), make(transitions=0)
-    other.restore(*learner.state())
-    for one in (learner, other):
+    learner, restored = make(), make(transitions=0)
+    restored.restore(*learner.state())
+    for each in (learner, restored):
         torch.manual_seed(3)
         np.random.seed(3)  # noqa: NPY002
-        one.model.train(4, 8)
-    expected, result = (parameters_to_vector(one.model.critic.parameters()) for one in (learner, other))
+        each.model.train(4, 8)
+    expected, result = (parameters_to_vector(each.model.critic.parameters()) for each in (learner, restored))
     torch.testing.assert_close(result, expected, rtol=0, atol=0)
 
 
-def test_learner_raises_when_nothing_privileged_is_declared():
+def test_learner_raises_when_no_privileged_space_is_declared():
     class Plain(gymnasium.Env):
         observation_space, action_space = Vector.observation_space, Vector.action_space
 
@@ -149,15 +146,15 @@ def test_insertion_declares_pose_and_exact_wrench():
     env = make_env("BncConnector", sensing="robot", difficulty="hard", guidance="kgrl")
     assert env.privileged_space.shape == (9,)
     env.reset(seed=0)
-    assert env.privileged is None  # evaluated only if a learner uses it
+    assert env.privileged is None  # not evaluated unless requested
     env.observes_privileged = True
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)
     np.testing.assert_allclose(env.privileged[:2] * 2e-3, info["jack_offset"], rtol=1e-6)
 
 
-def test_symmetry_of_the_connector_holds_for_what_is_hidden():
-    """A quarter turn of jack offset and action turns the privileged observation by its declared matrix."""
+def test_symmetry_of_the_connector_applies_to_hidden_values():
+    """A quarter turn of the jack offset transforms the privileged observation by the declared matrix."""
     env = make_env("BncConnector", difficulty="hard", guidance="kgrl", reward="aligned", time_step=0.01)
     env.observes_privileged = True
     symmetry = env.task.near_symmetry
@@ -168,7 +165,7 @@ def test_symmetry_of_the_connector_holds_for_what_is_hidden():
     np.testing.assert_allclose(symmetry.privileged[0] @ hidden[0], hidden[1], atol=1e-6)
 
 
-def test_rollout_passes_what_is_hidden_to_callbacks_only():
+def test_rollout_passes_hidden_values_to_callbacks_only():
     env = make_env("GridClamp", fixture_offset="none", action_repeat=50)
     env.observes_privileged = True
     transitions = []
@@ -179,32 +176,32 @@ def test_rollout_passes_what_is_hidden_to_callbacks_only():
         on_episode_end = staticmethod(lambda row: {})
 
     rollout(env, lambda observation: np.full(env.action_space.shape, -1.0, np.float32), Observer(), seed=1)
-    assert all(one.privileged.shape == (9,) for one in transitions)
+    assert all(transition.privileged.shape == (9,) for transition in transitions)
     np.testing.assert_array_equal(transitions[0].next_privileged, transitions[1].privileged)
     assert not np.array_equal(transitions[0].privileged, transitions[-1].next_privileged)
 
 
 def test_pipelined_learner_restores_a_pending_episode():
-    """The pending episode of a checkpoint contains the hidden values, too."""
+    """The pending episode of a checkpoint contains the hidden values."""
 
     def pipelined():
         config = resolve_preset("tqc_contact", "tqc", SETTINGS | {"train_freq": 1, "gradient_steps": 1})
-        named = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
+        options = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
         env = SpacesOnlyEnv(Vector())
-        return PipelinedLearner(TqcLearner(config, env, **named), ((config, env), named), waits=True)
+        return PipelinedLearner(TqcLearner(config, env, **options), ((config, env), options), waits=True)
 
-    def episode(learner, seed):
+    def run_episode(learner, seed):
         random = np.random.default_rng(seed)
         learner.on_episode_start()
         for _ in range(8):
-            seen, hidden = random.uniform(-1, 1, OBSERVED), random.uniform(-1, 1, HIDDEN)
-            seen, hidden = seen.astype(np.float32), hidden.astype(np.float32)
-            action = learner.act(seen)
-            learner.on_step(Transition(seen, action, 1.0, seen, False, False, {}, hidden, hidden))
+            observation = random.uniform(-1, 1, OBSERVED).astype(np.float32)
+            hidden = random.uniform(-1, 1, HIDDEN).astype(np.float32)
+            action = learner.act(observation)
+            learner.on_step(Transition(observation, action, 1.0, observation, False, False, {}, hidden, hidden))
         learner.on_episode_end({"termination": "success", "success": True})
 
     whole, resumed = pipelined(), pipelined()
-    episode(whole, 0)
+    run_episode(whole, 0)
     arrays, values = whole.state()
     assert arrays["pending/privileged"].shape == (8, HIDDEN)
     random_state = torch.get_rng_state(), np.random.get_state()  # noqa: NPY002
@@ -214,6 +211,6 @@ def test_pipelined_learner_restores_a_pending_episode():
     np.random.set_state(random_state[1])  # noqa: NPY002
     resumed.restore(arrays, values)
     resumed.finish()
-    seen = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
+    observation = np.linspace(-1, 1, OBSERVED, dtype=np.float32)
     policies = [learner.policy({"observation_shape": [OBSERVED]}) for learner in (whole, resumed)]
-    np.testing.assert_array_equal(policies[0](seen), policies[1](seen))
+    np.testing.assert_array_equal(policies[0](observation), policies[1](observation))

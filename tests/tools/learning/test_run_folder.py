@@ -13,7 +13,7 @@ def test_config_is_read_as_written(bead_config, tmp_path):
     assert folder.config() == bead_config
 
 
-def test_config_file_has_everything_that_decides_a_run(bead_config, tmp_path):
+def test_config_file_has_everything_that_determines_a_run(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(bead_config)
     text = (tmp_path / "run" / "config.yaml").read_text()
@@ -21,7 +21,7 @@ def test_config_file_has_everything_that_decides_a_run(bead_config, tmp_path):
         assert word in text
 
 
-def test_missing_setting_has_its_default_not_the_presets(bead_config, tmp_path):
+def test_missing_setting_has_the_default_despite_a_preset(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
     file = tmp_path / "run" / "config.yaml"
@@ -32,26 +32,18 @@ def test_missing_setting_has_its_default_not_the_presets(bead_config, tmp_path):
 
 def test_missing_option_has_its_default(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    older = {key: value for key, value in bead_config.environment.items() if key != "observation"}
-    folder.create(replace(bead_config, environment=older))
+    incomplete = {key: value for key, value in bead_config.environment.items() if key != "observation"}
+    folder.create(replace(bead_config, environment=incomplete))
     folder.refuse_another(bead_config)
     with pytest.raises(InputError, match="another environment"):
         folder.refuse_another(replace(bead_config, environment=bead_config.environment | {"action_repeat": 2}))
 
 
-def test_config_file_with_an_invalid_setting_is_refused(bead_config, tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    folder.create(bead_config)
-    file = tmp_path / "run" / "config.yaml"
-    file.write_text(file.read_text().replace("batch_size: 16", "batch_size: -3"))
-    with pytest.raises(InputError):
-        folder.config()
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("batch_size: 16", "batch size: 16"),  # would have been the default
+        ("batch_size: 16", "batch_size: -3"),
+        ("batch_size: 16", "batch size: 16"),  # not read as a missing setting
         ("episodes: 8", "episodes: true"),
         ("episodes: 8", "episodes: '8'"),
         ("seed: 5", "seed: 2147483648"),

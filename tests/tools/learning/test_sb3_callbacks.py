@@ -12,11 +12,11 @@ from guiderail.tools.learning.trainer import run_training
 
 
 class Recorder(BaseCallback):
-    """Record the calls, and stop after some transitions."""
+    """Callback that records its calls, and stops the training after `last` transitions."""
 
     def __init__(self, last=10**9):
         super().__init__()
-        self.calls, self.seen, self.last = [], [], last
+        self.calls, self.transitions, self.last = [], [], last
 
     def _on_training_start(self):
         self.calls.append("training start")
@@ -25,7 +25,7 @@ class Recorder(BaseCallback):
         self.calls.append("start")
 
     def _on_step(self):
-        self.seen.append((self.num_timesteps, self.locals["rewards"][0], self.locals["infos"][0]["is_success"]))
+        self.transitions.append((self.num_timesteps, self.locals["rewards"][0], self.locals["infos"][0]["is_success"]))
         return self.num_timesteps < self.last
 
     def _on_rollout_end(self):
@@ -35,15 +35,15 @@ class Recorder(BaseCallback):
         self.calls.append("training end")
 
 
-def test_callbacks_see_every_transition_and_the_model(bead_config, tmp_path):
-    recorder, saved = Recorder(), CheckpointCallback(5, str(tmp_path / "models"))
+def test_callbacks_receive_every_transition_and_the_model(bead_config, tmp_path):
+    recorder, checkpoints = Recorder(), CheckpointCallback(5, str(tmp_path / "models"))
     config = replace(bead_config, episodes=3, learner=replace(bead_config.learner, algorithm="sac"))
-    rows = run_training(RunFolder(tmp_path / "run"), config, sb3_callbacks=[recorder, saved])
+    rows = run_training(RunFolder(tmp_path / "run"), config, sb3_callbacks=[recorder, checkpoints])
     assert recorder.calls == ["training start", *["start", "end"] * 3, "training end"]
-    assert [count for count, _, _ in recorder.seen] == list(range(1, len(recorder.seen) + 1))
-    assert sum(reward for _, reward, _ in recorder.seen) == pytest.approx(sum(row["return"] for row in rows))
+    assert [count for count, _, _ in recorder.transitions] == list(range(1, len(recorder.transitions) + 1))
+    assert sum(reward for _, reward, _ in recorder.transitions) == pytest.approx(sum(row["return"] for row in rows))
     assert recorder.model.policy is not None
-    assert len(list((tmp_path / "models").glob("*.zip"))) == len(recorder.seen) // 5
+    assert len(list((tmp_path / "models").glob("*.zip"))) == len(recorder.transitions) // 5
     plain = run_training(RunFolder(tmp_path / "plain"), config)
     assert [row["return"] for row in plain] == [row["return"] for row in rows]
 
@@ -53,7 +53,7 @@ def test_count_of_transitions_continues_when_resumed(bead_config, tmp_path):
     first, second = Recorder(), Recorder()
     run_training(folder, config, sb3_callbacks=first)
     run_training(folder, replace(config, episodes=2), resume=True, sb3_callbacks=second)
-    counts = [count for count, _, _ in [*first.seen, *second.seen]]
+    counts = [count for count, _, _ in [*first.transitions, *second.transitions]]
     assert counts == list(range(1, len(counts) + 1))
 
 
@@ -67,7 +67,7 @@ def test_callback_that_returns_false_ends_the_training(bead_config, tmp_path):
 
 
 def test_callbacks_of_another_kind_are_refused(bead_config, tmp_path):
-    for wrong, message in ((lambda: True, "is no callback"), ([TD3], "is no callback")):
-        with pytest.raises(InputError, match=message):
-            run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=wrong)
+    for callbacks in (lambda: True, [TD3]):
+        with pytest.raises(InputError, match="is no callback"):
+            run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=callbacks)
     assert not (tmp_path / "run").exists()

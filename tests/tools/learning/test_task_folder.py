@@ -1,4 +1,4 @@
-"""Runs of a task folder depend on its files at the start of the run."""
+"""Runs of a task folder: refused when the files of the folder changed since the start of the run."""
 
 import shutil
 from dataclasses import replace
@@ -35,7 +35,8 @@ TASK = {
     "demonstrations": {"components": 1},
 }
 POLICY = {"observation_shape": [1], "action_low": [-1], "action_high": [1]}
-NAMES_TASK = """
+# Program that finds the run of its first argument in the task of its second, and prints the task and its folder.
+PRINT_TASK = """
 import sys
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.tools.cli.app import find_task
@@ -59,6 +60,15 @@ def folder(tmp_path):
     gymnasium.registry.pop(environment_id("parts/pin"))
 
 
+@pytest.fixture
+def run(folder, tmp_path):
+    """Return the folder of a run of the task, with a policy."""
+    run = RunFolder(tmp_path / "run")
+    run.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(run.path)
+    return run
+
+
 CHANGES = {
     "task.yaml": yaml.safe_dump(TASK | {"bounds": {"lower": [None] * 6, "upper": [None] * 6}}),
     "part.obj": "v 0 0 1\n",
@@ -66,125 +76,107 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("name", CHANGES)
-def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, tmp_path):
-    config = configure("parts/pin", {}, episodes=2, imports=[str(folder)])
-    begun = RunFolder(tmp_path / "run")
-    begun.create(config)
-    before = (folder / name).read_text()
+def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, run):
+    config, before = run.config(), (folder / name).read_text()
     (folder / name).write_text(CHANGES[name])
-    for second in (
-        lambda: start_or_resume(None, begun.path, environment={}, resume=True),
-        lambda: begun.refuse_another(configure("parts/pin", {}, episodes=2)),
+    for resume in (
+        lambda: start_or_resume(None, run.path, environment={}, resume=True),
+        lambda: run.refuse_another(configure("parts/pin", {}, episodes=2)),
     ):
         with pytest.raises(InputError, match="the files of parts/pin are not those"):
-            second()
+            resume()
     (folder / name).write_text(before)
-    begun.refuse_another(config)
-    begun.write_config(replace(config, task_content=""))  # as it was written before anybody kept this
+    run.refuse_another(config)
+    run.write_config(replace(config, task_content=""))  # without the digest of the files
     (folder / name).write_text(CHANGES[name])
-    begun.refuse_another(config)
+    run.refuse_another(config)
 
 
 @pytest.mark.parametrize(
-    "words",
+    "arguments",
     [["evaluate"], ["evaluate", "--station", "hardware", "--sim"], ["robustness"], ["visualize"], ["deploy", "--sim"]],
     ids=" ".join,
 )
-def test_run_is_not_evaluated_when_its_task_folder_changed(words, folder, tmp_path, capsys):
-    begun = RunFolder(tmp_path / "run")
-    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
-    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+def test_run_is_not_evaluated_when_its_task_folder_changed(arguments, folder, run, capsys):
     (folder / "part.obj").write_text(CHANGES["part.obj"])
-    before = sorted(begun.path.iterdir())
+    before = sorted(run.path.iterdir())
     with pytest.raises(SystemExit) as end:
-        main([words[0], str(begun.path), *words[1:]])
+        main([arguments[0], str(run.path), *arguments[1:]])
     message = capsys.readouterr().err
     assert end.value.code == 2
     assert "the files of parts/pin are not those that the run in" in message
-    assert ("--task" in message) == ("--sim" not in words)  # not on a robot
-    assert sorted(begun.path.iterdir()) == before
+    assert ("--task" in message) == ("--sim" not in arguments)  # a robot has no other task
+    assert sorted(run.path.iterdir()) == before
 
 
-def test_run_is_not_certified_or_served_when_its_task_folder_changed(folder, tmp_path):
-    begun = RunFolder(tmp_path / "run")
-    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
+def test_run_is_not_certified_or_served_when_its_task_changed(folder, run):
     (folder / "part.obj").write_text(CHANGES["part.obj"])
-    for refused in (lambda: certify_skill(str(begun.path), {}), lambda: open_environment(str(begun.path), {})):
+    for use_run in (certify_skill, open_environment):
         with pytest.raises(InputError, match="the files of parts/pin are not those that the run in"):
-            refused()
+            use_run(str(run.path), {})
 
 
-def test_policy_of_a_run_acts_in_changed_files_of_a_named_task(folder, tmp_path):
-    begun = RunFolder(tmp_path / "run")
-    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
-    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+def test_policy_of_a_run_acts_in_changed_files_of_a_named_task(folder, run):
     (folder / "part.obj").write_text(CHANGES["part.obj"])
-    assert find_subject(begun.path, "parts/pin").folder is None
-    begun.write_config(replace(begun.config(), task_content=""))  # as older versions wrote it
-    assert find_subject(begun.path, None).folder is not None
+    assert find_subject(run.path, "parts/pin").folder is None
+    run.write_config(replace(run.config(), task_content=""))  # without the digest of the files
+    assert find_subject(run.path, None).folder is not None
 
 
-def test_moved_task_folder_is_named_with_its_remedy(folder, tmp_path, capsys, forks):
-    begun, moved = RunFolder(tmp_path / "run"), tmp_path / "moved pin"
-    begun.create(configure("parts/pin", {}, episodes=2, imports=[str(folder)]))
-    Policy([(np.zeros((1, 1), np.float32), np.zeros(1, np.float32))], POLICY).save(begun.path)
+def test_moved_task_folder_is_named_with_its_remedy(folder, run, tmp_path, capsys, forks):
+    moved = tmp_path / "moved pin"
     folder.rename(moved)
     with pytest.raises(SystemExit) as end:
-        main(["evaluate", str(begun.path)])
+        main(["evaluate", str(run.path)])
     message = capsys.readouterr().err
     assert end.value.code == 2
-    assert f"there is no file or task folder {folder} to import, which {begun.path / 'config.yaml'} names" in message
+    assert f"there is no file or task folder {folder} to import, which {run.path / 'config.yaml'} names" in message
     assert "--task NEW_FOLDER" in message
     assert "--import" not in message
-    # Another process, because in this one the task's name belongs to the old folder.
-    result = forks.run("-c", NAMES_TASK, begun.path, moved)
+    # In another process, because the task's name is registered with the old folder in this process.
+    result = forks.run("-c", PRINT_TASK, run.path, moved)
     assert (result.returncode, result.stdout) == (0, f"parts/pin {moved}\n"), result.stderr
 
 
-def test_evaluated_episodes_are_of_the_files_of_the_task(folder, tmp_path):
+def test_stored_episodes_depend_on_the_files_of_the_task(folder, tmp_path):
     config = configure("parts/pin", {}, episodes=2)
     declaration = {"name": "pins", "task": "parts/pin", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
     job = Job(Study.model_validate(declaration), "zero", 0, tmp_path)
 
-    def files():
-        kept = episodes_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
-        return kept, digest(job), digest(job, job.study.eval_sets[0])
+    def names():
+        stored = episodes_file(tmp_path, "uniform_random", config, config.environment, episodes=2)
+        return stored, digest(job), digest(job, job.study.eval_sets[0])
 
-    before = files()
-    other = replace(config, task="NarrowPassage")
-    assert episodes_file(tmp_path, "uniform_random", other, config.environment, episodes=2).name != before[0].name
+    before = names()
+    changed = replace(config, task="NarrowPassage")
+    assert episodes_file(tmp_path, "uniform_random", changed, config.environment, episodes=2).name != before[0].name
     (folder / "task.yaml").write_text(yaml.safe_dump(TASK | {"measured": {"clearance": 1}}))
-    assert files() == before, "nothing reads what was measured"
+    assert names() == before, "the entry `measured` has an effect"
     (folder / "part.obj").write_text(CHANGES["part.obj"])
-    assert all(one != other for one, other in zip(files(), before, strict=True))
+    assert all(name != previous for name, previous in zip(names(), before, strict=True))
 
 
-def test_stored_episodes_are_of_the_content_of_the_base_policy(tmp_path):
-    def train(bias):
+def test_stored_episodes_depend_on_the_base_policy(tmp_path):
+    def save_policy(bias):
         layers = [(np.zeros((8, 5), np.float32), np.full(8, bias, np.float32))]
         description = {"observation_shape": [5], "action_low": [-1] * 8, "action_high": [1] * 8, "chunk": [1, 4, 2]}
         Policy(layers, description).save(tmp_path)
 
-    train(0.0)
+    save_policy(0.0)
     environment = {"guidance": "kgrl_base_policy", "base_policy": str(tmp_path)}
     config = configure("NarrowPassage", environment, episodes=2)
-    declaration = {
-        "name": "chunks",
-        "task": "NarrowPassage",
-        "env": environment,
-        "methods": {"zero": {"policy": "zero"}},
-        "seeds": [0],
-    }
+    declaration = {"name": "chunks", "task": "NarrowPassage", "methods": {"zero": {"policy": "zero"}}, "seeds": [0]}
+    declaration["env"] = environment
     job = Job(Study.model_validate(declaration), "zero", 0, tmp_path)
 
-    def files():
+    def names():
         return episodes_file(tmp_path, "zero", config, config.environment, episodes=2), digest(job)
 
-    before = files()
+    before = names()
     (tmp_path / "episodes.csv").write_text("")
-    assert files() == before, "only the policy matters"
-    train(0.5)
-    assert all(one != other for one, other in zip(files(), before, strict=True))
+    assert names() == before, "another file than the policy has an effect"
+    save_policy(0.5)
+    assert all(name != previous for name, previous in zip(names(), before, strict=True))
 
 
 def test_task_without_a_folder_has_no_content_digest():

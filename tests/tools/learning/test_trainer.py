@@ -26,7 +26,7 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, train, with_defaults
 from guiderail.tools.learning.trainer import run_training
 
-# Trains the run of the fixture and prints the number of each finished episode; the parent kills it then.
+# Program that trains the run of `bead_config` and prints the number of each finished episode.
 CHILD = """
 import sys
 from pathlib import Path
@@ -52,53 +52,61 @@ def assert_same_run(first, second):
     assert a.keys() == b.keys()
     for key in a:
         np.testing.assert_array_equal(a[key], b[key])
-    assert step_log_bytes(first) == step_log_bytes(second) != {}
-
-
-def step_log_bytes(folder):
-    return {path.name: path.read_bytes() for path in folder.steps.iterdir()}
+    first_steps, second_steps = ({path.name: path.read_bytes() for path in f.steps.iterdir()} for f in (first, second))
+    assert first_steps == second_steps != {}
 
 
 def with_demonstrations(config, number):
     return replace(config, learner=replace(config.learner, demonstration_episodes=number))
 
 
-def always_left(env):
+def lowest_action(env):
     return lambda observation: env.action_space.low
 
 
-def test_demonstrator_acts_in_the_first_episodes(bead_config, tmp_path):
-    acted = []
+def interrupt_in(episode):
+    """Return a report function that interrupts the training after an episode."""
 
-    def watched(env):
-        acted.append(0)
+    def report(row):
+        if row["episode"] == episode:
+            raise KeyboardInterrupt
+
+    return report
+
+
+def test_demonstrator_acts_in_the_first_episodes(bead_config, tmp_path):
+    num_actions = []
+
+    def demonstrator(env):
+        num_actions.append(0)
 
         def act(observation):
-            acted[-1] += 1
+            num_actions[-1] += 1
             return env.action_space.low
 
         return act
 
-    rows = run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 2), demonstrator=watched)
-    assert acted[1:] == [row["steps"] for row in rows[:2]]  # the first call checks the compatibility
-    assert len(rows) > 2
+    rows = run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 2), demonstrator=demonstrator)
+    assert num_actions[1:] == [row["steps"] for row in rows[:2]]  # the first call checks the compatibility
+    assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
 
 
 def test_demonstrated_run_resumes_bit_for_bit(bead_config, tmp_path):
     config = with_demonstrations(bead_config, 2)
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
-    run_training(undisturbed, config, demonstrator=always_left)
-    run_training(stopped, replace(config, episodes=1), demonstrator=always_left)
-    run_training(stopped, config, demonstrator=always_left, resume=True)
+    run_training(undisturbed, config, demonstrator=lowest_action)
+    run_training(stopped, replace(config, episodes=1), demonstrator=lowest_action)
+    run_training(stopped, config, demonstrator=lowest_action, resume=True)
     assert_same_run(undisturbed, stopped)
 
 
 def test_demonstrator_of_other_observations_is_refused(bead_config, tmp_path):
-    def later(env):
-        return lambda seen: env.action_space.low if seen[0] < 0.5 else env.action_space.low * seen[99]
+    def demonstrator(env):
+        low = env.action_space.low
+        return lambda observation: low if observation[0] < 0.5 else low * observation[99]
 
     with pytest.raises(InputError, match="observations or actions of Bead's scripted policy"):
-        run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 1), demonstrator=later)
+        run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 1), demonstrator=demonstrator)
 
 
 def test_run_is_refused_when_a_demonstrator_is_missing(bead_config, tmp_path):
@@ -108,18 +116,14 @@ def test_run_is_refused_when_a_demonstrator_is_missing(bead_config, tmp_path):
 
 
 def test_demonstrator_of_other_actions_is_refused(bead_config, tmp_path):
+    config = with_demonstrations(bead_config, 1)
     with pytest.raises(InputError, match="actions of Bead's scripted policy differ"):
-        run_training(
-            RunFolder(tmp_path / "run"),
-            with_demonstrations(bead_config, 1),
-            demonstrator=lambda env: lambda seen: np.zeros(7),
-        )
+        run_training(RunFolder(tmp_path / "run"), config, demonstrator=lambda env: lambda observation: np.zeros(7))
     assert not (tmp_path / "run").exists()
 
 
-def test_killed_run_resumes_bit_for_bit(bead_config, tmp_path):
-    undisturbed, killed = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "killed")
-    run_training(undisturbed, bead_config)
+def test_killed_run_resumes_bit_for_bit(bead_config, bead_run, tmp_path):
+    killed = RunFolder(tmp_path / "killed")
     code = CHILD.format(tests=str(Path(__file__).parents[1]), out=str(killed.path))
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
@@ -130,40 +134,34 @@ def test_killed_run_resumes_bit_for_bit(bead_config, tmp_path):
     assert child.returncode == -signal.SIGKILL
     assert not (killed.path / "policy.safetensors").exists()
     run_training(killed, bead_config, resume=True)
-    assert_same_run(undisturbed, killed)
+    assert_same_run(RunFolder(bead_run), killed)
 
 
-def test_seed_decides_the_run(bead_config, tmp_path):
-    folders = [RunFolder(tmp_path / name) for name in "abc"]
-    for folder, seed in zip(folders, (5, 5, 6), strict=True):
-        run_training(folder, replace(bead_config, seed=seed))
-    assert_same_run(folders[0], folders[1])
-    assert without_clock(folders[0].episodes()) != without_clock(folders[2].episodes())
+def test_seed_determines_the_run(bead_config, bead_run, tmp_path):
+    first, second, third = RunFolder(bead_run), RunFolder(tmp_path / "second"), RunFolder(tmp_path / "third")
+    run_training(second, bead_config)
+    run_training(third, replace(bead_config, seed=6))
+    assert_same_run(first, second)
+    assert without_clock(first.episodes()) != without_clock(third.episodes())
 
 
-def test_finished_run_continues_with_more_episodes(bead_config, tmp_path):
-    long, extended = RunFolder(tmp_path / "long"), RunFolder(tmp_path / "extended")
-    run_training(long, bead_config)
+def test_finished_run_continues_with_more_episodes(bead_config, bead_run, tmp_path):
+    extended = RunFolder(tmp_path / "extended")
     run_training(extended, replace(bead_config, episodes=3))
     run_training(extended, bead_config, resume=True)
-    assert_same_run(long, extended)
+    assert_same_run(RunFolder(bead_run), extended)
     assert extended.config() == bead_config
 
 
 @pytest.mark.parametrize("changes", [{}, {"pipelined": True, "constant_episodes": 0}, {"num_envs": 2}], ids=str)
 @pytest.mark.parametrize("episodes", [4, 6])
-def test_stopped_run_is_ended_early(changes, episodes, bead_config, tmp_path, monkeypatch, forkserver):
+def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_config, tmp_path, monkeypatch, forkserver):
     monkeypatch.setattr("guiderail.tools.learning.trainer.MAX_SAVING_FRACTION", np.inf)  # a checkpoint per episode
     config = replace(bead_config, learner=replace(bead_config.learner, **changes))
     short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")
     run_training(short, replace(config, episodes=episodes))
-
-    def stop(row):
-        if row["episode"] == 4:  # the checkpoint holds four episodes
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=stop)
+        run_training(stopped, config, report=interrupt_in(4))  # the checkpoint has the four episodes before
     with pytest.raises(InputError, match="has done 4 episodes: give at least as many"):
         resumed_config(stopped, None, {}, {"episodes": 3}, None)
     with pytest.raises(InputError, match="--episodes ends it early"):
@@ -174,38 +172,34 @@ def test_stopped_run_is_ended_early(changes, episodes, bead_config, tmp_path, mo
 
 
 @pytest.mark.parametrize("num_envs", [0, 3])
-def test_run_ends_after_successes_in_a_row_also_if_it_is_resumed(num_envs, bead_config, tmp_path, monkeypatch):
+def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config, tmp_path, monkeypatch):
     successes = dict(enumerate([1, 1, 0, 1, 1, 1, 1, 1]))
-    own_row = trainer.rollout
+    rollout = trainer.rollout
 
-    def row_of(*arguments, index, **how):
-        return own_row(*arguments, index=index, **how) | {"success": successes[index]}
+    def rollout_with_success(*arguments, index, **options):
+        return rollout(*arguments, index=index, **options) | {"success": successes[index]}
 
     for module in (trainer, actors):
-        monkeypatch.setattr(module, "rollout", row_of)
+        monkeypatch.setattr(module, "rollout", rollout_with_success)
     learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
     config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
     run_training(whole, config)
     assert [row["success"] for row in whole.episodes().to_dict("records")] == [1, 1, 0, 1, 1, 1]
     assert len(list(whole.steps.glob("*.parquet"))) == 6
     assert Policy.load(whole.path)
-
-    def stop(row):
-        if row["episode"] == 4:
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=stop)
+        run_training(stopped, config, report=interrupt_in(4))
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
-    monkeypatch.delattr(RunFolder, "remove_policy")  # the policy of a run that has ended is never missing
+    monkeypatch.delattr(RunFolder, "remove_policy")  # the policy of a finished run is not removed
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
     assert stopped.config().episodes == config.episodes
 
 
 def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "rollout", lambda *a, own=trainer.rollout, **how: own(*a, **how) | {"success": 1})
+    rollout = trainer.rollout
+    monkeypatch.setattr(trainer, "rollout", lambda *values, **options: rollout(*values, **options) | {"success": 1})
     learner = replace(bead_config.learner, stop_after_successes=2, demonstration_episodes=2)
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, learner=learner), demonstrator=zero_policy)
@@ -215,57 +209,41 @@ def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypa
 def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
-
-    class Killed(Exception):
-        pass
-
-    def kill(row):
-        raise Killed
-
-    with pytest.raises(Killed):
-        run_training(folder, replace(bead_config, episodes=3), resume=True, report=kill)
+    with pytest.raises(KeyboardInterrupt):
+        run_training(folder, replace(bead_config, episodes=3), resume=True, report=interrupt_in(2))
     with pytest.raises(InputError, match="finish the run with --resume"):
         Policy.load(folder.path)
     run_training(folder, replace(bead_config, episodes=3), resume=True)
     before = Policy.load(folder.path).description
     run_training(folder, replace(bead_config, episodes=3), resume=True)
-    assert Policy.load(folder.path).description == before, "of a finished one nothing is removed"
+    assert Policy.load(folder.path).description == before, "the policy of a finished run is replaced"
 
 
 def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
-    """The episode that was pending at the stop is learned after it."""
+    """The episode that is pending when the run stops is learned from after the resume."""
     plain = replace(bead_config, learner=replace(bead_config.learner, constant_episodes=0))
     config = replace(plain, learner=replace(plain.learner, pipelined=True))
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
     rows = run_training(undisturbed, config)
-
-    class Stop(Exception):
-        pass
-
-    def stop(row):
-        if row["episode"] == 4:
-            raise Stop
-
-    with pytest.raises(Stop):
-        run_training(stopped, config, report=stop)
+    with pytest.raises(KeyboardInterrupt):
+        run_training(stopped, config, report=interrupt_in(4))
     run_training(stopped, config, resume=True)
     assert_same_run(undisturbed, stopped)
-    # Without a pipeline the weights are one episode newer: another run.
-    run_training(RunFolder(tmp_path / "other"), plain)
-    assert without_clock(rows) != without_clock(RunFolder(tmp_path / "other").episodes())
+    # A run that is not pipelined acts with weights that are one episode newer.
+    assert without_clock(rows) != without_clock(run_training(RunFolder(tmp_path / "plain"), plain))
 
 
 def test_run_is_locked_against_other_processes(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
-    holds = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
-    holds += f"with RunFolder({str(folder.path)!r}).locked(): print('held', flush=True); sys.stdin.read()"
-    with subprocess.Popen([sys.executable, "-c", holds], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
-        other.stdout.readline()
+    code = "import sys; from guiderail.tools.learning.run_folder import RunFolder\n"
+    code += f"with RunFolder({str(folder.path)!r}).locked(): print('locked', flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
         with pytest.raises(InputError, match="another process writes into"):
             run_training(folder, bead_config)
-        other.kill()  # its lock file stays, without effect
-    (folder.path / f".episodes.csv.{other.pid}.part").write_text("from a process that was killed while writing")
+        process.kill()  # leaves a lock file without effect
+    (folder.path / f".episodes.csv.{process.pid}.part").write_text("from a process that was killed while writing")
     with folder.locked():
         pass
     run_training(folder, replace(bead_config, episodes=2))
@@ -280,7 +258,7 @@ def test_step_log_stays_off_when_a_run_resumes(bead_config, tmp_path):
         start_or_resume(None, folder.path, environment={}, step_log=True, resume=True)
 
 
-def test_run_never_replaces_other_files(bead_config, tmp_path):
+def test_run_is_refused_in_a_folder_with_other_files(bead_config, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="already exists"):
         run_training(RunFolder(tmp_path), bead_config)
@@ -298,7 +276,7 @@ def test_run_never_replaces_other_files(bead_config, tmp_path):
     ],
     ids=["truncated checkpoint", "no checkpoint", "another table", "broken yaml", "incomplete yaml"],
 )
-def test_run_is_unchanged_when_it_is_damaged(bead_config, tmp_path, damage):
+def test_damaged_run_is_unchanged_when_resume_is_refused(bead_config, tmp_path, damage):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
     damage(folder)
@@ -308,73 +286,67 @@ def test_run_is_unchanged_when_it_is_damaged(bead_config, tmp_path, damage):
     assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
 
 
-def test_run_killed_between_checkpoint_and_table_is_complete(bead_config, tmp_path):
-    whole, torn = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "torn")
-    run_training(whole, bead_config)
-    run_training(torn, replace(bead_config, episodes=4))
-    lines = (torn.path / "episodes.csv").read_text().splitlines(keepends=True)
-    (torn.path / "episodes.csv").write_text("".join(lines[:-1]))
-    run_training(torn, bead_config, resume=True)
-    assert_same_run(whole, torn)
+def test_run_killed_between_checkpoint_and_table_is_complete(bead_config, bead_run, tmp_path):
+    killed = RunFolder(tmp_path / "killed")
+    run_training(killed, replace(bead_config, episodes=4))
+    lines = (killed.path / "episodes.csv").read_text().splitlines(keepends=True)
+    (killed.path / "episodes.csv").write_text("".join(lines[:-1]))
+    run_training(killed, bead_config, resume=True)
+    assert_same_run(RunFolder(bead_run), killed)
 
 
-def test_table_is_completed_from_the_checkpoint(bead_config, tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    run_training(folder, bead_config)
+def test_table_is_completed_from_the_checkpoint(bead_config, bead_run):
+    folder = RunFolder(bead_run)
     table = folder.path / "episodes.csv"
     whole = table.read_bytes()
-    for left in (b"".join(whole.splitlines(keepends=True)[:2]), None):
-        table.unlink() if left is None else table.write_bytes(left)
+    for remaining in (b"".join(whole.splitlines(keepends=True)[:2]), None):
+        table.unlink() if remaining is None else table.write_bytes(remaining)
         run_training(folder, bead_config, resume=True)
         assert table.read_bytes() == whole
 
 
-def refused_in(episode):
-    """Return a demonstrator that raises an InputError in the episode of that number."""
+def demonstrator_refused_in(episode):
+    """Return a demonstrator that raises an `InputError` at the start of an episode."""
     requests = []
 
     def demonstrator(env):
         requests.append(env)
         if len(requests) == episode + 2:  # the first call checks the compatibility
             raise InputError("this is wrong")
-        return always_left(env)
+        return lowest_action(env)
 
     return demonstrator
 
 
 def test_folder_is_removed_when_the_first_episode_is_refused(bead_config, tmp_path):
-    there = tmp_path / "there"
-    there.mkdir()
-    (there / ".of_somebody").write_text("")
-    for path, is_left in ((tmp_path / "new", []), (there, [".of_somebody"])):
+    existing = tmp_path / "existing"
+    existing.mkdir()
+    (existing / ".hidden_file").write_text("")
+    for path, remaining in ((tmp_path / "new", []), (existing, [".hidden_file"])):
         with pytest.raises(InputError, match="this is wrong"):
-            run_training(RunFolder(path), with_demonstrations(bead_config, 3), demonstrator=refused_in(0))
-        assert path.exists() is bool(is_left)
-        assert [one.name for one in path.glob("*")] == is_left
+            run_training(RunFolder(path), with_demonstrations(bead_config, 3), demonstrator=demonstrator_refused_in(0))
+        assert path.exists() is bool(remaining)
+        assert [file.name for file in path.glob("*")] == remaining
     run_training(RunFolder(tmp_path / "new"), replace(bead_config, episodes=1))
 
 
 def test_folder_is_kept_when_a_later_episode_is_refused(bead_config, tmp_path):
-    config, later, begun = (
-        with_demonstrations(bead_config, 3),
-        RunFolder(tmp_path / "later"),
-        RunFolder(tmp_path / "begun"),
-    )
+    config = with_demonstrations(bead_config, 3)
+    later, created = RunFolder(tmp_path / "later"), RunFolder(tmp_path / "created")
     with pytest.raises(InputError, match="this is wrong"):
-        run_training(later, config, demonstrator=refused_in(1))
+        run_training(later, config, demonstrator=demonstrator_refused_in(1))
     assert len(later.episodes()) == 1
-    begun.create(config)
+    created.create(config)
     with pytest.raises(InputError, match="this is wrong"):
-        run_training(begun, config, resume=True, demonstrator=refused_in(0))
-    assert begun.config() == config
+        run_training(created, config, resume=True, demonstrator=demonstrator_refused_in(0))
+    assert created.config() == config
 
 
-def test_run_starts_again_when_killed_before_a_checkpoint(bead_config, tmp_path):
-    whole, begun = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "begun")
-    run_training(whole, bead_config)
-    begun.create(bead_config)
-    run_training(begun, bead_config, resume=True)
-    assert_same_run(whole, begun)
+def test_run_starts_again_when_killed_before_a_checkpoint(bead_config, bead_run, tmp_path):
+    created = RunFolder(tmp_path / "created")
+    created.create(bead_config)
+    run_training(created, bead_config, resume=True)
+    assert_same_run(RunFolder(bead_run), created)
 
 
 def test_resume_refuses_other_settings(bead_config, tmp_path):
@@ -386,10 +358,8 @@ def test_resume_refuses_other_settings(bead_config, tmp_path):
 
 
 @pytest.mark.parametrize(("old", "new"), [("seed: 5", "seed: 6"), ("batch_size: 16", "batch_size: 8")])
-def test_resume_refuses_an_edited_configuration(old, new, bead_config, tmp_path):
-    folder = RunFolder(tmp_path)
-    run_training(folder, bead_config)
-    file = tmp_path / "config.yaml"
+def test_resume_refuses_an_edited_configuration(old, new, bead_run):
+    folder, file = RunFolder(bead_run), bead_run / "config.yaml"
     assert old in file.read_text()
     file.write_text(file.read_text().replace(old, new))
     with pytest.raises(InputError, match="another task, seed, environment or learner than its checkpoint"):
@@ -402,13 +372,12 @@ def test_resume_refuses_too_many_episodes(bead_config, tmp_path):
         resumed_config(RunFolder(tmp_path), None, {}, {"episodes": 10**9 + 1}, None)
 
 
-def test_resume_refuses_rows_with_other_columns(bead_config, tmp_path):
-    folder = RunFolder(tmp_path / "run")
-    rows = run_training(folder, bead_config)
+def test_resume_refuses_rows_with_other_columns(bead_config, bead_run):
+    folder = RunFolder(bead_run)
     arrays, values = load_checkpoint(folder.checkpoint)
-    older = [{key: value for key, value in row.items() if key != "mean_force"} for row in rows]
-    save_checkpoint(folder.checkpoint, arrays, values | {"rows": older})
-    folder.write_episodes(older)
+    rows = [{key: value for key, value in row.items() if key != "mean_force"} for row in values["rows"]]
+    save_checkpoint(folder.checkpoint, arrays, values | {"rows": rows})
+    folder.write_episodes(rows)
     before = (folder.path / "episodes.csv").read_bytes()
     with pytest.raises(InputError, match="another version"):
         run_training(folder, replace(bead_config, episodes=9), resume=True)
@@ -425,19 +394,19 @@ def test_environment_limits_threads_to_one():
     ("task", "preset", "algorithm"),
     [("GridClamp", "sac_gridclamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "tqc_contact", "tqc")],
 )
-def test_default_learner_is_the_tasks(task, preset, algorithm):
+def test_default_learner_is_declared_by_the_task(task, preset, algorithm):
     config = configure(task, {}, **with_defaults(task, {"seed": 3}))
     assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
 
 
-def test_chosen_learner_replaces_the_tasks():
+def test_chosen_algorithm_replaces_the_default_learner():
     arguments = with_defaults("GridClamp", {"algorithm": "tqc"})
     assert arguments == {"algorithm": "tqc"}
     assert configure("GridClamp", {"guidance": "none"}, **arguments).preset == "tqc_contact"
 
 
 @pytest.mark.parametrize("pipelined", [False, True])
-def test_diverged_run_is_reported_and_kept(pipelined, bead_config, tmp_path, forkserver):
+def test_diverged_run_is_reported_and_its_folder_is_kept(pipelined, bead_config, tmp_path, forkserver):
     learner = replace(bead_config.learner, learning_rate=1e30, constant_episodes=0, pipelined=pipelined)
     folder = RunFolder(tmp_path / "run")
     with pytest.raises(InputError, match="diverged"):
@@ -447,55 +416,54 @@ def test_diverged_run_is_reported_and_kept(pipelined, bead_config, tmp_path, for
 
 
 def test_run_is_refused_when_memory_does_not_suffice(bead_config, tmp_path, monkeypatch):
-    def vast(*given, **named):
+    def construct(*arguments, **options):
         raise MemoryError("no 44 GiB")
 
-    monkeypatch.setitem(LEARNERS._entries, "vast", vast)
+    monkeypatch.setitem(LEARNERS._entries, "large", construct)
+    config = replace(bead_config, learner=replace(bead_config.learner, algorithm="large"))
     with pytest.raises(InputError, match="buffer_size"):
-        run_training(
-            RunFolder(tmp_path / "run"), replace(bead_config, learner=replace(bead_config.learner, algorithm="vast"))
-        )
+        run_training(RunFolder(tmp_path / "run"), config)
     assert not (tmp_path / "run").exists()
 
 
-def test_resume_accepts_the_same_options_and_notes_versions(tmp_path, caplog):
-    words = {
+def test_resume_accepts_the_same_options_and_logs_versions(tmp_path, caplog):
+    options = {
         "environment": {"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40},
         "settings": {"net_arch": "8", "gradient_steps": 1},
         "pictures": False,
     }
     out = tmp_path / "run"
-    start_or_resume("NarrowPassage", out, episodes=1, **words)
+    start_or_resume("NarrowPassage", out, episodes=1, **options)
     folder = RunFolder(out)
     folder.write_config(replace(folder.config(), versions={**folder.config().versions, "drake": "1.0.0"}))
     for _ in range(2):
-        start_or_resume("NarrowPassage", out, episodes=2, resume=True, **words)
+        start_or_resume("NarrowPassage", out, episodes=2, resume=True, **options)
     assert caplog.text.count("continues with other versions: drake 1.0.0, then ") == 1
     assert folder.config().versions["drake"].startswith("1.0.0, then ")
     with pytest.raises(InputError, match="has done 2 episodes"):
-        start_or_resume("NarrowPassage", out, episodes=1, resume=True, **words)
+        start_or_resume("NarrowPassage", out, episodes=1, resume=True, **options)
 
 
-def one_more(folder, package, kind, register, name):
-    """Write a file that registers a subclass of one of the package's classes under another name."""
-    (module, _, like), (registry, _, decorator) = kind.rpartition("."), register.partition(".")
-    file = folder / "mine.py"
+def write_subclass(folder, package, base, decorator, name):
+    """Write a file that registers a subclass of a class of the package; return its path."""
+    (module, _, base), (registry, _, decorator) = base.rpartition("."), decorator.partition(".")
+    file = folder / "subclass.py"
     file.write_text(
-        f"from {package}.{module} import {like}\nfrom {package}.{registry} import {decorator}\n"
-        f"@{decorator}({name!r})\nclass Mine({like}):\n    pass\n"
+        f"from {package}.{module} import {base}\nfrom {package}.{registry} import {decorator}\n"
+        f"@{decorator}({name!r})\nclass Subclass({base}):\n    pass\n"
     )
     return file
 
 
 def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
-    monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # no other test has this one
-    kinds = "narrow_passage.task.NarrowPassage", "registry.register_task"
-    file = one_more(tmp_path, "guiderail.diagrams.tasks", *kinds, "changes/Passage")
+    monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # removed after the test
+    names = "narrow_passage.task.NarrowPassage", "registry.register_task"
+    file = write_subclass(tmp_path, "guiderail.diagrams.tasks", *names, "changes/Passage")
     out, environment = tmp_path / "run", {"guidance": "kgrl", "action_repeat": 40}
     start_or_resume("changes/Passage", out, environment=environment, episodes=1, imports=[str(file)], pictures=False)
     config = RunFolder(out).config()
     before = episodes_file(out, "uniform_random", config, config.environment, episodes=2)
-    file.write_text(file.read_text() + "# now it is another one\n")
+    file.write_text(file.read_text() + "# changed\n")
     with pytest.raises(InputError, match=f"the files of changes/Passage or {file.name} are not those that the run"):
         start_or_resume(None, out, environment={}, episodes=2, resume=True)
     assert episodes_file(out, "uniform_random", config, config.environment, episodes=2) != before
@@ -503,20 +471,15 @@ def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
 
 
 def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
-    monkeypatch.setitem(LEARNERS._entries, "sac_of_mine", None)  # no other test has this one
-    kinds = "off_policy.SacLearner", "learner.register_learner"
-    file = one_more(tmp_path, "guiderail.tools.learning", *kinds, "sac_of_mine")
+    monkeypatch.setitem(LEARNERS._entries, "lab_sac", None)  # removed after the test
+    names = "off_policy.SacLearner", "learner.register_learner"
+    file = write_subclass(tmp_path, "guiderail.tools.learning", *names, "lab_sac")
     settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
-    done = start_or_resume(
+    run = start_or_resume(
         "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20},
-        algorithm="sac_of_mine", settings=settings, episodes=2, imports=[str(file)], pictures=False,
+        algorithm="lab_sac", settings=settings, episodes=2, imports=[str(file)], pictures=False,
     )  # fmt: skip
-    assert done.summary["episodes"] == 2
-
-
-def test_demonstrated_episodes_are_marked(bead_config, tmp_path):
-    rows = run_training(RunFolder(tmp_path / "run"), with_demonstrations(bead_config, 2), demonstrator=always_left)
-    assert [row["is_demonstration"] for row in rows[:3]] == [1, 1, 0]
+    assert run.summary["episodes"] == 2
 
 
 def test_run_folder_refuses_an_impossible_path(tmp_path):
@@ -529,28 +492,26 @@ def test_run_folder_refuses_an_impossible_path(tmp_path):
 
 @pytest.fixture
 def trained_config(monkeypatch, tmp_path):
-    """Return a function that returns the configuration which `train` passes on; nothing is trained."""
-    passed = []
-    monkeypatch.setattr(
-        "guiderail.tools.learning.trainer.run_training", lambda folder, config, **_: passed.append(config)
-    )
+    """Return a function from arguments of `train` to the configuration of the run, which is not trained."""
+    configs = []
+    monkeypatch.setattr(trainer, "run_training", lambda folder, config, **_: configs.append(config))
 
     def configuration(task="Bead", **arguments):
         train(task, out=tmp_path / "run", pictures=False, **arguments)
         assert not list(tmp_path.iterdir())
-        return passed.pop()
+        return configs.pop()
 
     return configuration
 
 
-def test_train_takes_whole_numbers_of_numpy(trained_config):
+def test_train_accepts_whole_numbers_of_numpy(trained_config):
     config = trained_config(episodes=np.int64(2), seed=np.uint8(3))
     assert (type(config.episodes), type(config.seed)) == (int, int)
     assert config == trained_config(episodes=2, seed=3)
 
 
 def test_train_warns_when_its_source_is_unfinished(bead_config, tmp_path, monkeypatch, caplog):
-    monkeypatch.setattr("guiderail.tools.learning.trainer.run_training", lambda *arguments, **named: None)
+    monkeypatch.setattr(trainer, "run_training", lambda *arguments, **options: None)
     source = RunFolder(tmp_path / "source")
     run_training(source, replace(bead_config, episodes=2))
     for _ in range(2):
@@ -560,11 +521,11 @@ def test_train_warns_when_its_source_is_unfinished(bead_config, tmp_path, monkey
     assert f"{source.path} that init_from names is unfinished: training starts from its checkpoint of 2" in caplog.text
 
 
-@pytest.mark.parametrize("wrong", [1.5, "3", True])
+@pytest.mark.parametrize("value", [1.5, "3", True])
 @pytest.mark.parametrize("name", ["episodes", "seed"])
-def test_train_refuses_numbers_that_are_not_whole(name, wrong, trained_config):
-    with pytest.raises(InputError, match=f"must be a whole number, not {wrong!r}"):
-        trained_config(**{name: wrong})
+def test_train_refuses_numbers_that_are_not_whole(name, value, trained_config):
+    with pytest.raises(InputError, match=f"must be a whole number, not {value!r}"):
+        trained_config(**{name: value})
 
 
 @pytest.mark.parametrize(
@@ -578,13 +539,13 @@ def test_train_refuses_numbers_that_are_not_whole(name, wrong, trained_config):
         ({"task": None}, "name of a task or its folder, not None"),
     ],
 )
-def test_train_names_the_argument_that_was_meant(options, message, trained_config):
+def test_train_refuses_wrong_arguments_with_a_hint(options, message, trained_config):
     with pytest.raises(InputError, match=message):
         trained_config(**options)
 
 
-@pytest.mark.parametrize(("method", "number"), [("state", 2), ("policy", 5), ("restore", 2)])
-def test_failure_of_a_users_learner_is_named(method, number, bead_config, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("method", "episodes"), [("state", 2), ("policy", 5), ("restore", 2)])
+def test_failure_of_a_learner_of_a_user_is_named(method, episodes, bead_config, tmp_path, monkeypatch):
     class Own(SacLearner):
         pass
 
@@ -603,6 +564,6 @@ def test_failure_of_a_users_learner_is_named(method, number, bead_config, tmp_pa
         patch.setattr(Own, method, fail)
         with pytest.raises(InputError, match=rf"Own\.{method} failed: test_trainer\.py, line \d+: AttributeError: no"):
             run_training(folder, config, resume=method == "restore")
-    assert len(folder.episodes()) == number
+    assert len(folder.episodes()) == episodes
     assert len(run_training(folder, config, resume=True)) == 5
     assert (folder.path / "policy.json").is_file()

@@ -1,10 +1,11 @@
-"""Run a study of eight runs on two processes, and on a Ray cluster of two machines of which one is lost.
+"""Run a study of eight runs in two processes, and on a Ray cluster that loses one of its two machines.
 
-    python tests/tools.experiments.engines/ray_study.py --out FOLDER         # the narrow passage
-    python tests/tools.experiments.engines/ray_study.py --out FOLDER --bead  # half a minute
+    python tests/tools/experiments/engines/ray_study.py --out FOLDER         # the narrow passage
+    python tests/tools/experiments/engines/ray_study.py --out FOLDER --bead  # half a minute
 
-On the cluster a worker is killed in the middle of a run, and then one of the two machines with all its processes. It
-ends with 1 if the study is not complete, or not the same bit for bit. Ray must be installed.
+On the cluster, a worker is killed during a run, and then one of the two machines with all its processes. The exit code
+is 1 if the study on the cluster is not complete, or differs in any bit from the study in two processes. Ray must be
+installed.
 """
 
 from __future__ import annotations
@@ -37,15 +38,19 @@ STUDY = {
 }
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
 BEAD = {
-    **{"name": "eight", "task": "Bead", "methods": {"bead": {}}, "seeds": list(range(8))},
-    **{"learner": {"settings": SETTINGS, "episodes": 40}, "eval_set": [{"episodes": 2}]},
+    "name": "eight",
+    "task": "Bead",
+    "learner": {"settings": SETTINGS, "episodes": 40},
+    "methods": {"bead": {}},
+    "seeds": list(range(8)),
+    "eval_set": [{"episodes": 2}],
 }
 REGISTER = f"import sys\nsys.path.insert(0, {str(TESTS / 'tools')!r})\nimport bead\nbead.register()\n"
-PATIENCE = 600.0  # s
+TIMEOUT = 600.0  # longest time of a study, and longest wait for a running job [s]
 
 
 def write_study(folder: Path, bead: bool) -> Path:
-    """Write the study's file into a folder and return its path."""
+    """Write the declaration of the study into a folder; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "register_bead.py").write_text(REGISTER)
     study = {**BEAD, "imports": [str(folder / "register_bead.py")]} if bead else STUDY
@@ -53,14 +58,14 @@ def write_study(folder: Path, bead: bool) -> Path:
     return folder / "eight.yaml"
 
 
-def command(file: Path, out: Path, *more: str) -> list[str]:
-    """Return the study's command line."""
+def command(file: Path, out: Path, *options: str) -> list[str]:
+    """Return the command line of the study."""
     program = "from guiderail.tools.cli.main import main; main()"
-    return [sys.executable, "-c", program, "study", str(file), "--out", str(out), "--json", *more]
+    return [sys.executable, "-c", program, "study", str(file), "--out", str(out), "--json", *options]
 
 
-def running(out: Path, episodes: int) -> Iterator[tuple[str, int]]:
-    """Yield running jobs with at least a number of episodes, and the process of each."""
+def running_jobs(out: Path, episodes: int) -> Iterator[tuple[str, int]]:
+    """Yield name and process id of each running job with at least this number of training episodes."""
     for log in sorted((out / "logs").glob("*.txt")):
         last = log.read_text().splitlines()[-1]
         table = out / log.stem.removeprefix("eight-") / "episodes.csv"
@@ -68,61 +73,64 @@ def running(out: Path, episodes: int) -> Iterator[tuple[str, int]]:
             yield log.stem, int(last.rpartition(" ")[2])
 
 
-def wait_for(found: Callable[[], Any], study: subprocess.Popen) -> Any:
-    """Return the first result of `found` that is not None while the study runs."""
-    end = time.monotonic() + PATIENCE
+def wait_for(find: Callable[[], Any], study: subprocess.Popen) -> Any:
+    """Return the first result of `find` that is not None while the study runs."""
+    end = time.monotonic() + TIMEOUT
     while time.monotonic() < end:
-        if (what := found()) is not None:
-            return what
+        if (result := find()) is not None:
+            return result
         if study.poll() is not None:
-            raise RuntimeError("the study ended before anything was killed")
+            raise RuntimeError("the study ended before a process was killed")
         time.sleep(0.02)
-    raise RuntimeError("the study came nowhere")
+    raise RuntimeError(f"no job was running for {TIMEOUT:g} s")
 
 
 def is_on(process: int, machine: Any) -> bool:
-    """Return True if the worker was started by the machine's Ray."""
+    """Return True if a worker process was started by the Ray server of the machine."""
     parent = int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
-    return any(one.process.pid == parent for one in machine.all_processes["raylet"])
+    return any(server.process.pid == parent for server in machine.all_processes["raylet"])
 
 
 def on_cluster(file: Path, out: Path, episodes: int) -> tuple[int, str, list[str]]:
-    """Return exit code and output of the study on a cluster of two machines, and what was killed."""
+    """Return the exit code and output of the study on a cluster of two machines, and a list of the losses."""
     from ray.cluster_utils import Cluster
 
-    machine = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100 * 1024**2}
-    cluster = Cluster(initialize_head=True, head_node_args=machine | {"num_cpus": 0})
-    killed = []
+    options = {"num_cpus": 1, "include_dashboard": False, "object_store_memory": 100 * 1024**2}
+    cluster = Cluster(initialize_head=True, head_node_args=options | {"num_cpus": 0})
+    losses = []
     try:
-        machines = [cluster.add_node(**machine) for _ in range(2)]
+        machines = [cluster.add_node(**options) for _ in range(2)]
         engine = ("--engine", "ray", "--address", cluster.address)
         with subprocess.Popen(
             command(file, out, *engine), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         ) as study:
-            name, process = wait_for(lambda: next(running(out, episodes), None), study)
+            name, process = wait_for(lambda: next(running_jobs(out, episodes), None), study)
             os.kill(process, signal.SIGKILL)
-            killed.append(f"the worker of {name}")
-            others = {name}
-            name, process = wait_for(lambda: next((o for o in running(out, 0) if o[0] not in others), None), study)
-            cluster.remove_node(next(m for m in machines if is_on(process, m)), allow_graceful=False)
-            killed.append(f"one of two machines, where {name} was running")
-            words, _ = study.communicate(timeout=PATIENCE)
-        return study.returncode, words, killed
+            losses.append(f"the worker of {name}")
+            killed = name
+            name, process = wait_for(
+                lambda: next((job for job in running_jobs(out, 0) if job[0] != killed), None), study
+            )
+            lost = next(machine for machine in machines if is_on(process, machine))
+            cluster.remove_node(lost, allow_graceful=False)
+            losses.append(f"one of two machines, where {name} was running")
+            output, _ = study.communicate(timeout=TIMEOUT)
+        return study.returncode, output, losses
     finally:
         cluster.shutdown()
 
 
 def compare(folder: Path, bead: bool) -> dict[str, object]:
-    """Run both studies and return their comparison."""
+    """Run the study in two processes and on the cluster; return the comparison."""
     file, seconds = write_study(folder, bead), time.perf_counter()
-    subprocess.run(command(file, folder / "process"), check=True, capture_output=True, timeout=PATIENCE)
+    subprocess.run(command(file, folder / "process"), check=True, capture_output=True, timeout=TIMEOUT)
     seconds = time.perf_counter() - seconds
     started = time.perf_counter()
-    code, words, killed = on_cluster(file, folder / "ray", 10 if bead else 1)
+    code, output, losses = on_cluster(file, folder / "ray", 10 if bead else 1)
     return {
-        "killed": killed,
+        "losses": losses,
         "exit_code": code,
-        "begun_again": [line for line in words.splitlines() if "by worker" in line],
+        "restarted": [line for line in output.splitlines() if "by worker" in line],
         "differences": differences(folder / "process", folder / "ray"),
         "files": sum(path.is_file() for path in (folder / "process").rglob("*")),
         "seconds": {"process": round(seconds, 1), "ray": round(time.perf_counter() - started, 1)},
@@ -137,7 +145,7 @@ def main() -> None:
     args = parser.parse_args()
     result = compare(args.out.absolute(), args.bead)
     print(json.dumps(result, indent=2))
-    sys.exit(bool(result["exit_code"] or result["differences"] or len(result["begun_again"]) < 2))
+    sys.exit(bool(result["exit_code"] or result["differences"] or len(result["restarted"]) < 2))
 
 
 if __name__ == "__main__":

@@ -11,9 +11,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.experiments.engines.engine import ENGINES, make_engine
 from oracles.work import die, work
 
+# Program that runs two jobs without end in two workers.
 PARENT = """
 import signal
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in a shell's background ignore SIGINT
 from oracles.work import wait
 from guiderail.tools.experiments.engines.engine import make_engine
 if __name__ == "__main__":
@@ -22,12 +23,13 @@ if __name__ == "__main__":
 """
 
 
-def run(do, jobs, processes=2):
+def run(function, jobs, processes=2):
+    """Return the outcome of each job in the process engine."""
     with make_engine("process", processes) as engine:
-        return dict(engine.run(do, jobs))
+        return dict(engine.run(function, jobs))
 
 
-def gone(process):
+def has_ended(process):
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -41,10 +43,10 @@ def test_process_engine_runs_every_job_and_ends_its_workers():
     assert {row["threads"] for row in rows.values()} == {"1"}
     workers = {row["process"] for row in rows.values()}
     assert os.getpid() not in workers
-    assert all(map(gone, workers))
+    assert all(map(has_ended, workers))
 
 
-def test_single_process_is_this_one(monkeypatch):
+def test_single_process_is_the_calling_process(monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     assert run(work, {0: 3}, processes=1)[0].rows[0]["process"] == os.getpid()
 
@@ -55,15 +57,15 @@ def test_job_of_a_killed_worker_is_run_by_another(tmp_path):
     assert result[1].rows[0]["square"] == 25
 
 
-def test_job_that_kills_its_workers_is_given_up():
+def test_job_fails_when_three_workers_are_lost():
     result = run(die, {n: n for n in range(4)})
     assert [result[n].rows[0]["square"] for n in (0, 2)] == [0, 4]
     for n in (1, 3):
         assert result[n].failure == "3 workers were lost running it, one after the other, the last by exit code 3"
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_workers_end_when_the_study_is_killed(how, tmp_path):
+@pytest.mark.parametrize("stop_signal", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_workers_end_when_the_study_is_killed(stop_signal, tmp_path):
     (tmp_path / "parent.py").write_text(PARENT)
     paths = os.pathsep.join([str(Path(__file__).parents[3]), *filter(None, sys.path)])
     with subprocess.Popen(
@@ -74,15 +76,15 @@ def test_workers_end_when_the_study_is_killed(how, tmp_path):
         text=True,
     ) as parent:
         assert parent.stdout is not None
-        alarm = threading.Timer(60, parent.kill)
-        alarm.start()
+        timeout = threading.Timer(60, parent.kill)  # [s]
+        timeout.start()
         workers = {int(parent.stdout.readline()) for _ in range(2)}
         assert len(workers - {parent.pid}) == 2
-        parent.send_signal(how)
-        # The workers write to the same pipe: it ends when the last of them does.
+        parent.send_signal(stop_signal)
+        # The workers write to the same pipe, which ends when the last worker ends.
         assert parent.communicate() == ("", None)
-        alarm.cancel()
-        assert parent.returncode == -how
+        timeout.cancel()
+        assert parent.returncode == -stop_signal
 
 
 def test_engine_refuses_unsupported_arguments():

@@ -33,7 +33,7 @@ def test_ray_engine_reports_an_unreachable_address():
 
 
 @needs_ray
-def test_ray_cluster_gives_the_same_study_after_losses(tmp_path):
+def test_ray_cluster_completes_the_same_study_after_losses(tmp_path):
     script = Path(__file__).with_name("ray_study.py")
-    done = subprocess.run([sys.executable, script, "--bead", "--out", tmp_path], capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    result = subprocess.run([sys.executable, script, "--bead", "--out", tmp_path], capture_output=True, text=True)
+    assert result.returncode == 0, result.stdout + result.stderr
