@@ -1,4 +1,4 @@
-"""A driver without messages: a robot in the same process that implements `read` and `write` only."""
+"""Driver of a simulated robot in the same process, with `read` and `write` only."""
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
@@ -40,8 +40,8 @@ class DirectDriver(Driver):
         self.positions, self.time = self.positions + self.period * self.velocities, self.time + self.period
 
 
-def started(driver):
-    """Return a station of a connector's workcell on a driver, started at `START`, and its simulator."""
+def start_station(driver):
+    """Start a station of the connector's workcell with a driver at `START`; return the station and its simulator."""
     station = HardwareStation(BncWorkcell(), driver)
     simulator = Simulator(station)
     station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)

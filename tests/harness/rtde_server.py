@@ -1,10 +1,10 @@
-"""Double of a UR5e's controller: RTDE, dashboard and script ports, with time that a test advances.
+"""Double of a UR5e's controller: RTDE, dashboard and script ports, with a clock that the test advances.
 
 The double follows Universal Robots' "Real-Time Data Exchange Guide" and "Dashboard Server" manual, and the commands of
 the client's program for the controller. It emulates that program's force mode, tool center, payload, zeroing of the
-force sensor and watchdog. In force mode the tool's speed is proportional to the sum of the commanded wrench and that of
-the sensor, and a horizontal plane blocks the tool. Tests with this double show that messages arrive and have the
-documented meaning and signs. They do not show how a robot moves.
+force sensor and watchdog. In force mode the tool's velocity is proportional to the sum of the commanded and measured
+wrenches, and a horizontal plane blocks the tool. Tests with this double show that messages arrive and have the
+documented meaning and signs. They do not show how a real robot moves.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 
 CYCLE = 0.002  # control cycle of the robot [s]
 REPEAT_TIME = 0.01  # wall clock time after which the newest values are sent again [s]
-DAMPING = np.array([200.0] * 3 + [5.0] * 3)  # of the emulated force mode [Ns/m, Nms/rad]
-PLANE_STIFFNESS = 2e4  # [N/m]
+DAMPING = np.array([200.0] * 3 + [5.0] * 3)  # damping of the emulated force mode [Ns/m, Nms/rad]
+PLANE_STIFFNESS = 2e4  # stiffness of the plane that blocks the tool [N/m]
 
 # Published parameters d [m], a [m], alpha [rad] of a UR5e.
 DENAVIT_HARTENBERG = (
@@ -39,8 +39,8 @@ DENAVIT_HARTENBERG = (
 )
 
 FORCE_MODE, END_FORCE_MODE, ZERO_SENSOR, SET_TCP, WATCHDOG, SET_PAYLOAD, STOP_SCRIPT = 6, 7, 8, 29, 35, 65, 255
-READY, DONE = 1, 2  # values of the program's state register
-PROTECTIVE_STOP_BIT, EMERGENCY_STOP_BIT = 2, 7  # of the safety status
+READY, DONE = 1, 2  # values of the state register of the client's program
+PROTECTIVE_STOP_BIT, EMERGENCY_STOP_BIT = 2, 7  # bits of the safety status
 
 FORMATS = {"DOUBLE": "d", "INT32": "i", "UINT32": "I", "UINT8": "B", "VECTOR6D": "6d", "VECTOR3D": "3d", "BOOL": "?"}
 TYPES = {
@@ -59,7 +59,7 @@ TYPES = {
 
 
 def type_of(name: str) -> str:
-    """Return the protocol's type of a field."""
+    """Return the RTDE type of a field."""
     if name in TYPES:
         return TYPES[name]
     if "_int_register" in name:
@@ -70,16 +70,16 @@ def type_of(name: str) -> str:
 
 
 class RtdeServer:
-    """Controller at an address of this machine.
+    """Simulated controller that listens at a loopback address.
 
     Args:
-        host: Address to listen at, of 127.0.0.0/8.
+        host: Address to listen at, within 127.0.0.0/8.
         positions: Initial joint positions, (6,) [rad].
 
     Attributes:
-        plane: Height of the plane [m].
-        bias: Error of the force sensor, (6,). Zeroing makes it the opposite of the present force.
-        calibration: Difference of the tool center's position from that of the published parameters, (3,) [m].
+        plane: Height of the plane that blocks the tool, in the controller's base [m].
+        bias: Offset of the force sensor, (6,) [N, Nm]. Zeroing the sensor sets it to the negative contact wrench.
+        calibration: Offset of the tool center from its position by the published parameters, (3,) [m].
     """
 
     def __init__(self, host: str, positions: np.ndarray):
@@ -91,7 +91,7 @@ class RtdeServer:
         self._lock, self._changed = threading.RLock(), threading.Condition()
 
     def listen(self) -> None:
-        """Answer at the ports of a controller."""
+        """Serve the dashboard, script and RTDE ports."""
         handlers = {
             29999: self._serve_dashboard,
             30002: self._serve_script,
@@ -104,7 +104,7 @@ class RtdeServer:
         threading.Thread(target=self._repeat, daemon=True).start()
 
     def reset(self) -> None:
-        """Return to the initial posture, with the program running and nothing commanded."""
+        """Reset to the initial posture, with the program running and without a command."""
         self.positions, self.velocities, self.plane = self._start.copy(), np.zeros(6), -np.inf
         self.is_running, self.watchdog, self._last_input = True, 0.0, self.time
         self.safety_bits, self.bias, self.commands = 1, np.zeros(6), []
@@ -113,7 +113,7 @@ class RtdeServer:
         self.registers["output_int_register_0"] = READY
 
     def advance(self, seconds: float) -> None:
-        """Simulate the robot, and send its state."""
+        """Simulate the robot for `seconds` [s], and send its state."""
         with self._lock:
             for _ in range(round(seconds / CYCLE)):
                 self._step()
@@ -125,7 +125,7 @@ class RtdeServer:
             assert self._changed.wait_for(lambda: self.num_inputs >= number, 10.0)
 
     def pose(self) -> np.ndarray:
-        """Return the tool center in the controller's base as position and rotation vector, (6,)."""
+        """Return the tool center in the controller's base, (6,): position [m] and rotation vector [rad]."""
         X = _frames(self.positions, self.tcp)[-1]
         return np.concatenate([X[:3, 3] + self.calibration, Rotation.from_matrix(X[:3, :3]).as_rotvec()])
 
@@ -136,11 +136,11 @@ class RtdeServer:
         return np.array([[*np.cross(z, tool[:3, 3] - X[:3, 3]), *z] for z, X in zip(axes, frames, strict=True)]).T
 
     def measured_force(self) -> np.ndarray:
-        """Return the wrench on the tool that the sensor shows in the controller's axes, (6,)."""
+        """Return the measured wrench on the tool in the controller's axes, (6,) [N, Nm]."""
         return self.contact_force() + self.bias
 
     def contact_force(self) -> np.ndarray:
-        """Return the wrench of the surroundings on the tool in the controller's axes, (6,)."""
+        """Return the contact wrench on the tool in the controller's axes, (6,) [N, Nm]."""
         height = self.pose()[2]
         return np.array([0.0, 0.0, PLANE_STIFFNESS * max(0.0, self.plane - height), 0.0, 0.0, 0.0])
 
@@ -260,9 +260,9 @@ class RtdeServer:
         offset = 1
         with self._lock:
             for name in fields:
-                form = ">" + FORMATS[type_of(name)]
-                self.registers[name] = struct.unpack_from(form, payload, offset)[0]
-                offset += struct.calcsize(form)
+                layout = ">" + FORMATS[type_of(name)]
+                self.registers[name] = struct.unpack_from(layout, payload, offset)[0]
+                offset += struct.calcsize(layout)
             if "input_int_register_0" in fields:
                 self._last_input = self.time
                 self._process(int(self.registers["input_int_register_0"]))
@@ -271,41 +271,41 @@ class RtdeServer:
             self.num_inputs += 1
             self._changed.notify_all()
 
-    def execute(self, command: int, real: Sequence[float] = (), whole: Sequence[int] = ()) -> None:
-        """Write the registers of a command, and execute it.
+    def execute(self, command: int, doubles: Sequence[float] = (), integers: Sequence[int] = ()) -> None:
+        """Write the registers of a command, and execute the command.
 
         Args:
             command: Number of the command.
-            real: Double registers from 0 on.
-            whole: Integer registers from 1 on.
+            doubles: Values of the double registers, from register 0.
+            integers: Values of the integer registers, from register 1.
         """
-        self.registers |= {f"input_double_register_{i}": value for i, value in enumerate(real)}
-        self.registers |= {f"input_int_register_{i}": value for i, value in enumerate(whole, 1)}
+        self.registers |= {f"input_double_register_{i}": value for i, value in enumerate(doubles)}
+        self.registers |= {f"input_int_register_{i}": value for i, value in enumerate(integers, 1)}
         self._last_input = self.time
         self._process(command)
 
     def _process(self, command: int) -> None:
-        """Execute a command as the client's program on the controller does."""
+        """Execute a command like the client's program on the controller."""
         if not self.is_running:
             return
-        real = [float(self.registers.get(f"input_double_register_{i}", 0.0)) for i in range(24)]
-        whole = [int(self.registers.get(f"input_int_register_{i}", 0)) for i in range(24)]
+        doubles = [float(self.registers.get(f"input_double_register_{i}", 0.0)) for i in range(24)]
+        integers = [int(self.registers.get(f"input_int_register_{i}", 0)) for i in range(24)]
         state = READY if command in (0, FORCE_MODE) else DONE
         if command:
             self.commands.append(command)
         if command == FORCE_MODE:
-            assert whole[1:8] == [2, 1, 1, 1, 1, 1, 1], "force mode in a fixed frame, with all axes compliant"
-            self.task_frame, self.wrench, self.speed_limits = (np.array(real[i : i + 6]) for i in (0, 6, 12))
+            assert integers[1:8] == [2, 1, 1, 1, 1, 1, 1], "force mode in a fixed frame, with all axes compliant"
+            self.task_frame, self.wrench, self.speed_limits = (np.array(doubles[i : i + 6]) for i in (0, 6, 12))
         elif command == END_FORCE_MODE:
             self.wrench = None
         elif command == ZERO_SENSOR:
             self.bias = -self.contact_force()
         elif command == SET_TCP:
-            self.tcp = np.array(real[:6])
+            self.tcp = np.array(doubles[:6])
         elif command == SET_PAYLOAD:
-            self.payload = np.array(real[:10])
+            self.payload = np.array(doubles[:10])
         elif command == WATCHDOG:
-            self.watchdog = real[0]
+            self.watchdog = doubles[0]
         elif command == STOP_SCRIPT:
             self._end_program()
             return
@@ -313,10 +313,10 @@ class RtdeServer:
 
 
 class DirectClient:
-    """The part of ur-rtde's client that the driver uses, without the network.
+    """Client without a network, with the methods of ur-rtde's clients that the driver calls.
 
     Attributes:
-        is_connected: False after the connection was lost.
+        is_connected: False if the connection is lost.
     """
 
     def __init__(self, server: RtdeServer):
@@ -331,10 +331,8 @@ class DirectClient:
 
     def DashboardClient(self, _) -> Any:
         unlock = lambda: setattr(self._server, "safety_bits", 1)  # noqa: E731
-        nothing = lambda: None  # noqa: E731
-        return SimpleNamespace(
-            connect=nothing, disconnect=nothing, closeSafetyPopup=nothing, unlockProtectiveStop=unlock
-        )
+        no_op = lambda: None  # noqa: E731
+        return SimpleNamespace(connect=no_op, disconnect=no_op, closeSafetyPopup=no_op, unlockProtectiveStop=unlock)
 
     def isConnected(self) -> bool:
         return self.is_connected
@@ -370,14 +368,14 @@ class DirectClient:
         field = field or {"getActualTCPForce": "actual_TCP_force", "getActualTCPPose": "actual_TCP_pose"}[name]
         return lambda: self._server.value(field)
 
-    def _execute(self, command: int, real: Sequence[float] = (), whole: Sequence[int] = ()) -> bool:
+    def _execute(self, command: int, doubles: Sequence[float] = (), integers: Sequence[int] = ()) -> bool:
         if self._server.is_running:
-            self._server.execute(command, real, whole)
+            self._server.execute(command, doubles, integers)
         return self._server.is_running
 
 
 def _frames(positions: np.ndarray, tcp: np.ndarray) -> list[np.ndarray]:
-    """Return the frames of the joints, of the flange and of the tool center, as (4, 4) matrices."""
+    """Return the poses of the joints, the flange and the tool center in the base, as (4, 4) matrices."""
     frames = [np.eye(4)]
     for q, (d, a, alpha) in zip(positions, DENAVIT_HARTENBERG, strict=True):
         c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
@@ -389,31 +387,30 @@ def _frames(positions: np.ndarray, tcp: np.ndarray) -> list[np.ndarray]:
 
 
 class RtdeProcess:
-    """`RtdeServer` in a process of its own, because some calls of the client hold the GIL.
+    """`RtdeServer` in a child process, because some calls of the client hold the GIL.
 
-    Attributes and methods of the server are accessed by their names.
+    The attributes and methods of the server are available under the same names.
     """
 
     def __init__(self, host: str, positions: np.ndarray):
         context = multiprocessing.get_context("forkserver")
-        connection, other = context.Pipe()
-        arguments = (other, host, positions)
-        process = context.Process(target=_serve, args=arguments, daemon=True)
+        connection, child_connection = context.Pipe()
+        process = context.Process(target=_serve, args=(child_connection, host, positions), daemon=True)
         self.__dict__.update(_connection=connection, _process=process)
         process.start()
         assert connection.recv() == "ready"
 
-    def _ask(self, *request: Any) -> Any:
+    def _request(self, *request: Any) -> Any:
         self._connection.send(request)
         return self._connection.recv()
 
     def __getattr__(self, name: str) -> Any:
         if callable(getattr(RtdeServer, name, None)):
-            return lambda *arguments: self._ask("call", name, *arguments)
-        return self._ask("get", name)
+            return lambda *arguments: self._request("call", name, *arguments)
+        return self._request("get", name)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        self._ask("set", name, value)
+        self._request("set", name, value)
 
     def kill(self) -> None:
         """Kill the process."""

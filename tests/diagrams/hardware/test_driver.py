@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from direct_driver import START, DirectDriver, started
+from direct_driver import START, DirectDriver, start_station
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
@@ -50,7 +50,7 @@ def test_station_moves_a_robot_by_read_and_write():
 
 def test_wall_clock_steps_once_per_new_status():
     driver = DirectDriver()
-    (station, simulator), clock = started(driver), WallClock(driver)
+    (station, simulator), clock = start_station(driver), WallClock(driver)
     clock.begin()
     driver.elapse()
     before = driver.num_statuses

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from direct_driver import START, DirectDriver, started
+from direct_driver import START, DirectDriver, start_station
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.hardware.clock import WallClock
@@ -264,7 +264,7 @@ def test_start_raises_when_a_read_raises(method):
 
 def test_wall_clock_steps_when_receiving_raises():
     driver = DirectDriver()
-    (station, simulator), clock = started(driver), WallClock(driver)
+    (station, simulator), clock = start_station(driver), WallClock(driver)
     calls = []
 
     def receive(timeout=0.0):

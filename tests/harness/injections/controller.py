@@ -1,4 +1,4 @@
-"""Program that moves an arm on a circle and resumes after every stop as soon as possible; arguments: URL RATE."""
+"""Program that moves an arm on a circle and resumes as soon as possible after every stop; arguments: URL RATE."""
 
 import contextlib
 import sys
@@ -28,8 +28,8 @@ def main(url: str, rate: float) -> None:
     with garbage_collection_disabled():
         while True:
             angle = 2.0 * np.pi * context.get_time()
-            side = 0.01 * np.array([np.cos(angle), np.sin(angle)])
-            desired.FixValue(context, START + [*side, 0.0, 0.15 * np.sin(angle), 0.0, 0.0])
+            offset = 0.01 * np.array([np.cos(angle), np.sin(angle)])
+            desired.FixValue(context, START + [*offset, 0.0, 0.15 * np.sin(angle), 0.0, 0.0])
             if station.get_arm_state_output_port().Eval(context)[0] == ArmState.OFF:
                 with contextlib.suppress(InputError):  # the fault persists
                     station.resume(context)
