@@ -23,8 +23,8 @@ INJECTIONS = [
     faults.clock_jump(1e4),
     faults.lost(COMMAND, 0.015),
     faults.lost(COMMAND, 0.06),
-    faults.controller_held_up(0.015),
-    faults.controller_held_up(0.3),
+    faults.controller_paused(0.015),
+    faults.controller_paused(0.3),
     faults.controller_killed(0.06),
     faults.robot_killed(0.05),
     faults.robot_killed(0.1),
@@ -40,7 +40,7 @@ def bus():
 @pytest.mark.parametrize("injection", INJECTIONS, ids=lambda injection: f"{injection.kind}, {injection.description}")
 def test_station_stops_in_time_and_resumes(bus, injection):
     observation = injection.inject(bus)
-    assert observation.wrong == []
+    assert observation.failures == []
 
 
 def test_injection_reports_a_missed_or_needless_stop(bus):
@@ -48,7 +48,7 @@ def test_injection_reports_a_missed_or_needless_stop(bus):
     must = faults.Injection(
         tolerated.kind, tolerated.description, tolerated.begin, tolerated.end, tolerated.duration, True
     )
-    assert must.inject(bus).wrong == ["not detected"]
+    assert must.inject(bus).failures == ["not detected"]
     stopped = faults.resized(3, 1)
     may_not = faults.Injection(stopped.kind, stopped.description, stopped.begin, stopped.end, stopped.duration, False)
-    assert may_not.inject(bus).wrong == ["stopped the arm: WRONG_SIZE"]
+    assert may_not.inject(bus).failures == ["stopped the arm: WRONG_SIZE"]

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_command, lcmt_iiwa_status, lcmt_panda_command, lcmt_panda_status
-from injections.together import advance
+from injections.stepped_robot import advance
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder

@@ -1,4 +1,4 @@
-"""A station and a simulated robot at the two ends of a faulty bus, stepped in turn."""
+"""Bus with injected faults between a hardware station and a simulated robot, which are stepped in turn."""
 
 from __future__ import annotations
 
@@ -25,41 +25,41 @@ from guiderail.tools.hardware.sim_driver import START
 
 PERIOD = IiwaDriver.period
 STOPPED_WITHIN = 0.05  # time from the detection of a fault to standstill [s]
-STANDSTILL = 0.05  # largest joint speed of an arm at rest, which moved at up to 1 rad/s before [rad/s]
-STANDSTILL_WITHOUT_STATUS = 0.15  # the same if no status arrived during the stop [rad/s]
-RADIUS, TURN, FREQUENCY = 0.01, 0.15, 1.0  # of the arm's motion [m], [rad], [Hz]
+STANDSTILL = 0.05  # largest joint speed of a stopped arm; the motion reaches 1 rad/s [rad/s]
+STANDSTILL_WITHOUT_STATUS = 0.15  # largest joint speed if no status arrived during the stop [rad/s]
+RADIUS, ROTATION, FREQUENCY = 0.01, 0.15, 1.0  # amplitudes and frequency of the arm's motion [m], [rad], [Hz]
 HEARTBEAT_CHANNEL = IiwaDriver.heartbeat_channel()
 
 Relay = Callable[[bytes], list[bytes]]
 
 
-def passes(message: bytes) -> list[bytes]:
-    """Relay a message, as a bus without faults."""
+def relay_unchanged(message: bytes) -> list[bytes]:
+    """Return the messages that arrive on a bus without faults: the sent message."""
     return [message]
 
 
 @dataclass
 class Observation:
-    """Effect of a fault, observed on the robot's side."""
+    """Observed effect of a fault on the arm."""
 
     detected: float | None = None  # time from the beginning of the fault to its detection [s]
     fault: str = ""
     fastest: float = 0.0  # speed of the fastest joint at the detection [rad/s]
     after: float = 0.0  # largest speed from `STOPPED_WITHIN` after the detection [rad/s]
-    wrong: list[str] = field(default_factory=list)
+    failures: list[str] = field(default_factory=list)
 
 
 class Bus:
-    """Both programs, and the bus between them.
+    """Simulated robot, safety monitor and hardware station, and the bus between them.
 
     Attributes:
         on_sensor: Function from a status to the messages that the driver sends to station and safety monitor.
-        on_status: Function from such a message to those that arrive at the station.
-        on_command: Function from a command to the messages that arrive.
-        has_robot: True if the robot is stepped.
-        has_controller: True if the station is stepped.
-        has_safety_monitor: True if heartbeats are relayed.
-        torques: Torques that the robot received since `torques.clear()`.
+        on_status: Function from a message of the driver to the messages that arrive at the station.
+        on_command: Function from a command to the messages that arrive at the robot.
+        has_robot: True while the robot is stepped.
+        has_controller: True while the station is stepped.
+        has_safety_monitor: True while the monitor checks statuses and its heartbeats are relayed.
+        torques: Torques received by the robot since the list was cleared, each (7,) [Nm].
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class Bus:
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
         self._stop_limits = limits
-        self.on_sensor = self.on_status = self.on_command = passes
+        self.on_sensor = self.on_status = self.on_command = relay_unchanged
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
         self.step = 0
@@ -83,33 +83,33 @@ class Bus:
         self._arm.Subscribe(IiwaDriver.status_channel, self._measured.append)
         self.near_robot.Subscribe(IiwaDriver.status_channel, self._statuses.append)
         self.near_robot.Subscribe(HEARTBEAT_CHANNEL, self._heartbeats.append)
-        self.near_robot.Subscribe(IiwaDriver.command_channel, self._arrive)
+        self.near_robot.Subscribe(IiwaDriver.command_channel, self._receive_command)
         self.near_station.Subscribe(IiwaDriver.command_channel, self._commands.append)
         self.robot_simulator = self.robot.simulator()
-        self._pristine = self.robot.CreateDefaultContext()
+        self._default_context = self.robot.CreateDefaultContext()
         self.robot_time = 0  # steps since the robot was started
         self.start_robot()
         self.simulator = Simulator(self.station)
         self.start_controller()
 
-    # Start of both programs.
+    # Starts of the programs.
 
     def start_robot(self) -> None:
-        """Start the robot where it was, with its clock at zero."""
+        """Start the robot at its last joint positions, with its clock at zero."""
         context = self.robot_simulator.get_mutable_context()
         plant = self.robot.plant
-        state = plant.GetPositions(plant.GetMyContextFromRoot(context)) if self.step else None
-        context.SetTimeStateAndParametersFrom(self._pristine)
-        if state is None:
+        positions = plant.GetPositions(plant.GetMyContextFromRoot(context)) if self.step else None
+        context.SetTimeStateAndParametersFrom(self._default_context)
+        if positions is None:
             self.robot.set_pose(context, START)
         else:
-            plant.SetPositions(plant.GetMyMutableContextFromRoot(context), state)
+            plant.SetPositions(plant.GetMyMutableContextFromRoot(context), positions)
         self.robot_simulator.Initialize()
         self.robot_time, self.has_robot = 0, True
         self._relay_statuses()
 
     def start_over(self) -> None:
-        """Start all programs again with the robot at its initial pose."""
+        """Restart all programs with the robot at its initial pose."""
         self.step = 0
         self.start_robot()
         self.start_monitor()
@@ -122,12 +122,12 @@ class Bus:
         self.has_safety_monitor = True
 
     def start_controller(self) -> None:
-        """Start the station's program without any earlier state."""
+        """Start the station without any earlier state."""
         context = self.simulator.get_mutable_context()
         context.SetTime(0.0)
         self.station.get_desired_pose_input_port().FixValue(context, START)
         self.robot.ForcedPublish(self.robot_simulator.get_context())
-        self._relay_statuses(settle=False)
+        self._relay_statuses(deliver=False)
         self.station.start(self.simulator)
         self.has_controller, self._station_step = True, 0
 
@@ -161,13 +161,13 @@ class Bus:
 
     # Time.
 
-    def go(self, seconds: float) -> None:
-        """Advance both programs by a time [s]."""
+    def advance(self, seconds: float) -> None:
+        """Advance all programs by `seconds` [s]."""
         for _ in range(round(seconds / PERIOD)):
-            self.one()
+            self.step_once()
 
-    def one(self) -> None:
-        """Advance both programs by a period."""
+    def step_once(self) -> None:
+        """Advance all programs by a period."""
         self.step += 1
         if self.has_robot:
             self.robot_time += 1
@@ -180,7 +180,7 @@ class Bus:
             self.simulator.AdvancePendingEvents()
             self.station.receive(context, self.step * PERIOD)
             self.simulator.AdvanceTo(self._station_step * PERIOD)
-            self._settle(self.near_station)
+            self._deliver(self.near_station)
         commands, self._commands[:] = list(self._commands), []
         for message in commands:
             self._send(self.near_robot, IiwaDriver.command_channel, self.on_command(message))
@@ -188,41 +188,41 @@ class Bus:
     def desired(self) -> np.ndarray:
         """Return the desired pose: on a circle, with an oscillating rotation."""
         phase = 2.0 * np.pi * FREQUENCY * self.step * PERIOD
-        return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, TURN * np.sin(phase), 0.0, 0.0]
+        return START + [RADIUS * np.cos(phase), RADIUS * np.sin(phase), 0.0, ROTATION * np.sin(phase), 0.0, 0.0]
 
-    def _relay_statuses(self, settle: bool = True) -> None:
-        self._settle(self._arm)
+    def _relay_statuses(self, deliver: bool = True) -> None:
+        self._deliver(self._arm)
         measured, self._measured[:] = list(self._measured), []
         for message in measured:
             self._send(self.near_robot, IiwaDriver.status_channel, self.on_sensor(message))
         if self.has_safety_monitor:
             self.monitor.check()
-        self._settle(self.near_robot)
+        self._deliver(self.near_robot)
         statuses, self._statuses[:] = list(self._statuses), []
         heartbeats, self._heartbeats[:] = list(self._heartbeats), []
         for message in statuses:
-            self._send(self.near_station, IiwaDriver.status_channel, self.on_status(message), settle)
+            self._send(self.near_station, IiwaDriver.status_channel, self.on_status(message), deliver)
         # Heartbeats are relayed like the statuses, and are lost with them.
         if self.has_safety_monitor and self.on_status(b""):
-            self._send(self.near_station, HEARTBEAT_CHANNEL, heartbeats[-1:], settle)
+            self._send(self.near_station, HEARTBEAT_CHANNEL, heartbeats[-1:], deliver)
 
-    def _send(self, lcm: DrakeLcm, channel: str, messages: list[bytes], settle: bool = True) -> None:
+    def _send(self, lcm: DrakeLcm, channel: str, messages: list[bytes], deliver: bool = True) -> None:
         for message in messages:
             lcm.Publish(channel, message)
-            # A paused program receives nothing.
-            if lcm is self.near_robot or (settle and self.has_controller):
-                self._settle(lcm)
+            # A paused station receives no message.
+            if lcm is self.near_robot or (deliver and self.has_controller):
+                self._deliver(lcm)
 
-    def settle(self) -> None:
-        """Deliver all messages that are on their way."""
+    def deliver(self) -> None:
+        """Deliver all pending messages."""
         for lcm in (self._arm, self.near_robot, self.near_station):
-            self._settle(lcm)
+            self._deliver(lcm)
 
-    def _settle(self, lcm: DrakeLcm) -> None:
+    def _deliver(self, lcm: DrakeLcm) -> None:
         while lcm.HandleSubscriptions(0):
             pass
 
-    def _arrive(self, message: bytes) -> None:
+    def _receive_command(self, message: bytes) -> None:
         self._arm.Publish(IiwaDriver.command_channel, message)
         try:
             command = lcmt_iiwa_command.decode(message)
@@ -232,29 +232,29 @@ class Bus:
 
     # Checks.
 
-    def run_in(self, seconds: float = 0.15) -> None:
-        """Run until the arm follows its command, then for some time [s]."""
+    def run_until_following(self, seconds: float = 0.15) -> None:
+        """Advance until the arm follows its command, and then for `seconds` [s]."""
         for _ in range(round(3.0 / PERIOD)):
             if self.arm_state == ArmState.RUNNING and self.fault == Fault.NONE:
                 break
             if self.arm_state == ArmState.OFF:
                 with contextlib.suppress(InputError):  # the fault persists
                     self.station.resume(self.simulator.get_mutable_context())
-            self.one()
+            self.step_once()
         else:
             raise AssertionError(f"the arm does not resume: {self.arm_state.name}, {self.fault.name}")
-        self.go(seconds)
+        self.advance(seconds)
 
-    def watch(
+    def observe(
         self, seconds: float, repair: Callable[[], None], duration: float, standstill: float = STANDSTILL
     ) -> Observation:
         """Observe the effect of a fault that has just begun.
 
         Args:
-            seconds: Time to observe [s].
+            seconds: Duration of the observation [s].
             repair: Function that ends the fault.
             duration: Duration of the fault [s].
-            standstill: Largest joint speed of an arm at rest [rad/s].
+            standstill: Largest joint speed of a stopped arm [rad/s].
         """
         observation, begin, self.torques = Observation(), self.step, []
         is_repaired = False
@@ -262,12 +262,12 @@ class Bus:
             if not is_repaired and (self.step - begin) * PERIOD >= duration - 1e-9:
                 repair()
                 is_repaired = True
-            self.one()
+            self.step_once()
             now, speed = (self.step - begin) * PERIOD, float(np.abs(self.velocities).max())
             if observation.detected is None and self.is_detected:
                 observation.detected, observation.fastest = now, speed
                 observation.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
-            # A restarted program moves the arm again without `resume`: that speed is not counted.
+            # A restarted station moves the arm again without `resume`: the speed of this motion is not counted.
             is_moving_again = (
                 self.has_controller and self.arm_state in (ArmState.RAMPING, ArmState.RUNNING) and not self.is_detected
             )
@@ -282,14 +282,14 @@ class Bus:
             repair()
         for torque in self.torques:
             if len(torque) != len(self.limits) or not (np.abs(torque) <= self.limits + 1e-12).all():
-                observation.wrong.append(f"sent {torque}")
+                observation.failures.append(f"sent {torque}")
         if observation.after > standstill:
-            observation.wrong.append(f"{observation.after:.3f} rad/s after {STOPPED_WITHIN} s")
+            observation.failures.append(f"{observation.after:.3f} rad/s after {STOPPED_WITHIN} s")
         return observation
 
 
 def with_fields(message: bytes, **fields: object) -> bytes:
-    """Return a status message with other values of some fields."""
+    """Return a status message in which the given fields are replaced."""
     status = lcmt_iiwa_status.decode(message)
     for name, value in fields.items():
         setattr(status, name, value)

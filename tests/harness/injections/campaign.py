@@ -1,15 +1,17 @@
-"""Campaign: every kind of fault at many instants of a motion, and sampled pairs of faults, by simulated time.
+"""Campaign of faults at many instants of a simulated motion: every kind of fault, and sampled pairs of faults.
 
     python tests/harness/injections/campaign.py --instants 25 --pairs 200
 
-Robot, safety monitor and station are stepped in turn in one process, so that the same seed gives the same result. At
-each instant that process is forked for every fault. `processes.py` kills and pauses real processes.
+Robot, safety monitor and station are stepped in turn in one process, so the same seed gives the same result. At each
+instant the process is forked for every fault. `processes.py` kills and pauses real processes.
 
-Every detectable fault must be detected within its bound. All joints must be below 0.15 rad/s within 100 ms of the
-fault, and never faster than 1.25 times the speed at the fault or, if it is higher, the speed of the undisturbed motion
-within the bound. The exit code is 1 if a requirement is not met. A fault that only changes positions or velocities
-begins when they are wrong by `SENSITIVITY`: a velocity that is frozen in a joint at rest is right until the joint
-moves. Of two injected faults one can hide the other; the longer bound applies.
+Every detectable fault must be detected within its bound. From 100 ms after the fault, all joints must be slower than
+0.15 rad/s. No joint may exceed 1.25 times the speed at the fault, or 1.25 times the largest speed of the undisturbed
+motion within the bound if that is higher. The exit code is 1 if a requirement is not met.
+
+A fault that only changes positions or velocities begins with the first error of at least `SENSITIVITY`: the frozen
+velocity of a joint at rest is correct until the joint moves. Of two injected faults one can mask the other, so the
+longer bound applies to a pair.
 """
 
 from __future__ import annotations
@@ -33,10 +35,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from injections.bus import FREQUENCY, PERIOD, Bus
 from injections.kinds import KINDS, Kind, Q, V
 
-SLOW, SLOW_AFTER, GROWTH = 0.15, 0.1, 1.25  # [rad/s], [s], required of every fault
-DURATION = 0.3  # of a fault [s]
-MAX_STEPS = round(1.0 / PERIOD)  # steps within which a fault must have an effect; otherwise it is not checked
-SENSITIVITY = {Q: 1e-3, V: 0.05}  # errors that must be detected [rad], [rad/s]
+SLOW, SLOW_AFTER = 0.15, 0.1  # required joint speed [rad/s], from this time after every fault on [s]
+GROWTH = 1.25  # largest joint speed after a fault, relative to the speed at the fault or of the undisturbed motion
+DURATION = 0.3  # duration of a fault [s]
+MAX_STEPS = round(1.0 / PERIOD)  # a fault without an effect within this number of steps is not checked
+SENSITIVITY = {Q: 1e-3, V: 0.05}  # smallest errors that must be detected [rad], [rad/s]
 
 
 @dataclass
@@ -45,17 +48,17 @@ class Result:
 
     Attributes:
         detected: Time from the fault to its detection [s]; NaN if it was not detected.
-        cause: The station's fault.
+        cause: Fault reported by the station, or else by the safety monitor.
         late_speed: Largest joint speed from `SLOW_AFTER` after the fault [rad/s].
-        growth: Largest joint speed after the fault, relative to that at the fault or of the undisturbed motion.
-        wrong: Failed requirements.
+        growth: Largest joint speed after the fault, relative to the speed at the fault or of the undisturbed motion.
+        failures: Failed requirements.
     """
 
     detected: float
     cause: str
     late_speed: float
     growth: float
-    wrong: list[str]
+    failures: list[str]
 
 
 def fastest(bus: Bus) -> float:
@@ -67,15 +70,15 @@ def undisturbed_speeds(bus: Bus) -> np.ndarray:
     """Return the speed of the fastest joint in each step of a period of the motion [rad/s]."""
     steps = round(1.0 / FREQUENCY / PERIOD)
     speeds = np.zeros(steps)
-    bus.run_in(0.5)
+    bus.run_until_following(0.5)
     for _ in range(steps):
-        bus.one()
+        bus.step_once()
         speeds[bus.step % steps] = fastest(bus)
     return speeds
 
 
 def has_effect(message: bytes, relayed: list[bytes], where: str) -> bool:
-    """Return True if a message is changed by more than the sensitivity."""
+    """Return True if a message is changed by at least the sensitivity, dropped or duplicated."""
     if where == "command" or len(relayed) != 1:
         return relayed != [message]
     try:
@@ -93,7 +96,7 @@ def has_effect(message: bytes, relayed: list[bytes], where: str) -> bool:
 
 
 def begin(bus: Bus, kind: Kind, rng: np.random.Generator, effects: list[int]) -> None:
-    """Begin a fault; `effects` collects the steps at which it has an effect."""
+    """Begin a fault; append the step of the first effect to `effects` if the list is empty."""
     if kind.make is not None:
         start, fault = bus.step + 1, kind.make(rng)
         where = {"sensor": "on_sensor", "network": "on_status", "command": "on_command"}[kind.where]
@@ -112,15 +115,15 @@ def begin(bus: Bus, kind: Kind, rng: np.random.Generator, effects: list[int]) ->
 
 
 def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random.Generator) -> Result:
-    """Inject one fault, or several at once, and observe the arm for `DURATION`."""
-    begun, effects, start = bus.step, list[int](), None
+    """Inject one or more faults at the same time, and observe the arm for `DURATION`."""
+    first_step, effects, start = bus.step, list[int](), None
     bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
     for kind in kinds:
         begin(bus, kind, rng, effects)
     result, speed, elapsed = Result(np.nan, "", 0.0, 0.0, []), fastest(bus), 0.0
-    while elapsed < DURATION - 1e-9 and bus.step - begun < MAX_STEPS:
+    while elapsed < DURATION - 1e-9 and bus.step - first_step < MAX_STEPS:
         before = fastest(bus)
-        bus.one()
+        bus.step_once()
         if start is None and effects:
             start = effects[0] - 1
             reach = round((bound if np.isfinite(bound) else DURATION) / PERIOD) + 4
@@ -135,24 +138,24 @@ def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random
                 result.late_speed = max(result.late_speed, fastest(bus))
     is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
     if is_detectable and not result.detected <= bound + 1e-9:
-        result.wrong.append(f"detected after {1000.0 * result.detected:.0f} ms")
+        result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
     if is_detectable and result.late_speed >= SLOW:
-        result.wrong.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
+        result.failures.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
     if is_detectable and result.growth > GROWTH:
-        result.wrong.append(f"{result.growth:.2f} times as fast")
+        result.failures.append(f"{result.growth:.2f} times as fast")
     return result
 
 
 def in_child(bus: Bus, work: Callable[[], Result]) -> Result:
-    """Return the result of `work` in a forked process, so that the motion continues here without the fault."""
-    bus.settle()  # the processes share the pipes of the buses in memory, which have to be empty on both sides
+    """Return the result of `work` in a forked process, so that this process continues without the fault."""
+    bus.deliver()  # both processes share the pipes of the buses in memory, which must be empty
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
         status = 1
         try:
             os.write(writing, pickle.dumps(work()))
-            bus.settle()
+            bus.deliver()
             status = 0
         except Exception:
             traceback.print_exc()
@@ -163,7 +166,7 @@ def in_child(bus: Bus, work: Callable[[], Result]) -> Result:
         content = file.read()
     _, status = os.waitpid(child, 0)
     if status:
-        raise SystemExit(f"a process ended with {os.waitstatus_to_exitcode(status)}")
+        raise SystemExit(f"a forked process exited with {os.waitstatus_to_exitcode(status)}")
     return pickle.loads(content)
 
 
@@ -179,20 +182,22 @@ def pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[
 def table(results: dict[str, list[Result]]) -> int:
     """Print a row for each kind; return the number of failed injections."""
     bounds = {kind.name: kind.bound for kind in KINDS}
-    print(f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'wrong':>6}")
+    print(
+        f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'failed':>7}"
+    )
     for name, rows in results.items():
         times = 1000.0 * np.array([row.detected for row in rows])
-        result = times[np.isfinite(times)]
-        middle, worst = (np.median(result), result.max()) if len(result) else (np.nan, np.nan)
+        detected = times[np.isfinite(times)]
+        median, worst = (np.median(detected), detected.max()) if len(detected) else (np.nan, np.nan)
         causes = ", ".join(sorted({row.cause for row in rows if row.cause}))
         late, growth = max(row.late_speed for row in rows), max(row.growth for row in rows)
-        wrong = sum(bool(row.wrong) for row in rows)
-        missed = len(times) - len(result)
+        failed = sum(bool(row.failures) for row in rows)
+        missed = len(times) - len(detected)
         print(
-            f"{name:<32}{1000.0 * bounds.get(name, np.nan):>6.0f}{middle:>7.0f}{worst:>6.0f}       {missed:>6}"
-            f"{late:>7.2f}{growth:>7.2f}{wrong:>6}  {causes}"
+            f"{name:<32}{1000.0 * bounds.get(name, np.nan):>6.0f}{median:>7.0f}{worst:>6.0f}       {missed:>6}"
+            f"{late:>7.2f}{growth:>7.2f}{failed:>7}  {causes}"
         )
-    return sum(bool(row.wrong) for rows in results.values() for row in rows)
+    return sum(bool(row.failures) for rows in results.values() for row in rows)
 
 
 def main() -> int:
@@ -209,20 +214,20 @@ def main() -> int:
     results: dict[str, list[Result]] = {kind.name: [] for kind in kinds}
     for instant in range(arguments.instants):
         rng = np.random.default_rng([arguments.seed, instant])
-        bus.run_in(float(rng.uniform(0.02, 0.3)))
+        bus.run_until_following(float(rng.uniform(0.02, 0.3)))
         injections = [(KINDS.index(kind), (kind,)) for kind in kinds]
         injections += [(len(KINDS), pair) for pair in pairs(kinds, arguments.pairs // arguments.instants, rng)]
         for index, (number, chosen) in enumerate(injections):
             rng = np.random.default_rng([arguments.seed, instant, number, index])
             result = in_child(bus, partial(inject, bus, chosen, speeds, rng))
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
-            for problem in result.wrong:
+            for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)
-                print(f"WRONG  {name}, instant {instant}: {problem} ({result.cause})", flush=True)
-    wrong = table(results)
+                print(f"FAIL  {name}, instant {instant}: {failure} ({result.cause})", flush=True)
+    failed = table(results)
     total = sum(len(rows) for rows in results.values())
-    print(f"{total} injections, {wrong} with a failed requirement, in {time.monotonic() - started:.0f} s")
-    return 1 if wrong else 0
+    print(f"{total} injections, {failed} with a failed requirement, in {time.monotonic() - started:.0f} s")
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Faults of a bus and of the programs on it, each with its required effect."""
+"""Faults of a bus and of its programs, each with its required effect."""
 
 from __future__ import annotations
 
@@ -12,28 +12,26 @@ from drake import lcmt_iiwa_status
 from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
 
 from . import bus as buses
-from .bus import PERIOD, Bus, passes, with_fields
+from .bus import PERIOD, Bus, relay_unchanged, with_fields
 
-TOLERATED, STOPS = (
-    (MAX_MISSED_MESSAGES - 2) * PERIOD,
-    (MAX_MISSED_MESSAGES + 2) * PERIOD,
-)  # a shorter fault is tolerated, a longer one stops the arm [s]
+MAX_TOLERATED = (MAX_MISSED_MESSAGES - 2) * PERIOD  # longest fault that must not stop the arm [s]
+MIN_STOPPING = (MAX_MISSED_MESSAGES + 2) * PERIOD  # shortest fault that must stop the arm [s]
 JOINT_FIELDS = tuple(lcmt_iiwa_status.__slots__[2:])
 MEASURED = ("joint_position_measured", "joint_velocity_estimated", "joint_torque_external")
 
 
 @dataclass(frozen=True)
 class Injection:
-    """Fault that is injected.
+    """Fault to inject, with its required effect.
 
     Attributes:
         kind: Name of the kind.
-        description: Parameters of the fault, for messages.
+        description: Parameters of the fault as text.
         begin: Function that begins the fault.
-        end: Function that ends it.
-        duration: Duration [s].
-        stops: True if the fault must stop the arm, False if it must not, None if both are allowed.
-        fault: The station's fault, if it is always the same.
+        end: Function that ends the fault.
+        duration: Duration of the fault [s].
+        stops: True if the fault must stop the arm, False if it must not, None if both outcomes are allowed.
+        fault: Required fault of the station; None to allow any.
     """
 
     kind: str
@@ -45,31 +43,31 @@ class Injection:
     fault: Fault | None = None
 
     def inject(self, bus: Bus) -> buses.Observation:
-        """Inject the fault while the arm moves; check its effect, and that the arm can resume."""
-        bus.run_in()
+        """Inject the fault while the arm moves; check the effect of the fault, and that the arm can resume."""
+        bus.run_until_following()
         self.begin(bus)
         standstill = buses.STANDSTILL_WITHOUT_STATUS if self.kind.startswith(("status", "clock")) else buses.STANDSTILL
-        observation = bus.watch(self.duration + 0.35, lambda: self.end(bus), self.duration, standstill)
+        observation = bus.observe(self.duration + 0.35, lambda: self.end(bus), self.duration, standstill)
         if self.stops is not None and self.stops != (observation.detected is not None):
-            observation.wrong.append("not detected" if self.stops else f"stopped the arm: {observation.fault}")
+            observation.failures.append("not detected" if self.stops else f"stopped the arm: {observation.fault}")
         if self.stops and self.fault not in (None, bus.fault):
-            observation.wrong.append(f"reported as {bus.fault.name}")
+            observation.failures.append(f"reported as {bus.fault.name}")
         try:
-            bus.run_in(0.05)
+            bus.run_until_following(0.05)
         except AssertionError as error:
-            observation.wrong.append(str(error))
+            observation.failures.append(str(error))
         return observation
 
 
-def _repair(bus: Bus) -> None:
-    bus.on_status = bus.on_command = passes
+def _end_relay(bus: Bus) -> None:
+    bus.on_status = bus.on_command = relay_unchanged
 
 
 def _must_stop(seconds: float) -> bool | None:
-    return False if seconds <= TOLERATED else True if seconds >= STOPS else None
+    return False if seconds <= MAX_TOLERATED else True if seconds >= MIN_STOPPING else None
 
 
-def _at(where: str, relay: Callable[[bytes], list[bytes]]) -> Callable[[Bus], None]:
+def _set_relay(where: str, relay: Callable[[bytes], list[bytes]]) -> Callable[[Bus], None]:
     def begin(bus: Bus) -> None:
         setattr(bus, where, relay)
 
@@ -77,13 +75,13 @@ def _at(where: str, relay: Callable[[bytes], list[bytes]]) -> Callable[[Bus], No
 
 
 def lost(where: str, seconds: float) -> Injection:
-    """Drop all messages for a while."""
+    """Drop all messages for `seconds` [s]."""
     kind = "status stopped" if where == "on_status" else "commands lost"
-    return Injection(kind, f"{seconds} s", _at(where, lambda m: []), _repair, seconds, _must_stop(seconds))
+    return Injection(kind, f"{seconds} s", _set_relay(where, lambda m: []), _end_relay, seconds, _must_stop(seconds))
 
 
 def delayed(where: str, seconds: float) -> Injection:
-    """Delay all messages by `seconds`, during 0.3 s."""
+    """Delay all messages by `seconds` [s] for 0.3 s."""
     name = "status" if where == "on_status" else "commands"
     queue: deque[bytes] = deque()
     steps = round(seconds / PERIOD)
@@ -94,46 +92,49 @@ def delayed(where: str, seconds: float) -> Injection:
         queue.append(message)
         return [queue.popleft()] if len(queue) > steps else []
 
-    stops = True if seconds >= STOPS else None
-    return Injection(f"{name} delayed", f"{seconds} s", _at(where, relay), _repair, 0.3, stops)
+    stops = True if seconds >= MIN_STOPPING else None
+    return Injection(f"{name} delayed", f"{seconds} s", _set_relay(where, relay), _end_relay, 0.3, stops)
 
 
 def reordered(where: str, pairs: int) -> Injection:
-    """Swap pairs of messages."""
+    """Swap the two messages of each pair of consecutive messages."""
     name = "status" if where == "on_status" else "commands"
-    held: list[bytes] = []
+    pending: list[bytes] = []
 
     def relay(message: bytes) -> list[bytes]:
         if not message:
             return [message]
-        held.append(message)
-        if len(held) < 2:
+        pending.append(message)
+        if len(pending) < 2:
             return []
-        later, sooner = held.pop(), held.pop()
-        return [later, sooner]
+        return [pending.pop(), pending.pop()]
 
-    return Injection(f"{name} reordered", f"{pairs} pairs", _at(where, relay), _repair, 2 * pairs * PERIOD, None)
+    return Injection(
+        f"{name} reordered", f"{pairs} pairs", _set_relay(where, relay), _end_relay, 2 * pairs * PERIOD, None
+    )
 
 
 def duplicated(where: str, seconds: float) -> Injection:
-    """Send all messages twice, which must be tolerated."""
+    """Send all messages twice for `seconds` [s], which must not stop the arm."""
     name = "status" if where == "on_status" else "commands"
-    return Injection(f"{name} duplicated", f"{seconds} s", _at(where, lambda m: [m, m]), _repair, seconds, False)
+    return Injection(
+        f"{name} duplicated", f"{seconds} s", _set_relay(where, lambda m: [m, m]), _end_relay, seconds, False
+    )
 
 
 def replaced(kind: str, description: str, change: Callable[[bytes], bytes], messages: int) -> Injection:
-    """Change statuses; the first changed one must stop the arm."""
+    """Change statuses; the first changed status must stop the arm."""
 
     def relay(message: bytes) -> list[bytes]:
         return [change(message)] if message else [message]
 
     return Injection(
-        kind, f"{description}, {messages} times", _at("on_status", relay), _repair, messages * PERIOD, True
+        kind, f"{description}, {messages} times", _set_relay("on_status", relay), _end_relay, messages * PERIOD, True
     )
 
 
 def not_finite(field: str, joints: list[int], value: float, messages: int) -> Injection:
-    """Replace numbers with NaN or infinity."""
+    """Replace values of a field with NaN or infinity."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
@@ -145,7 +146,7 @@ def not_finite(field: str, joints: list[int], value: float, messages: int) -> In
 
 
 def resized(joints: int, messages: int) -> Injection:
-    """Change the number of joints."""
+    """Change the number of joints in the status."""
 
     def change(message: bytes) -> bytes:
         return with_fields(message, num_joints=joints, **{name: [0.0] * joints for name in JOINT_FIELDS})
@@ -154,33 +155,33 @@ def resized(joints: int, messages: int) -> Injection:
 
 
 def garbage(rng: np.random.Generator, messages: int) -> Injection:
-    """Replace a message by random bytes, truncate it, or flip a byte of its type."""
+    """Replace messages by random bytes, truncate them, or invert the first byte of their type."""
     variant = int(rng.integers(3))
-    share, noise = float(rng.uniform(0.0, 0.99)), rng.bytes(int(rng.integers(0, 2000)))
+    fraction, noise = float(rng.uniform(0.0, 0.99)), rng.bytes(int(rng.integers(0, 2000)))
 
     def change(message: bytes) -> bytes:
         if variant == 0:
             return noise
         if variant == 1:
-            return message[: int(share * len(message))]
+            return message[: int(fraction * len(message))]
         return bytes([message[0] ^ 255]) + message[1:]
 
-    return replaced("status garbage", ("noise", "cut off", "another type")[variant], change, messages)
+    return replaced("status garbage", ("noise", "truncated", "another type")[variant], change, messages)
 
 
-def jumped(field: str, joint: int, by: float, messages: int) -> Injection:
-    """Let a joint's position or velocity jump."""
+def jumped(field: str, joint: int, offset: float, messages: int) -> Injection:
+    """Add an offset to a joint's position [rad] or velocity [rad/s]."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
-        values[joint] += by
+        values[joint] += offset
         return with_fields(message, **{field: values})
 
-    return replaced("status jumped", f"{field}[{joint}] by {by:.2f}", change, messages)
+    return replaced("status jumped", f"{field}[{joint}] by {offset:.2f}", change, messages)
 
 
 def external_load(joint: int, torque: float) -> Injection:
-    """Load a joint with more than its limit."""
+    """Add an external torque above the limit to a joint, in one status."""
 
     def change(message: bytes) -> bytes:
         values = list(lcmt_iiwa_status.decode(message).joint_torque_external)
@@ -191,19 +192,19 @@ def external_load(joint: int, torque: float) -> Injection:
 
 
 def clock_jump(seconds: float) -> Injection:
-    """Shift the robot's clock; the end of the fault shifts it back, which is another jump."""
+    """Shift the robot's clock by `seconds` [s]; the end of the fault is a second jump, back to the true time."""
 
     def relay(message: bytes) -> list[bytes]:
         if not message:
             return [message]
         return [with_fields(message, utime=lcmt_iiwa_status.decode(message).utime + round(seconds * 1e6))]
 
-    stops = True if abs(seconds) >= STOPS else None
-    return Injection("clock jump", f"{seconds} s", _at("on_status", relay), _repair, 0.3, stops)
+    stops = True if abs(seconds) >= MIN_STOPPING else None
+    return Injection("clock jump", f"{seconds} s", _set_relay("on_status", relay), _end_relay, 0.3, stops)
 
 
-def controller_held_up(seconds: float) -> Injection:
-    """Pause the commanding program."""
+def controller_paused(seconds: float) -> Injection:
+    """Pause the station for `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
@@ -212,30 +213,30 @@ def controller_held_up(seconds: float) -> Injection:
         bus.has_controller = True
 
     return Injection(
-        "controller held up", f"{seconds} s", begin, end, seconds, _must_stop(seconds), Fault.DEADLINE_MISSED
+        "controller paused", f"{seconds} s", begin, end, seconds, _must_stop(seconds), Fault.DEADLINE_MISSED
     )
 
 
 def controller_killed(seconds: float) -> Injection:
-    """Kill the commanding program, and start it again."""
+    """Kill the station, and restart it after `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
 
-    return Injection("controller killed", f"back after {seconds} s", begin, Bus.start_controller, seconds, True)
+    return Injection("controller killed", f"restarted after {seconds} s", begin, Bus.start_controller, seconds, True)
 
 
 def robot_killed(seconds: float) -> Injection:
-    """Kill the robot, and start it again with its clock at zero."""
+    """Kill the robot, and restart it after `seconds` [s] with its clock at zero."""
 
     def begin(bus: Bus) -> None:
         bus.has_robot = False
 
-    return Injection("robot killed", f"back after {seconds} s", begin, Bus.start_robot, seconds, True)
+    return Injection("robot killed", f"restarted after {seconds} s", begin, Bus.start_robot, seconds, True)
 
 
 def monitor_killed(seconds: float) -> Injection:
-    """Kill the safety monitor, and start it again."""
+    """Kill the safety monitor, and restart it after `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_safety_monitor = False
@@ -243,36 +244,42 @@ def monitor_killed(seconds: float) -> Injection:
     def end(bus: Bus) -> None:
         bus.has_safety_monitor = True
 
-    return Injection("monitor killed", f"back after {seconds} s", begin, end, seconds, True)
+    return Injection("monitor killed", f"restarted after {seconds} s", begin, end, seconds, True)
 
 
 def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
     """Yield one injection of each kind with random parameters."""
 
-    def duration(longest: float = 5.0) -> float:
-        return round(float(np.exp(rng.uniform(np.log(0.01), np.log(longest)))) / PERIOD) * PERIOD
+    def duration(maximum: float = 5.0) -> float:
+        return round(float(np.exp(rng.uniform(np.log(0.01), np.log(maximum)))) / PERIOD) * PERIOD
 
-    def few() -> int:
+    def random_count() -> int:
         return int(rng.integers(1, 20))
 
     for where in ("on_status", "on_command"):
         yield lost(where, duration())
         yield delayed(where, duration(0.2))
-        yield reordered(where, few())
+        yield reordered(where, random_count())
         yield duplicated(where, duration(0.5))
     joints = sorted(set(rng.integers(0, 7, 3).tolist()))
-    yield not_finite(str(rng.choice(MEASURED)), joints, float(rng.choice([np.nan, np.inf, -np.inf])), few())
-    yield resized(int(rng.choice([0, 1, 3, 6, 8, 14])), few())
-    yield garbage(rng, few())
+    yield not_finite(str(rng.choice(MEASURED)), joints, float(rng.choice([np.nan, np.inf, -np.inf])), random_count())
+    yield resized(int(rng.choice([0, 1, 3, 6, 8, 14])), random_count())
+    yield garbage(rng, random_count())
     yield jumped(
-        "joint_position_measured", int(rng.integers(7)), float(rng.choice([-1, 1]) * rng.uniform(0.1, 3)), few()
+        "joint_position_measured",
+        int(rng.integers(7)),
+        float(rng.choice([-1, 1]) * rng.uniform(0.1, 3)),
+        random_count(),
     )
     yield jumped(
-        "joint_velocity_estimated", int(rng.integers(7)), float(rng.choice([-1, 1]) * rng.uniform(1.8, 9)), few()
+        "joint_velocity_estimated",
+        int(rng.integers(7)),
+        float(rng.choice([-1, 1]) * rng.uniform(1.8, 9)),
+        random_count(),
     )
     yield external_load(int(rng.integers(7)), float(rng.uniform(50.0, 200.0)))
     yield clock_jump(float(rng.choice([-1, 1])) * float(np.exp(rng.uniform(np.log(0.01), np.log(1e5)))))
-    yield controller_held_up(duration(2.0))
-    yield controller_killed(duration(1.0) + STOPS)
-    yield robot_killed(duration(1.0) + STOPS)
-    yield monitor_killed(duration(1.0) + 2.0 * STOPS)
+    yield controller_paused(duration(2.0))
+    yield controller_killed(duration(1.0) + MIN_STOPPING)
+    yield robot_killed(duration(1.0) + MIN_STOPPING)
+    yield monitor_killed(duration(1.0) + 2.0 * MIN_STOPPING)

@@ -1,4 +1,4 @@
-"""Kinds of faults of a robot's sensors, clock, bus and programs, for `campaign.py` and `processes.py`.
+"""Kinds of faults of a robot's sensors, clock, bus and programs, for `campaign.py` and `fci/faults.py`.
 
 A message fault is a function from a message and the time since the fault began [s] to the messages that arrive.
 """
@@ -23,15 +23,16 @@ Fault = Callable[[bytes, float], list[bytes]]
 
 @dataclass(frozen=True)
 class Kind:
-    """Kind of fault.
+    """Kind of fault, with the bound of its detection time.
 
     Attributes:
         name: Name of the kind.
         bound: Time within which the fault must be detected while the arm moves [s], derived in docs/robot.md; NaN if
             the arm may continue, because the fault has no effect.
-        make: Function from a random generator to the fault of messages; None for a fault of a program.
-        where: "sensor" (before station and safety monitor), "network" (before the station), "command" or "program".
-        action: "kill" or "stop" and the program, for a fault of a program.
+        make: Function from a random generator to a message fault; None for a fault of a program.
+        where: Place of the fault: "sensor" (before station and safety monitor), "network" (before the station only),
+            "command" (before the robot) or "program".
+        action: For a fault of a program, "kill" or "stop", and the name of the program.
     """
 
     name: str
@@ -59,8 +60,8 @@ def _status(change: Callable[[lcmt_iiwa_status, float], None]) -> Fault:
     return relay
 
 
-def _frozen(fields: tuple[str, ...], one: bool) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault that repeats the first values of fields, of one joint or of all."""
+def _frozen(fields: tuple[str, ...], single_joint: bool) -> Callable[[np.random.Generator], Fault]:
+    """Return a fault that repeats the first values of the given fields, for a single joint or all joints."""
 
     def make(rng: np.random.Generator) -> Fault:
         joint, first = int(rng.integers(7)), dict[str, list[float]]()
@@ -68,10 +69,10 @@ def _frozen(fields: tuple[str, ...], one: bool) -> Callable[[np.random.Generator
         def change(status: lcmt_iiwa_status, elapsed: float) -> None:
             for field in fields:
                 values = getattr(status, field)
-                kept = first.setdefault(field, list(values))
+                first_values = first.setdefault(field, list(values))
                 for index in range(7):
-                    if not one or index == joint:
-                        values[index] = kept[index]
+                    if not single_joint or index == joint:
+                        values[index] = first_values[index]
 
         return _status(change)
 
@@ -79,9 +80,9 @@ def _frozen(fields: tuple[str, ...], one: bool) -> Callable[[np.random.Generator
 
 
 def _changed(
-    field: str, change: Callable[[float, float], float], one: bool = False
+    field: str, change: Callable[[float, float], float], single_joint: bool = False
 ) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault that changes the values of a field; `change` maps a value and the time since then [s]."""
+    """Return a fault of a field; `change` maps a value and the time since the fault began [s] to the new value."""
 
     def make(rng: np.random.Generator) -> Fault:
         joint, sign = int(rng.integers(7)), float(rng.choice([-1.0, 1.0]))
@@ -89,7 +90,7 @@ def _changed(
         def changed(status: lcmt_iiwa_status, elapsed: float) -> None:
             values = getattr(status, field)
             for index in range(7):
-                if not one or index == joint:
+                if not single_joint or index == joint:
                     values[index] = sign * change(sign * values[index], elapsed)
 
         return _status(changed)
@@ -119,7 +120,7 @@ def _swapped(field: str) -> Callable[[np.random.Generator], Fault]:
 
 
 def _frozen_with_noise(rng: np.random.Generator) -> Fault:
-    frozen = _frozen((Q, V, T), one=False)(rng)
+    frozen = _frozen((Q, V, T), single_joint=False)(rng)
 
     def relay(message: bytes, elapsed: float) -> list[bytes]:
         status = lcmt_iiwa_status.decode(frozen(message, elapsed)[0])
@@ -131,7 +132,7 @@ def _frozen_with_noise(rng: np.random.Generator) -> Fault:
 
 
 def _clock(change: Callable[[float], float]) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault of the clock; `change` returns its error [s] after a time [s]."""
+    """Return a fault of the clock; `change` maps the time since the fault began [s] to the clock error [s]."""
 
     def make(rng: np.random.Generator) -> Fault:
         def changed(status: lcmt_iiwa_status, elapsed: float) -> None:
@@ -173,7 +174,7 @@ def _repeated(rng: np.random.Generator) -> Fault:
 
 
 def _old_values(seconds: float) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault that delays the values, but not the time stamps."""
+    """Return a fault that delays the values, but not the time stamps, by `seconds` [s]."""
 
     def make(rng: np.random.Generator) -> Fault:
         queue: deque[lcmt_iiwa_status] = deque()
@@ -204,8 +205,8 @@ def _delayed(seconds: float) -> Callable[[np.random.Generator], Fault]:
     return make
 
 
-def _lost(share: float) -> Callable[[np.random.Generator], Fault]:
-    return lambda rng: lambda message, elapsed: [] if rng.random() < share else [message]
+def _lost(fraction: float) -> Callable[[np.random.Generator], Fault]:
+    return lambda rng: lambda message, elapsed: [] if rng.random() < fraction else [message]
 
 
 def _duplicated(rng: np.random.Generator) -> Fault:
@@ -213,17 +214,22 @@ def _duplicated(rng: np.random.Generator) -> Fault:
 
 
 def _reordered(rng: np.random.Generator) -> Fault:
-    held: list[bytes] = []
+    pending: list[bytes] = []
 
     def relay(message: bytes, elapsed: float) -> list[bytes]:
-        held.append(message)
-        return [held.pop(), held.pop()] if len(held) == 2 else []
+        pending.append(message)
+        return [pending.pop(), pending.pop()] if len(pending) == 2 else []
 
     return relay
 
 
 def _second_robot(delay: float, offset: float) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault by a second robot at rest in the posture of the first status; its clock differs by a delay [s]."""
+    """Return a fault by a second robot at rest.
+
+    Args:
+        delay: Difference between the clocks of the two robots [s].
+        offset: Difference between the joint positions of the second robot and those of the first status [rad].
+    """
 
     def make(rng: np.random.Generator) -> Fault:
         first: list[lcmt_iiwa_status] = []
@@ -232,11 +238,11 @@ def _second_robot(delay: float, offset: float) -> Callable[[np.random.Generator]
             status = lcmt_iiwa_status.decode(message)
             if not first:
                 first.append(lcmt_iiwa_status.decode(message))
-            other = first[0]
-            other.utime = status.utime + round(1e6 * delay)
-            other.joint_velocity_estimated = [0.0] * 7
-            other.joint_position_measured = [value + offset for value in other.joint_position_measured]
-            return [message, other.encode()]
+            second = first[0]
+            second.utime = status.utime + round(1e6 * delay)
+            second.joint_velocity_estimated = [0.0] * 7
+            second.joint_position_measured = [value + offset for value in second.joint_position_measured]
+            return [message, second.encode()]
 
         return relay
 
@@ -256,7 +262,12 @@ def _resized(message: bytes, rng: np.random.Generator) -> bytes:
 
 
 def _second_program(change: Callable[[np.ndarray], np.ndarray], delay: float) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault by a second program that commands other torques after each command, with a clock error [s]."""
+    """Return a fault by a second program, which sends changed torques after each command.
+
+    Args:
+        change: Function from the commanded to the changed torques, both (7,) [Nm].
+        delay: Clock error of the second program [s].
+    """
 
     def make(rng: np.random.Generator) -> Fault:
         def relay(message: bytes, elapsed: float) -> list[bytes]:
@@ -274,46 +285,47 @@ def _spike(size: float) -> Callable[[float, float], float]:
     return lambda value, elapsed: value + (size if elapsed < 0.5 * PERIOD else 0.0)
 
 
+# Bounds of the detection time [s], derived in docs/robot.md.
 NEXT, TWO, FEW = 2 * PERIOD, 3 * PERIOD, 6 * PERIOD
 TIMEOUT, HEARTBEAT, SLOW = 8 * PERIOD, 14 * PERIOD, 24 * PERIOD
 UNDETECTED = float("nan")
-# An error proportional to the velocity counts from 0.05 rad/s on, and its growth depends on the motion. Its bound is
-# therefore that of a constant error of 0.05 rad/s.
+# An error proportional to the velocity is detectable above 0.05 rad/s, and its growth depends on the motion. Its bound
+# is therefore the bound of a constant error of 0.05 rad/s.
 KINDS = (
-    Kind("all values frozen", FEW, _frozen(FIELDS, one=False)),
-    Kind("one joint frozen", FEW, _frozen((Q, V, T), one=True)),
-    Kind("positions frozen", FEW, _frozen((Q,), one=False)),
-    Kind("velocities frozen", HEARTBEAT, _frozen((V,), one=False)),
-    Kind("one position frozen", HEARTBEAT, _frozen((Q,), one=True)),
-    Kind("one velocity frozen", HEARTBEAT, _frozen((V,), one=True)),
+    Kind("all values frozen", FEW, _frozen(FIELDS, single_joint=False)),
+    Kind("one joint frozen", FEW, _frozen((Q, V, T), single_joint=True)),
+    Kind("positions frozen", FEW, _frozen((Q,), single_joint=False)),
+    Kind("velocities frozen", HEARTBEAT, _frozen((V,), single_joint=False)),
+    Kind("one position frozen", HEARTBEAT, _frozen((Q,), single_joint=True)),
+    Kind("one velocity frozen", HEARTBEAT, _frozen((V,), single_joint=True)),
     Kind("all values frozen, with noise", FEW, _frozen_with_noise),
-    Kind("external torques frozen", UNDETECTED, _frozen((T,), one=False)),
+    Kind("external torques frozen", UNDETECTED, _frozen((T,), single_joint=False)),
     Kind("time stamp frozen", NEXT, _frozen_clock),
     Kind("status repeated", TIMEOUT, _repeated),
-    Kind("velocity + 1.2 rad/s", TWO, _changed(V, lambda v, t: v + 1.2, one=True)),
-    Kind("velocity + 0.3 rad/s", FEW, _changed(V, lambda v, t: v + 0.3, one=True)),
-    Kind("velocity + 0.05 rad/s", HEARTBEAT, _changed(V, lambda v, t: v + 0.05, one=True)),
+    Kind("velocity + 1.2 rad/s", TWO, _changed(V, lambda v, t: v + 1.2, single_joint=True)),
+    Kind("velocity + 0.3 rad/s", FEW, _changed(V, lambda v, t: v + 0.3, single_joint=True)),
+    Kind("velocity + 0.05 rad/s", HEARTBEAT, _changed(V, lambda v, t: v + 0.05, single_joint=True)),
     Kind("velocities zero", HEARTBEAT, _changed(V, lambda v, t: 0.0)),
     Kind("velocities negated", HEARTBEAT, _changed(V, lambda v, t: -v)),
     Kind("velocities doubled", HEARTBEAT, _changed(V, lambda v, t: 2.0 * v)),
     Kind("velocities halved", HEARTBEAT, _changed(V, lambda v, t: 0.5 * v)),
     Kind("velocities swapped", HEARTBEAT, _swapped(V)),
-    Kind("velocity spike", NEXT, _changed(V, _spike(5.0), one=True)),
+    Kind("velocity spike", NEXT, _changed(V, _spike(5.0), single_joint=True)),
     Kind("velocity noise 0.3 rad/s", HEARTBEAT, _noisy(V, 0.3)),
-    Kind("velocity drift 5 rad/s²", HEARTBEAT, _changed(V, lambda v, t: v + 5.0 * t, one=True)),
-    Kind("position + 0.01 rad", NEXT, _changed(Q, lambda q, t: q + 0.01, one=True)),
-    Kind("position + 1 rad", NEXT, _changed(Q, lambda q, t: q + 1.0, one=True)),
-    Kind("position drift 0.1 rad/s", FEW, _changed(Q, lambda q, t: q + 0.1 * t, one=True)),
-    Kind("position drift 1 rad/s", NEXT, _changed(Q, lambda q, t: q + 1.0 * (t + PERIOD), one=True)),
+    Kind("velocity drift 5 rad/s²", HEARTBEAT, _changed(V, lambda v, t: v + 5.0 * t, single_joint=True)),
+    Kind("position + 0.01 rad", NEXT, _changed(Q, lambda q, t: q + 0.01, single_joint=True)),
+    Kind("position + 1 rad", NEXT, _changed(Q, lambda q, t: q + 1.0, single_joint=True)),
+    Kind("position drift 0.1 rad/s", FEW, _changed(Q, lambda q, t: q + 0.1 * t, single_joint=True)),
+    Kind("position drift 1 rad/s", NEXT, _changed(Q, lambda q, t: q + 1.0 * (t + PERIOD), single_joint=True)),
     Kind("positions swapped", NEXT, _swapped(Q)),
     Kind("positions in degrees", NEXT, _changed(Q, lambda q, t: q * 180.0 / np.pi)),
-    Kind("position spike", NEXT, _changed(Q, _spike(0.5), one=True)),
+    Kind("position spike", NEXT, _changed(Q, _spike(0.5), single_joint=True)),
     Kind("position noise 5 mrad", TWO, _noisy(Q, 5e-3)),
-    Kind("external torque + 100 Nm", NEXT, _changed(T, lambda t, e: t + 100.0, one=True)),
-    Kind("NaN in a position", NEXT, _changed(Q, lambda q, t: np.nan, one=True)),
-    Kind("NaN in a velocity", NEXT, _changed(V, lambda v, t: np.nan, one=True)),
-    Kind("NaN in an external torque", NEXT, _changed(T, lambda t, e: np.nan, one=True)),
-    Kind("infinite velocity", NEXT, _changed(V, lambda v, t: np.inf, one=True)),
+    Kind("external torque + 100 Nm", NEXT, _changed(T, lambda t, e: t + 100.0, single_joint=True)),
+    Kind("NaN in a position", NEXT, _changed(Q, lambda q, t: np.nan, single_joint=True)),
+    Kind("NaN in a velocity", NEXT, _changed(V, lambda v, t: np.nan, single_joint=True)),
+    Kind("NaN in an external torque", NEXT, _changed(T, lambda t, e: np.nan, single_joint=True)),
+    Kind("infinite velocity", NEXT, _changed(V, lambda v, t: np.inf, single_joint=True)),
     Kind("wrong number of joints", NEXT, _replaced(_resized)),
     Kind("random bytes", NEXT, _replaced(lambda message, rng: rng.bytes(int(rng.integers(0, 500))))),
     Kind("message cut off", NEXT, _replaced(lambda message, rng: message[: int(rng.integers(len(message)))])),
@@ -341,8 +353,8 @@ KINDS = (
     Kind("second program, torque negated", FEW, _second_program(lambda torque: -torque, 0.0), "command"),
     Kind("second program, another clock", FEW, _second_program(lambda torque: -torque, 40.0), "command"),
     Kind("second program, clock + 1 ms", SLOW, _second_program(lambda torque: 0.5 * torque, 1e-3), "command"),
-    Kind("commander killed", TIMEOUT, None, "program", ("kill", "controller")),
-    Kind("commander stopped", TIMEOUT, None, "program", ("stop", "controller")),
+    Kind("controller killed", TIMEOUT, None, "program", ("kill", "controller")),
+    Kind("controller stopped", TIMEOUT, None, "program", ("stop", "controller")),
     Kind("robot killed", TIMEOUT, None, "program", ("kill", "robot")),
     Kind("robot stopped", TIMEOUT, None, "program", ("stop", "robot")),
     Kind("monitor killed", HEARTBEAT, None, "program", ("kill", "monitor")),

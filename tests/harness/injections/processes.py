@@ -1,9 +1,10 @@
-"""Kill and pause real processes at the two ends of a bus, by the wall clock, and check the robot's side.
+"""Kill and pause real processes that share a bus, and check that the arm is stopped in time.
 
     python tests/harness/injections/processes.py --injections 20       # one or two minutes
 
-One process is a simulated robot with its safety monitor, one commands it, and one is a second safety monitor; this one
-checks the messages on the bus. Only killed processes are restarted. The exit code is 1 if a check failed.
+The first process is a simulated robot with its safety monitor, the second commands the robot, and the third is a second
+safety monitor. This process checks the messages on the bus. Killed processes are restarted, paused ones continue. The
+exit code is 1 if a check failed.
 """
 
 from __future__ import annotations
@@ -28,27 +29,28 @@ from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.joint_status import MAX_SENDERS
 
-STANDSTILL, STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.05, 0.06  # [rad/s], [s] of the robot's clock
-# Time by the robot's clock after which a robot that is gone is sent no command: detection, damping, zero torque [s].
-# Without a status a step takes one and a half periods.
+STANDSTILL = 0.05  # largest joint speed of a stopped arm [rad/s]
+STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.06  # from detection to standstill, from fault to detection [s, robot's clock]
+# Longest time by the robot's clock for which commands are sent after the robot was killed: detection, damping, zero
+# torque [s]. Without statuses a step of the controller takes one and a half periods.
 SILENT_AFTER = 0.95
-PAUSES = (0.1, 0.3, 1.0)  # by the robot's clock [s]
-MISSED_WITHIN, MISSED_FOR = 0.08, 0.9  # times between which a missing monitor must keep the arm stopped [s]
+PAUSES = (0.1, 0.3, 1.0)  # durations of pauses by the robot's clock [s]
+MISSED_WITHIN, MISSED_FOR = 0.08, 0.9  # the arm must be stopped between these times after the loss of a monitor [s]
 MOVING = 0.15  # speed of the fastest joint of a moving arm [rad/s]
 
 
 class Listener:
-    """Messages on the bus, with the robot's clock."""
+    """Record of the messages on the bus, with the robot's clock."""
 
     def __init__(self, url: str):
         self.lcm = DrakeLcm(url)
         self.clock, self.speed, self.torque = 0.0, 0.0, np.zeros(7)
         self.is_stopping: dict[int, bool] = {}  # by the number of a safety monitor
-        self.speeds: list[tuple[float, float]] = []
-        self.acting: list[float] = []
-        self.commands: list[tuple[float, float]] = []  # wall clock time of the arrival, largest torque
+        self.speeds: list[tuple[float, float]] = []  # robot's clock [s], speed of the fastest joint [rad/s]
+        self.stop_times: list[float] = []  # robot's clock at heartbeats of monitors that stop the arm [s]
+        self.commands: list[tuple[float, float]] = []  # wall clock time of the arrival [s], largest torque [Nm]
         self.limits = np.array(safety_limits(ArmControllerPlant(BncWorkcell()).plant, IiwaDriver).torque)
-        self.wrong: list[str] = []
+        self.failures: list[str] = []
         self.lcm.Subscribe(IiwaDriver.status_channel, self._status)
         self.lcm.Subscribe(IiwaDriver.command_channel, self._command)
         for number in range(MAX_SENDERS):
@@ -63,7 +65,7 @@ class Listener:
         command = IiwaDriver.decode_command(message)
         torque = None if command is None else command[0]
         if torque is None or len(torque) != 7 or not (np.abs(torque) <= self.limits + 1e-12).all():
-            self.wrong.append(f"sent {torque}")
+            self.failures.append(f"sent {torque}")
             return
         self.commands.append((time.monotonic(), float(np.abs(torque).max())))
 
@@ -71,26 +73,26 @@ class Listener:
         _, is_stopping, sender = HEARTBEAT_FORMAT.unpack(message)
         self.is_stopping[sender] = is_stopping
         if is_stopping:
-            self.acting.append(self.clock)
+            self.stop_times.append(self.clock)
 
     @property
-    def is_acting(self) -> bool:
+    def is_stopped_by_monitor(self) -> bool:
         """True if a safety monitor stops the arm."""
         return any(self.is_stopping.values())
 
     def listen(self, seconds: float) -> None:
-        """Receive for some wall clock time [s]."""
+        """Receive messages for `seconds` of wall clock time [s]."""
         end = time.monotonic() + seconds
-        while (left := end - time.monotonic()) > 0.0:
-            self.lcm.HandleSubscriptions(max(1, int(1000 * left)))
+        while (remaining := end - time.monotonic()) > 0.0:
+            self.lcm.HandleSubscriptions(max(1, int(1000 * remaining)))
 
     def wait_for_motion(self, seconds: float, rate: float) -> bool:
-        """Wait at most some wall clock time [s]; return True once the arm has moved for a while without a stop."""
+        """Wait for 0.7 s of motion (robot's clock) without a stop; return False after `seconds` of wall clock time."""
         end = time.monotonic() + seconds
         since = None
         while time.monotonic() < end:
             self.listen(0.01)
-            if self.is_acting:
+            if self.is_stopped_by_monitor:
                 since = None
             elif self.speed > MOVING:
                 since = since or time.monotonic()
@@ -100,7 +102,7 @@ class Listener:
 
     def clear(self) -> None:
         """Clear the records before an injection."""
-        for records in (self.speeds, self.acting, self.commands, self.wrong):
+        for records in (self.speeds, self.stop_times, self.commands, self.failures):
             records.clear()
         self.is_stopping.clear()
 
@@ -112,7 +114,7 @@ def robot(url: str, rate: float) -> subprocess.Popen:
 
 
 def controller(url: str, rate: float) -> subprocess.Popen:
-    """Start the commanding program."""
+    """Start the program that commands the robot."""
     program = str(Path(__file__).with_name("controller.py"))
     return subprocess.Popen([sys.executable, program, url, str(rate)], stderr=subprocess.DEVNULL)
 
@@ -123,27 +125,27 @@ def monitor(url: str, rate: float) -> subprocess.Popen:
     return subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
 
 
-def check_rest(listener: Listener, before: float, until: float) -> list[str]:
-    """Check that the commanding program stopped the arm after its safety monitor had gone; return the problems."""
+def check_controller_stop(listener: Listener, before: float, until: float) -> list[str]:
+    """Check that the controller stopped the arm after the loss of the safety monitor; return the failures."""
     first, last = before + MISSED_WITHIN + STOPPED_WITHIN, min(before + MISSED_FOR, until)
     fastest = max((speed for clock, speed in listener.speeds if first < clock < last), default=0.0)
-    return listener.wrong + ([f"the arm was not stopped: {fastest:.2f} rad/s"] if fastest > STANDSTILL else [])
+    return listener.failures + ([f"the arm was not stopped: {fastest:.2f} rad/s"] if fastest > STANDSTILL else [])
 
 
-def check_arm(listener: Listener, before: float, until: float) -> list[str]:
-    """Check that the safety monitor stopped the arm in time, by the robot's clock; return the problems."""
-    wrong = list(listener.wrong)
-    detected = next((clock for clock in listener.acting if clock > before), None)
+def check_monitor_stop(listener: Listener, before: float, until: float) -> list[str]:
+    """Check that the safety monitor stopped the arm in time by the robot's clock; return the failures."""
+    failures = list(listener.failures)
+    detected = next((clock for clock in listener.stop_times if clock > before), None)
     if detected is None:
         fastest = max((speed for clock, speed in listener.speeds if clock > before + DETECTED_WITHIN), default=0.0)
-        # The arm may have been stopped just before, for example because the machine is too busy for its controller.
-        return wrong if fastest < STANDSTILL else [*wrong, f"the arm was not stopped: {fastest:.2f} rad/s"]
+        # The controller may already have stopped the arm, for example because it missed a deadline on a busy machine.
+        return failures if fastest < STANDSTILL else [*failures, f"the arm was not stopped: {fastest:.2f} rad/s"]
     if detected - before > DETECTED_WITHIN:
-        wrong.append(f"detected after {1000 * (detected - before):.0f} ms")
+        failures.append(f"detected after {1000 * (detected - before):.0f} ms")
     after = [speed for clock, speed in listener.speeds if detected + STOPPED_WITHIN < clock < until]
     if after and max(after) > STANDSTILL:
-        wrong.append(f"{max(after):.3f} rad/s after {STOPPED_WITHIN} s")
-    return wrong
+        failures.append(f"{max(after):.3f} rad/s after {STOPPED_WITHIN} s")
+    return failures
 
 
 def main() -> int:
@@ -157,54 +159,54 @@ def main() -> int:
     listener, rng = Listener(url), np.random.default_rng(0)
     set_realtime_priority()
     start = {"robot": robot, "controller": controller, "monitor": monitor}
-    ends = {name: program(url, rate) for name, program in start.items()}
+    processes = {name: program(url, rate) for name, program in start.items()}
     counts: Counter[tuple[str, str]] = Counter()
-    kinds = [f"{name} {what}" for name in ("controller", "robot", "monitor") for what in ("killed", "held up")]
+    kinds = [f"{name} {action}" for name in ("controller", "robot", "monitor") for action in ("killed", "paused")]
     try:
         for number in range(arguments.injections):
             kind = kinds[number % len(kinds)]
-            process = kind.split()[0]
+            name = kind.split()[0]
             if not listener.wait_for_motion(90.0, rate):
-                print(f"WRONG  before {kind}: the arm does not move")
+                print(f"FAIL  before {kind}: the arm does not move")
                 return 1
             listener.listen(float(rng.uniform(0.0, 0.5)) / rate)
             listener.clear()
-            before, happened = listener.clock, time.monotonic()
+            before, wall_time = listener.clock, time.monotonic()
             if kind.endswith("killed"):
-                ends[process].kill()
-                ends[process].wait()
+                processes[name].kill()
+                processes[name].wait()
                 listener.listen(1.2 / rate)
                 until = listener.clock
-                ends[process] = start[process](url, rate)
+                processes[name] = start[name](url, rate)
             else:
-                held_up = float(rng.choice(PAUSES[1:] if process == "monitor" else PAUSES))
-                ends[process].send_signal(signal.SIGSTOP)
-                listener.listen(held_up / rate)
-                ends[process].send_signal(signal.SIGCONT)
+                pause = float(rng.choice(PAUSES[1:] if name == "monitor" else PAUSES))
+                processes[name].send_signal(signal.SIGSTOP)
+                listener.listen(pause / rate)
+                processes[name].send_signal(signal.SIGCONT)
                 until = listener.clock
                 listener.listen(0.2 / rate)
-            if process == "controller":
-                wrong = check_arm(listener, before, until)
-            elif process == "monitor":
-                wrong = check_rest(listener, before, until)
+            if name == "controller":
+                failures = check_monitor_stop(listener, before, until)
+            elif name == "monitor":
+                failures = check_controller_stop(listener, before, until)
             else:
-                wrong = list(listener.wrong)
-                late = [when for when, _ in listener.commands if when - happened > SILENT_AFTER / rate]
+                failures = list(listener.failures)
+                late = [arrival for arrival, _ in listener.commands if arrival - wall_time > SILENT_AFTER / rate]
                 if kind == "robot killed" and late:
-                    wrong.append(f"{len(late)} commands to a robot that is gone")
-            counts[kind, "wrong" if wrong else "well"] += 1
-            for problem in wrong:
-                print(f"WRONG  {kind}: {problem}", flush=True)
-        goes_on = listener.wait_for_motion(90.0, rate)
+                    failures.append(f"{len(late)} commands after the robot was killed")
+            counts[kind, "failed" if failures else "passed"] += 1
+            for failure in failures:
+                print(f"FAIL  {kind}: {failure}", flush=True)
+        is_moving = listener.wait_for_motion(90.0, rate)
     finally:
-        for end in ends.values():
-            end.send_signal(signal.SIGCONT)
-            end.kill()
-            end.wait()
+        for process in processes.values():
+            process.send_signal(signal.SIGCONT)
+            process.kill()
+            process.wait()
     for kind in kinds:
-        print(f"{kind:<22}{counts[kind, 'well']:>4} well {counts[kind, 'wrong']:>4} wrong")
-    print("the arm moves at the end" if goes_on else "WRONG  the arm does not move at the end")
-    return 0 if goes_on and not any(name == "wrong" for _, name in counts) else 1
+        print(f"{kind:<22}{counts[kind, 'passed']:>4} passed {counts[kind, 'failed']:>4} failed")
+    print("the arm moves at the end" if is_moving else "FAIL  the arm does not move at the end")
+    return 0 if is_moving and not any(outcome == "failed" for _, outcome in counts) else 1
 
 
 if __name__ == "__main__":

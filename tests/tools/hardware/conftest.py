@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from injections.together import Together
+from injections.stepped_robot import SteppedRobotClock
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
@@ -32,7 +32,7 @@ def make_executor(monkeypatch):
             skill = make_skill("BncConnector", policy, **OPTIONS, **options)
         task = EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
         monkeypatch.setattr(task, "num_steps", num_steps)
-        clock = Together(task.workcell(), lcm, start, has_monitor)
+        clock = SteppedRobotClock(task.workcell(), lcm, start, has_monitor)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return SkillExecutor(task, skill, clock, is_stop_requested), clock
 

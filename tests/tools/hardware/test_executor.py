@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from drake import lcmt_iiwa_command
-from injections.together import Together
+from injections.stepped_robot import SteppedRobotClock
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.config import EnvConfig
@@ -53,7 +53,7 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
     lcm, requests, imported, messages = DrakeLcm("memq://"), [], [], []
     task = EnvConfig.resolve("BncConnector", {}).make_task()
-    clock = Together(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
+    clock = SteppedRobotClock(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
     def policy(observation):
         requests.append(observation)

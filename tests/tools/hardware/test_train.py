@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
-from injections.together import Together
+from injections.stepped_robot import SteppedRobotClock
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.envs.assemble import build_task_diagram
@@ -49,7 +49,7 @@ def make(patch, start, **options):
         bus.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
         station = make_station(declared)
     task = build_task_diagram(declared, station, make_guidance(declared, station))
-    clock, keys, requests = Together(declared.workcell(), lcm, start), OperatorKeys(), []
+    clock, keys, requests = SteppedRobotClock(declared.workcell(), lcm, start), OperatorKeys(), []
     begin = declared.start_pose(np.random.default_rng(0))
     env = RobotEnv(
         task,
@@ -305,7 +305,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
 def ready(monkeypatch):
     """Return clock of a waiting arm, list of the questions, and function that starts a `robot_session`."""
     lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
-    clock, requests = Together(declared.workcell(), lcm, START), []
+    clock, requests = SteppedRobotClock(declared.workcell(), lcm, START), []
 
     @contextmanager
     def no_process(connection, *arguments):

@@ -1,4 +1,4 @@
-"""A simulated robot, its safety monitor and a hardware station, stepped in turn in one process."""
+"""Simulated robot, safety monitor and hardware station, stepped in turn in one process."""
 
 from guiderail.diagrams.hardware.driver import safety_limits
 from guiderail.diagrams.hardware.lcm import IiwaDriver
@@ -6,13 +6,13 @@ from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
 from guiderail.diagrams.hardware.monitor import SafetyMonitor
 
 
-class Together:
-    """Clock of a hardware station that steps the simulated robot before each step of the station.
+class SteppedRobotClock:
+    """Clock of a hardware station that steps a simulated robot before each step of the station.
 
     Attributes:
-        happens: Injected faults: functions, by the number of the step at which they are called.
+        happens: Injected events: functions, by the number of the step at which they are called.
         is_silent: True while the robot is not stepped.
-        clock: Time [s] passed to the station as its wall clock; None if it gets none.
+        clock: Wall clock time [s] passed to the station; None to pass none.
     """
 
     clock: float | None = None
@@ -51,7 +51,7 @@ class Together:
 
 
 def advance(simulator, station, time, clock=None):
-    """Advance a hardware station to `time` [s] with the newest status."""
+    """Advance a hardware station to `time` [s] after it has received the newest status."""
     simulator.AdvancePendingEvents()
     station.receive(simulator.get_mutable_context(), clock)
     simulator.AdvanceTo(time)
