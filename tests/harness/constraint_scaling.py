@@ -1,7 +1,7 @@
-"""Adversary against constraints whose rows are scaled: `python tests/harness/constraint_scaling.py [STEPS]`.
+"""Adversarial actions against constraints with scaled rows: `python tests/harness/constraint_scaling.py [STEPS]`.
 
-Every row of G and its c is scaled by a random factor from 1e-9 to 1e9. No command, fallbacks included, may violate a
-constraint by more than 1e-9 of the norm of its row.
+Every row of G and the corresponding entry of c are scaled by a random factor from 1e-9 to 1e9. No command, fallbacks
+included, may violate a constraint by more than 1e-9 of the norm of its row.
 """
 
 import sys
@@ -19,13 +19,13 @@ MOVING = ("moving box", "turning polygon", "jumping box")
 
 @dataclass
 class Result:
-    """Numbers of a campaign.
+    """Statistics of the executed steps.
 
     Attributes:
         steps: Number of executed steps.
         corrected: Number of steps at which a constraint of the window was active.
         fallbacks: Number of steps without a solution.
-        worst: Largest violation, relative to the norm of its row [unit of the output].
+        worst: Largest violation, divided by the norm of its row of G [unit of the output].
     """
 
     steps: int = 0
@@ -37,28 +37,28 @@ class Result:
 def half_spaces(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Return G (N, F, 2) and c (N, F) around a moving center, rows of unit norm."""
     phase = np.linspace(0.0, 1.0, STEPS)
-    moves, turns = kind in MOVING, kind == "turning polygon"
+    is_moving, is_turning = kind in MOVING, kind == "turning polygon"
     sides = 4 if kind.endswith("box") else int(rng.integers(3, 8))
     angles = np.arange(sides) * 2 * np.pi / sides + (0.0 if kind.endswith("box") else rng.uniform(0.0, 2 * np.pi))
-    angles = angles + np.outer(phase, np.ones(sides)) * (rng.uniform(-2.0, 2.0) if turns else 0.0)
+    angles = angles + np.outer(phase, np.ones(sides)) * (rng.uniform(-2.0, 2.0) if is_turning else 0.0)
     G = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     if kind.endswith("box"):
         G = np.round(G)
-    center = np.column_stack([0.2 * np.sin(2 * np.pi * phase), 0.2 * np.cos(2 * np.pi * phase)]) * moves
-    if kind == "jumping box":  # no smooth window satisfies constraints that do not overlap
+    center = np.column_stack([0.2 * np.sin(2 * np.pi * phase), 0.2 * np.cos(2 * np.pi * phase)]) * is_moving
+    if kind == "jumping box":  # no smooth window satisfies constraints without overlap
         center = center + np.outer(np.arange(STEPS) % 8 == 7, [5.0, 0.0])
-    width = rng.uniform(0.02, 0.3) + (rng.uniform(0.0, 0.2) * np.sin(7.0 * phase) ** 2 if moves else 0.0 * phase)
+    width = rng.uniform(0.02, 0.3) + (rng.uniform(0.0, 0.2) * np.sin(7.0 * phase) ** 2 if is_moving else 0.0 * phase)
     return G, np.einsum("nfo,no->nf", G, center) - width[:, None]
 
 
 def actions(rng: np.random.Generator) -> np.ndarray:
-    """Return actions (N, 2) of one size, from 1 to 1e5, whose sign changes never, seldom, often or at every step."""
-    turns = np.cumsum(rng.uniform(size=(STEPS, 2)) < rng.choice([0.0, 0.05, 0.3, 1.0]), axis=0) % 2
-    return (1.0 - 2.0 * turns) * rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(0.0, 5.0)
+    """Return actions (N, 2) of a random constant size from 1 to 1e5, with sign changes at no, some or all steps."""
+    parity = np.cumsum(rng.uniform(size=(STEPS, 2)) < rng.choice([0.0, 0.05, 0.3, 1.0]), axis=0) % 2
+    return (1.0 - 2.0 * parity) * rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(0.0, 5.0)
 
 
 def attack(steps: int, seed: int = 0) -> dict[str, Result]:
-    """Execute at least `steps` steps; return the results of each kind of constraints."""
+    """Execute at least `steps` steps; return the result for each kind of constraints."""
     rng, results, sequences = np.random.default_rng(seed), {kind: Result() for kind in KINDS}, 0
     while sum(result.steps for result in results.values()) < steps:
         kind = KINDS[sequences % len(KINDS)]
@@ -80,7 +80,7 @@ def attack(steps: int, seed: int = 0) -> dict[str, Result]:
 
 
 def run(primitive: LcNsKmp, sequence: np.ndarray, rows: tuple[np.ndarray, ...], result: Result) -> None:
-    """Execute a sequence of actions (N, 2) as `LcNsKmpSystem` does and add its numbers to a result."""
+    """Execute a sequence of actions (N, 2) like `LcNsKmpSystem`, and add its statistics to a result."""
     G, c, norms = rows
     last = primitive.constraints.nearest(primitive.reference.means[0])
     past = np.tile(last, (primitive.history, 1))

@@ -1,12 +1,13 @@
-"""Hashes of seeded episodes of every task, guidance, station and difficulty, to check that a refactoring keeps them.
+"""Hashes of seeded episodes of all tasks, guidance, stations and difficulties, to be compared after a refactoring.
 
     python tests/harness/episode_hashes.py write before.json     # some minutes
     python tests/harness/episode_hashes.py write after.json      # in the changed tree, on the same machine
     python tests/harness/episode_hashes.py compare before.json after.json
 
-A hash covers observations, rewards, ends, violations, forces and fallbacks of two episodes with smooth random actions.
-The same tree gives the same hashes on one machine; other processors round differently. `compare` prints every case that
-differs or is missing and exits with 1 if there is one. `--task`, `--guidance` and `--station` select cases.
+A hash covers observations, rewards, terminations, violations, forces and fallbacks of two episodes with smooth random
+actions. The same tree gives the same hashes on one machine; other processors round differently. `compare` prints every
+case that differs or is missing; the exit code is 1 if there is such a case. `--task`, `--guidance` and `--station`
+select cases.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import robot_names
 
-STEPS = 60  # environment steps of an episode, at most
+STEPS = 60  # largest number of environment steps of an episode
 INFO = ("constraint_violation", "measured_violation", "contact_force", "fallback")
-FURTHER: list[tuple[str, dict[str, Any]]] = [
+EXTRA_CASES: list[tuple[str, dict[str, Any]]] = [
     ("BncConnector", {"guidance": "kgrl", "wrench_noise": [0.2, 0.01], "wrench_delay": 2, "action_repeat": 5}),
     ("BncConnector", {"guidance": "skgrl", "reward": "shaped"}),
     ("BncConnector", {"guidance": "skgrl", "observation": "center_of_pressure", "action_repeat": 5}),
@@ -50,7 +51,7 @@ def all_cases() -> list[tuple[str, dict[str, Any]]]:
                 for difficulty in ("standard", "hard"):
                     common = {"guidance": guidance, "difficulty": difficulty, "action_repeat": 5}
                     cases.append((task, common | options))
-    return cases + FURTHER
+    return cases + EXTRA_CASES
 
 
 def _station_options(task: str, stations: list[str]) -> Iterator[dict[str, Any]]:
@@ -67,7 +68,7 @@ def _station_options(task: str, stations: list[str]) -> Iterator[dict[str, Any]]
 
 
 def case_name(task: str, options: dict[str, Any]) -> str:
-    """Return the name of a case."""
+    """Return the name of a case: its task and sorted options."""
     return " ".join([task, *(f"{key}={value}" for key, value in sorted(options.items()))])
 
 
@@ -76,8 +77,8 @@ def episode_hash(task: str, options: dict[str, Any], steps: int = STEPS) -> str:
 
     Args:
         task: Name of the task.
-        options: Options of its environment.
-        steps: Environment steps of an episode, at most.
+        options: Options of the environment.
+        steps: Largest number of environment steps of an episode.
     """
     try:
         env = gymnasium.make(f"guiderail/{task}-v0", disable_env_checker=True, **options)
@@ -108,7 +109,7 @@ def write(path: Path, selected: dict[str, str | None]) -> None:
 
     Args:
         path: File to write.
-        selected: Values of `task`, `guidance` and `station`; None selects all.
+        selected: Values of `task`, `guidance` and `station`; None selects all values.
     """
     hashes = {}
     for task, options in all_cases():
@@ -121,7 +122,7 @@ def write(path: Path, selected: dict[str, str | None]) -> None:
 
 
 def differences(first: dict[str, str], second: dict[str, str]) -> list[str]:
-    """Return a line for each case that differs or that only one of the two has."""
+    """Return a line for each case that differs or is missing in one of the results."""
     names = sorted({*first, *second})
     return [
         f"{name}: {first.get(name, 'missing')} → {second.get(name, 'missing')}"
@@ -134,13 +135,13 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
-    writing = commands.add_parser("write", help="run the episodes and write their hashes")
-    writing.add_argument("file", type=Path)
+    write_parser = commands.add_parser("write", help="run the episodes and write their hashes")
+    write_parser.add_argument("file", type=Path)
     for key in ("task", "guidance", "station"):
-        writing.add_argument(f"--{key}")
-    comparing = commands.add_parser("compare", help="compare two files of hashes")
-    comparing.add_argument("first", type=Path)
-    comparing.add_argument("second", type=Path)
+        write_parser.add_argument(f"--{key}")
+    compare_parser = commands.add_parser("compare", help="compare two files of hashes")
+    compare_parser.add_argument("first", type=Path)
+    compare_parser.add_argument("second", type=Path)
     args = parser.parse_args(arguments)
     if args.command == "write":
         write(args.file, {key: getattr(args, key) for key in ("task", "guidance", "station")})

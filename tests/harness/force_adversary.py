@@ -1,11 +1,11 @@
-"""Adversarial actions against the force limit: random, held, extreme and bang-bang, on every station and guidance.
+"""Adversarial actions against the force limit: random, constant, extreme and bang-bang, for all stations and guidance.
 
     python tests/harness/force_adversary.py --steps 100000            # an hour on one core; 0 stops are expected
     python tests/harness/force_adversary.py --steps 5000 --bounded false --task BncConnector
 
-Prints a line of JSON for each case: control steps, terminations, the least content of the energy tank, and in relation
-to the episode's limit the largest impedance force, measured contact force, and contact force of a single plant step,
-which is not filtered. Exit code 1 if an episode ended by force.
+A line of JSON is printed for each case: control steps, terminations, the smallest energy in the tank [J], and three
+forces relative to the limit of the episode. These are the largest impedance force, the largest measured contact force,
+and the largest unfiltered contact force of a plant step. The exit code is 1 if an episode ended by force.
 """
 
 from __future__ import annotations
@@ -24,34 +24,34 @@ from guiderail.diagrams.envs.make import make_env
 
 GUIDANCE = {"BncConnector": ("kgrl", "skgrl", "residual"), "GridClamp": ("sct", "residual")}
 STATIONS = ("gantry", "arm", "mujoco")
-ATTACKS = ("random", "held", "extreme", "bang_bang")
+ATTACKS = ("random", "constant", "extreme", "bang_bang")
 SEED = 2_100_000
 
 
 def attack(kind: str, rng: np.random.Generator, size: int) -> Callable[[], np.ndarray]:
     """Return a function that returns the next action (size,) of an attack."""
-    held = rng.uniform(-1.0, 1.0, size) if kind == "held" else rng.choice([-1.0, 1.0], size)
-    if kind in ("held", "extreme"):
-        return lambda: held
+    constant = rng.uniform(-1.0, 1.0, size) if kind == "constant" else rng.choice([-1.0, 1.0], size)
+    if kind in ("constant", "extreme"):
+        return lambda: constant
     if kind == "random":
         return lambda: rng.uniform(-1.0, 1.0, size)
     return lambda: rng.choice([-1.0, 1.0], size)
 
 
 def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
-    """Attack one environment for a number of control steps; return the outcome."""
+    """Run attacks in an environment for at least `steps` control steps; return the statistics."""
     env = make_env(task, action_repeat=5, **options)
-    done, endings, force, contact, step_contact, energy = 0, Counter[str](), 0.0, 0.0, 0.0, np.inf
+    done, terminations, force, contact, step_contact, energy = 0, Counter[str](), 0.0, 0.0, 0.0, np.inf
     for episode in itertools.count():
         rng = np.random.default_rng([SEED, episode])
         act = attack(ATTACKS[episode % len(ATTACKS)], rng, env.action_space.shape[0])
         *_, info = env.reset(seed=SEED + episode, options={"new_run": True})
-        limit, over = info.get("force_limit", env.task.declaration.collision.above), False
+        limit = info.get("force_limit", env.task.declaration.collision.above)
+        terminated = truncated = False
         unfiltered = watch_contact(env)
-        while not over:
+        while not (terminated or truncated):
             *_, terminated, truncated, info = env.step(act())
-            over = terminated or truncated
-        endings[info["termination"]] += 1
+        terminations[info["termination"]] += 1
         done += info["control_steps"]
         force = max(force, float(env.trace.force.max()) / limit)
         contact = max(contact, float(np.linalg.norm(env.trace.signals["wrench"][:, :3], axis=1).max()) / limit)
@@ -62,7 +62,7 @@ def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
     env.close()
     return {
         "steps": done,
-        "endings": dict(endings),
+        "terminations": dict(terminations),
         "force_per_limit": round(force, 3),
         "contact_per_limit": round(contact, 3),
         "step_contact_per_limit": round(step_contact, 3),
@@ -71,7 +71,7 @@ def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
 
 
 def watch_contact(env: object) -> list[float]:
-    """Return a list to which every step adds the norm of the contact forces in Drake's plant [N]; MuJoCo has none."""
+    """Return a list to which every step of Drake's plant adds the norm of the contact forces [N]; [0] in MuJoCo."""
     plant = env.task.diagram.GetSubsystemByName("station").plant
     contact, forces = plant.get_contact_results_output_port(), [0.0]
 
@@ -79,7 +79,8 @@ def watch_contact(env: object) -> list[float]:
         results = contact.Eval(plant.GetMyContextFromRoot(root))
         surfaces = map(results.hydroelastic_contact_info, range(results.num_hydroelastic_contacts()))
         points = map(results.point_pair_contact_info, range(results.num_point_pair_contacts()))
-        pushes = [one.F_Ac_W().translational() for one in surfaces] + [-one.contact_force() for one in points]
+        pushes = [surface.F_Ac_W().translational() for surface in surfaces]
+        pushes += [-point.contact_force() for point in points]
         forces.append(float(np.linalg.norm(np.sum(pushes, axis=0))))
         return EventStatus.DidNothing()
 
@@ -89,7 +90,7 @@ def watch_contact(env: object) -> list[float]:
 
 
 def tank_content(env: object) -> float:
-    """Return the energy in the station's tank [J]; infinite if it has none."""
+    """Return the energy in the station's tank [J], infinite without a tank."""
     station = env.task.diagram.GetSubsystemByName("station")
     if not station.HasSubsystemNamed("tank"):
         return np.inf
@@ -100,7 +101,7 @@ def tank_content(env: object) -> float:
 def main(arguments: list[str] | None = None) -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--steps", type=int, default=100_000, help="control steps, of all cases together")
+    parser.add_argument("--steps", type=int, default=100_000, help="control steps of all cases together")
     parser.add_argument("--bounded", choices=("true", "false"), default="true", help="option bounded_force")
     parser.add_argument("--task", choices=sorted(GUIDANCE), help="one task; default: all")
     parser.add_argument("--station", choices=STATIONS, help="one station; default: all")
@@ -117,7 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
     stops = total = 0
     for task, options in cases:
         result = run_case(task, max(args.steps // len(cases), 1), bounded_force=args.bounded == "true", **options)
-        stops += result["endings"].get("collision", 0)
+        stops += result["terminations"].get("collision", 0)
         total += result["steps"]
         print(json.dumps({"task": task, **options, **result}), flush=True)
     print(json.dumps({"steps": total, "stops": stops}))

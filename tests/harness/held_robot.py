@@ -1,8 +1,8 @@
-"""Robot that is held for two seconds: `python tests/harness/held_robot.py [--episodes N] [--held-from T]`.
+"""Episodes in which the robot is held for two seconds: `python tests/harness/held_robot.py [--episodes N]`.
 
-The scripted policy acts on the hard connector on the gantry, guided by KGRL. At a given instant all joints of the
-gantry are locked for two seconds; then the robot is free again. The motion advances with the clock or with the robot's
-state. The episodes of both have the same length and the same conditions.
+The scripted policy acts on the hard connector on the gantry, guided by KGRL. All joints of the gantry are locked for
+two seconds. The guided motion advances with the clock or with the robot's state. The episodes of both kinds have the
+same length and the same conditions.
 """
 
 import argparse
@@ -15,14 +15,14 @@ from guiderail.diagrams.tasks.bnc_connector.task import scripted_center_of_press
 from guiderail.models.common.arrays import round_period
 
 PROGRESS = {
-    # Progress by the clock, with episodes as long as those of "state": no robot exceeds this tolerance.
+    # No robot exceeds this tolerance, so progress follows the clock. The episodes are as long as those of "state".
     "clock": {"progress": "state", "progress_tolerance": (1e3, 1e3)},
     "state": {"progress": "state"},
 }
 
 
 def set_held(env: object, is_held: bool) -> None:
-    """Lock or free all joints of the gantry."""
+    """Lock or unlock all joints of the gantry."""
     diagram = env.task.diagram
     plant = diagram.GetSubsystemByName("station").plant
     context = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
@@ -34,25 +34,31 @@ def set_held(env: object, is_held: bool) -> None:
 
 
 def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> dict:
-    """Run an episode with a hold; return the last `info` with the time by which the motion was late."""
+    """Run an episode in which the robot is held; return the last `info` and, as "late", the delay of the motion [s].
+
+    Args:
+        env: Environment.
+        seed: Seed of the episode.
+        begin: Time at which the robot is locked [s]; None: never.
+        seconds: Time for which the robot is locked [s].
+    """
     period = env.task.control_period
     first = None if begin is None else round(begin / period)
     last = None if begin is None else round((begin + seconds) / period)
     observation, info = env.reset(seed=seed, options={"held_out": True})
-    finished = False
-    while not finished:
+    terminated = truncated = False
+    while not (terminated or truncated):
         step = info["control_steps"]
         if step in (first, last):
             set_held(env, step == first)
         observation, _, terminated, truncated, info = env.step(scripted_center_of_pressure(observation))
-        finished = terminated or truncated
     port = env.task.diagram.GetOutputPort("motion_time")
     late = round_period(period) * info["control_steps"] - float(port.Eval(env.simulator.get_context())[0])
     return {**info, "late": late}
 
 
 def run_episodes(progress: str, begin: float | None, episodes: int, seconds: float = 2.0) -> list[dict]:
-    """Return the last infos of episodes with one kind of progress, held from an instant [s] or not at all."""
+    """Return the results of `run_episode` for several seeds and one kind of progress."""
     env = make_env("BncConnector", guidance="kgrl", difficulty="hard", **PROGRESS[progress])
     infos = [run_episode(env, 1000 + k, begin, seconds) for k in range(episodes)]
     env.close()
@@ -62,10 +68,16 @@ def run_episodes(progress: str, begin: float | None, episodes: int, seconds: flo
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=50)
-    parser.add_argument("--held-from", type=float, nargs="*", default=[2.0, 4.0], help="[s]; none: never held")
+    parser.add_argument(
+        "--held-from",
+        type=float,
+        nargs="*",
+        default=[2.0, 4.0],
+        help="times of locking [s]; without a value the robot is never locked",
+    )
     parser.add_argument("--progress", choices=PROGRESS, nargs="+", default=list(PROGRESS))
     options = parser.parse_args()
-    print("progress | held from [s] | success | terminations | late at the end [s] | peak force [N]")
+    print("progress | held from [s] | success | terminations | delay at the end [s] | peak force [N]")
     for begin in options.held_from or [None]:
         for progress in options.progress:
             infos = run_episodes(progress, begin, options.episodes)

@@ -1,7 +1,8 @@
-"""Adversary against the joint limits of an arm: `python tests/harness/joint_adversary.py [STEPS [SEED]]`.
+"""Adversarial poses against the joint limits of an arm: `python tests/harness/joint_adversary.py [STEPS [SEED]]`.
 
-An iiwa under impedance control follows desired poses anywhere around the workcell, in all orientations, behind a
-`MotionConstraintFilter` with a `JointRange`. Neither commanded nor simulated joint positions may exceed a limit.
+An iiwa under impedance control follows desired poses all around the workcell, in all orientations. A
+`MotionConstraintFilter` with a `JointRange` filters the poses. Neither commanded nor simulated joint positions may
+exceed a limit.
 """
 
 import sys
@@ -19,22 +20,22 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.command_filter import CommandFilter
 
 START = np.array([0.0, 0.0, 0.1, 0.7, 0.0, 0.0])
-REACH = np.array([0.5, 0.5, 0.4, 2.5, 0.8, 0.8])  # of desired poses around the start [m, rad]
-ABOVE = 0.05  # lower bound of the height, above the fixture [m]
-MARGIN = 0.2  # [rad]
-SPEED = np.array([0.1, 0.1, 0.1, 0.3, 0.3, 0.3])  # [m/s, rad/s]
+REACH = np.array([0.5, 0.5, 0.4, 2.5, 0.8, 0.8])  # largest offsets of the desired poses from the start [m, rad]
+MIN_HEIGHT = 0.05  # lower bound of the commanded height, above the fixture [m]
+MARGIN = 0.2  # margin of commanded joint positions to the limits [rad]
+SPEED = np.array([0.1, 0.1, 0.1, 0.3, 0.3, 0.3])  # largest commanded speed [m/s, rad/s]
 
 
 @dataclass
 class Result:
-    """Numbers of a campaign.
+    """Statistics of the executed steps.
 
     Attributes:
         steps: Number of control steps.
         commanded: Largest excess of a commanded joint position over a limit reduced by the margin [rad].
-        measured: Largest excess of a simulated joint over its limits [rad]; negative inside.
+        measured: Largest excess of a simulated joint position over a limit [rad]; negative within the limits.
         near: Number of commands within 0.01 rad of a limit reduced by the margin.
-        fallbacks: Number of steps at which only braking was left.
+        fallbacks: Number of steps at which the filter intervened.
     """
 
     steps: int = 0
@@ -49,7 +50,7 @@ def attack(steps: int, seed: int = 0, *, constrained: bool = True) -> Result:
     rng, result, builder = np.random.default_rng(seed), Result(), DiagramBuilder()
     station = builder.AddNamedSystem("station", ArmStation(BncWorkcell()))
     joints = station.joint_range(MARGIN, 0.05)
-    linear = LinearConstraints(np.eye(6)[2:3], np.array([ABOVE]))
+    linear = LinearConstraints(np.eye(6)[2:3], np.array([MIN_HEIGHT]))
     motion = MotionConstraints(linear, max_speed=SPEED, state=[joints] if constrained else [])
     system = CommandFilter(MotionConstraintFilter(motion, station.control_period), station.control_period)
     builder.AddNamedSystem("filter", system)
@@ -63,20 +64,20 @@ def attack(steps: int, seed: int = 0, *, constrained: bool = True) -> Result:
     station.set_pose(context, START)
     simulator.Initialize()
     plant, model = station.plant, station.arm.model
-    indices = [plant.get_joint(i) for i in plant.GetJointIndices(model) if plant.get_joint(i).num_positions()]
-    lower = np.concatenate([joint.position_lower_limits() for joint in indices])
-    upper = np.concatenate([joint.position_upper_limits() for joint in indices])
-    own, state = system.GetMyContextFromRoot(context), plant.GetMyContextFromRoot(context)
+    model_joints = [plant.get_joint(i) for i in plant.GetJointIndices(model) if plant.get_joint(i).num_positions()]
+    lower = np.concatenate([joint.position_lower_limits() for joint in model_joints])
+    upper = np.concatenate([joint.position_upper_limits() for joint in model_joints])
+    filter_context, plant_context = system.GetMyContextFromRoot(context), plant.GetMyContextFromRoot(context)
     for k in range(steps):
         if k % 200 == 0:
             desired.GetMutableData().set_value(START + REACH * rng.choice([-1.0, 1.0, rng.uniform(-1.0, 1.0)], 6))
         simulator.AdvanceTo((k + 1) * station.control_period)
-        violation = joints.violation(system.get_safe_pose_output_port().Eval(own))
+        violation = joints.violation(system.get_safe_pose_output_port().Eval(filter_context))
         result.commanded = max(result.commanded, violation)
         result.near += violation > -0.01
-        q = plant.GetPositions(state, model)
+        q = plant.GetPositions(plant_context, model)
         result.measured = max(result.measured, float(np.maximum(lower - q, q - upper).max()))
-        result.fallbacks += system.get_intervention_output_port().Eval(own)[0] > 0.0
+        result.fallbacks += system.get_intervention_output_port().Eval(filter_context)[0] > 0.0
         result.steps += 1
     return result
 

@@ -1,8 +1,8 @@
-"""Adversary against shapes, speed and acceleration: `python tests/harness/motion_adversary.py [STEPS [SEED]]`.
+"""Adversarial actions against obstacles and motion limits: `python tests/harness/motion_adversary.py [STEPS [SEED]]`.
 
-Spherical obstacles are placed at sampled positions in the narrow passage. Full actions push against the
-obstacle, or actions change at random. No command, fallbacks included, and no straight line between two commands may
-enter an obstacle. This is checked by formulas that share no code with the constraints.
+Spherical obstacles are placed at sampled positions in the narrow passage. Actions of full size push against the
+obstacle, or change at random. No command, fallbacks included, and no straight line between two commands may enter an
+obstacle. The check uses formulas that share no code with the constraints.
 """
 
 import sys
@@ -19,7 +19,7 @@ from guiderail.models.primitives import LcNsKmp
 from guiderail.models.templates.schema import parse_template
 
 KINDS = ("reference", "command", "command, smooth", "speed", "speed and acceleration", "template")
-LIMITS = {"speed": (0.3, np.inf), "speed and acceleration": (0.3, 2.0)}  # [m/s], [m/s²]
+LIMITS = {"speed": (0.3, np.inf), "speed and acceleration": (0.3, 2.0)}  # speed [m/s], acceleration [m/s²]
 TEMPLATE = """
 name: free
 inputs: 3
@@ -42,11 +42,11 @@ EPISODES = 5  # number of episodes with each obstacle
 
 @dataclass
 class Result:
-    """Numbers of a campaign.
+    """Statistics of the executed steps.
 
     Attributes:
         steps: Number of executed steps.
-        touching: Number of commands within a tenth of a millimeter of the obstacle.
+        touching: Number of commands closer than 0.1 mm to the obstacle.
         fallbacks: Number of steps with a fallback.
         nearest: Smallest distance of a command from the obstacle [m].
         nearest_between: Smallest distance between the obstacle and a straight line from one command to the next [m].
@@ -67,8 +67,8 @@ class Result:
     def add(self, commands: np.ndarray, center: np.ndarray, radius: float, period: float, outside: float) -> None:
         """Add the commands (N, D) of an episode; the first row is only the start of the first move."""
         moves = np.diff(commands, axis=0)
-        share = ((center - commands[:-1]) * moves).sum(axis=1) / np.maximum((moves**2).sum(axis=1), 1e-300)
-        between = commands[:-1] + np.clip(share, 0.0, 1.0)[:, None] * moves
+        fraction = ((center - commands[:-1]) * moves).sum(axis=1) / np.maximum((moves**2).sum(axis=1), 1e-300)
+        between = commands[:-1] + np.clip(fraction, 0.0, 1.0)[:, None] * moves
         distances = np.linalg.norm(commands[1:] - center, axis=1) - radius
         self.steps += len(moves)
         self.touching += int((distances < 1e-4).sum())
@@ -80,7 +80,7 @@ class Result:
 
 
 def push(rng: np.random.Generator, style: int, last: np.ndarray, center: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """Return an action (D,) in [−1, 1]: towards the obstacle, around it, random, or as before."""
+    """Return an action (D,) in [−1, 1]: towards or around the obstacle, random, or the previous action `before`."""
     towards = (center - last) / max(float(np.linalg.norm(center - last)), 1e-12)
     around = np.roll(towards, 1) * np.where(np.arange(len(towards)) % 2, 1.0, -1.0)
     choices = (towards, towards + around, np.sign(rng.uniform(-1.0, 1.0, len(last))), before, around)
@@ -88,7 +88,7 @@ def push(rng: np.random.Generator, style: int, last: np.ndarray, center: np.ndar
 
 
 def attack(steps: int, seed: int = 0) -> dict[str, Result]:
-    """Execute at least `steps` steps; return the results of each kind of constraints."""
+    """Execute at least `steps` steps; return the result for each kind of constraints."""
     rng, results, rounds = np.random.default_rng(seed), {kind: Result() for kind in KINDS}, 0
     config = make_prior_knowledge("NarrowPassage").demonstrations
     while sum(result.steps for result in results.values()) < steps:
@@ -102,14 +102,14 @@ def attack(steps: int, seed: int = 0) -> dict[str, Result]:
 
 
 def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius: float, result: Result) -> None:
-    """Execute episodes around one obstacle near the motion, with sKGRL if `kind` is smooth, otherwise with KGRL."""
+    """Execute episodes with an obstacle near the motion, with sKGRL if `kind` is smooth, otherwise with KGRL."""
     reference, history = config.reference, 4 if kind == "command, smooth" else 0
     step = int(rng.integers(30, reference.num_steps - 30))
-    # The obstacle is to the side of the mean. If commands are constrained, its center may also be on the mean.
+    # The obstacle is next to the mean. If commands are constrained, its center may also be on the mean.
     aside = rng.choice([-1.0, 1.0], 2) * rng.uniform(0.5 if kind == "reference" else 0.0, 1.5, 2) * radius
     sphere = Sphere(reference.means[step] + aside, radius)
     if sphere.distance(reference.means[0]) < 0.1:
-        return  # the start might be inside
+        return  # the sampled start could be inside the obstacle
     constraints, motion = config.constraints, None
     if kind == "reference":
         constraints = linearize([sphere], reference.means, constraints)
@@ -125,7 +125,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
         stepper = primitive.start(start, gain, motion=motion)
         commands, outside = [start] if motion else [], -np.inf
         for n in range(reference.num_steps):
-            if style == 0:  # action at which the primitive without constraints commands the center
+            if style == 0:  # action for which the unconstrained primitive commands the center of the obstacle
                 _, effect, mean = primitive.linear_response(n)
                 action = np.linalg.solve(effect, sphere.center - mean) / gain if not history else action
                 action = np.clip(action + 0.1 * rng.standard_normal(2), -30.0, 30.0)
@@ -139,9 +139,11 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
 
 
 def attack_template(rng: np.random.Generator, radius: float, result: Result, period: float = 0.02) -> None:
-    """Execute episodes of a template that moves freely in a box around one obstacle."""
+    """Execute episodes of a template with free motion in a box around an obstacle."""
     template = parse_template(TEMPLATE, radius_m=radius)
-    center = np.append(rng.uniform([0.1, 0.15], [0.5, 0.9]), 0.0)  # farther from the start than the largest radius
+    center = np.append(
+        rng.uniform([0.1, 0.15], [0.5, 0.9]), 0.0
+    )  # the distance from the start exceeds the largest radius
     frames = {"ball": RigidTransform(center)}
     for _ in range(EPISODES):
         style, action, X = int(rng.integers(5)), np.zeros(3), RigidTransform([0.3, 0.05, 0.0])
@@ -158,7 +160,7 @@ def attack_template(rng: np.random.Generator, radius: float, result: Result, per
 
 
 def is_violated(kind: str, result: Result) -> bool:
-    """Return True if a command, or the straight line to it, was in the obstacle, or a limit was exceeded."""
+    """Return True if a command or a line between commands was inside the obstacle, or a limit was exceeded."""
     speed, acceleration = LIMITS.get(kind, (np.inf, np.inf))
     return (
         min(result.nearest, result.nearest_between) < 0.0

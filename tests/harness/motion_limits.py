@@ -1,8 +1,8 @@
 """Adversarial commands against the limits of velocity, acceleration and jerk of `PoseMotionLimiter`.
 
-The reached values are finite differences of the emitted poses, which do not depend on the trajectory generator: a
-difference of order n divided by the n-th power of the period is an average of the n-th derivative, and cannot exceed
-its largest value. The exit code is 1 if a limit is exceeded.
+The largest values are computed from finite differences of the emitted poses, independently of the trajectory generator.
+The n-th difference divided by the n-th power of the period is an average of the n-th derivative, and cannot exceed the
+maximum of the derivative. The exit code is 1 if a limit is exceeded.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
 from oracles.franka import FRANKA_LIMITS
 
 START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])
-CHUNK = 5000  # commands between two checks
-TOLERANCE = 1e-6  # relative, of the finite differences
+CHUNK = 5000  # number of commands between two checks
+TOLERANCE = 1e-6  # relative tolerance of the finite differences
 Policy = Callable[[np.random.Generator], Iterator[np.ndarray]]
 
 
 def jumps(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Jump at random instants by random amounts from micrometers to meters."""
+    """Yield poses that jump at random instants by micrometers to meters."""
     desired = START
     while True:
         if rng.random() < 0.1:
@@ -40,8 +40,8 @@ def jumps(rng: np.random.Generator) -> Iterator[np.ndarray]:
         yield desired
 
 
-def white(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Command a new random pose in every period."""
+def white_noise(rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Yield a new random pose in every period."""
     scale = 0.3
     while True:
         if rng.random() < 0.002:
@@ -50,7 +50,7 @@ def white(rng: np.random.Generator) -> Iterator[np.ndarray]:
 
 
 def reversals(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Alternate between two far corners, after random half periods of 1 to 199 commands."""
+    """Yield alternating distant poses, with random half periods of 1 to 199 commands."""
     while True:
         half, corner = int(rng.integers(1, 200)), rng.choice([-1.0, 1.0], 6) * [0.5, 0.5, 0.5, 1.0, 0.5, 1.0]
         for k in range(10 * half):
@@ -58,19 +58,19 @@ def reversals(rng: np.random.Generator) -> Iterator[np.ndarray]:
 
 
 def invalid(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Mix jumps with values that are not finite, huge angles and half turns."""
+    """Yield poses that jump, mixed with non-finite values, huge angles and half turns."""
     for desired in jumps(rng):
         if rng.random() < 0.3:
             desired = desired.copy()
             values = [np.nan, np.inf, -np.inf, 1e300, np.pi, -np.pi, 1e6]
             desired[rng.integers(6)] += rng.choice(values)
             if abs(desired[0]) > 1e3 or abs(desired[1]) > 1e3 or abs(desired[2]) > 1e3:
-                desired[:3] = np.nan  # a finite position that far away would be approached, and is not what is tested
+                desired[:3] = np.nan  # otherwise the limiter would approach the distant position
         yield desired
 
 
 def oscillations(rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Follow sinusoids of all frequencies up to half the command rate."""
+    """Yield sinusoids of all frequencies up to half the command rate."""
     while True:
         frequency, phase = rng.uniform(0.01, np.pi, 6), rng.uniform(0, 2 * np.pi, 6)
         amplitude = rng.choice([1e-4, 1e-2, 0.2]) * rng.uniform(0, 1, 6)
@@ -78,12 +78,14 @@ def oscillations(rng: np.random.Generator) -> Iterator[np.ndarray]:
             yield START + amplitude * np.sin(frequency * k + phase)
 
 
-POLICIES: dict[str, Policy] = {one.__name__: one for one in (jumps, white, reversals, invalid, oscillations)}
+POLICIES: dict[str, Policy] = {
+    policy.__name__: policy for policy in (jumps, white_noise, reversals, invalid, oscillations)
+}
 LIMITS = {"franka": FRANKA_LIMITS, "fci": FciDriver.motion_limits, "ur": UR_MOTION_LIMITS}
 
 
-def reached(poses: np.ndarray, period: float) -> np.ndarray:
-    """Return the largest norms of velocity, acceleration and jerk, (2, 3), linear and angular, of poses (N, 6)."""
+def largest_derivatives(poses: np.ndarray, period: float) -> np.ndarray:
+    """Return the largest velocity, acceleration and jerk of poses (N, 6), (2, 3), linear part first."""
     turns = Rotation.from_euler("xyz", poses[:, [5, 4, 3]])
     rates = (np.diff(poses[:, :3], axis=0) / period, (turns[1:] * turns[:-1].inv()).as_rotvec() / period)
     return np.array(
@@ -92,7 +94,7 @@ def reached(poses: np.ndarray, period: float) -> np.ndarray:
 
 
 def attack(policy: Policy, limits: MotionLimits, period: float, commands: int, seed: int) -> np.ndarray:
-    """Return the largest shares of the limits that were reached, (2, 3)."""
+    """Return the largest derivatives of the emitted poses relative to their limits, (2, 3)."""
     system = PoseMotionLimiter(limits, period=period)
     context = system.CreateDefaultContext()
     desired_port = system.get_desired_pose_input_port()
@@ -108,31 +110,31 @@ def attack(policy: Policy, limits: MotionLimits, period: float, commands: int, s
         poses.append(output.Eval(context).copy())
         simulator.AdvanceTo(k * period)
         if k % CHUNK == 0 or k == commands:
-            worst = np.maximum(worst, reached(np.array(poses), period) / bounds)
+            worst = np.maximum(worst, largest_derivatives(np.array(poses), period) / bounds)
             poses = poses[-4:]
     return worst
 
 
 def main() -> int:
-    """Run all policies against all limits."""
+    """Run all policies against all limits; return 1 if a limit was exceeded, otherwise 0."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--commands", type=int, default=1_000_000, help="number of commands in all")
+    parser.add_argument("--commands", type=int, default=1_000_000, help="total number of commands")
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
-    runs = [(p, name, h) for h in (0.005, 0.001) for name in LIMITS for p in POLICIES]
-    number, total, breaches, start = arguments.commands // len(runs) + 1, 0, 0, time.monotonic()
+    runs = [(policy, name, period) for period in (0.005, 0.001) for name in LIMITS for policy in POLICIES]
+    number, total, num_failed, start = arguments.commands // len(runs) + 1, 0, 0, time.monotonic()
     for seed, (policy, name, period) in enumerate(runs, arguments.seed):
-        shares = attack(POLICIES[policy], LIMITS[name], period, number, seed)
-        is_within = bool((shares <= 1.0 + TOLERANCE).all())
-        total, breaches = total + number, breaches + (not is_within)
-        largest = " ".join(f"{share:7.4f}" for share in shares.ravel())
+        ratios = attack(POLICIES[policy], LIMITS[name], period, number, seed)
+        is_within = bool((ratios <= 1.0 + TOLERANCE).all())
+        total, num_failed = total + number, num_failed + (not is_within)
+        largest = " ".join(f"{ratio:7.4f}" for ratio in ratios.ravel())
         print(
-            f"{'ok  ' if is_within else 'FAIL'} {policy:<13}{name:<19}{1e3 * period:2.0f} ms  shares of the limits "
+            f"{'ok  ' if is_within else 'FAIL'} {policy:<13}{name:<19}{1e3 * period:2.0f} ms  relative to the limits "
             f"{largest}  {total} commands, {time.monotonic() - start:.0f} s",
             flush=True,
         )
-    print(f"{total} commands, {breaches} runs with a breach")
-    return int(breaches > 0)
+    print(f"{total} commands, {num_failed} runs with an exceeded limit")
+    return int(num_failed > 0)
 
 
 if __name__ == "__main__":

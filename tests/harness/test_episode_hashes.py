@@ -1,4 +1,4 @@
-"""The tool that hashes seeded episodes."""
+"""Hashes of seeded episodes and their comparison."""
 
 import json
 

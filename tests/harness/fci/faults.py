@@ -1,10 +1,10 @@
-"""Faults of the statuses of a simulated Franka while it moves: each is detected in time, and the arm comes to rest.
+"""Faults of the statuses of a moving simulated Franka: each is detected in time, and the arm comes to rest.
 
     python tests/harness/fci/faults.py --instants 5
 
-The kinds are those of `injections/kinds.py` that change statuses. Kinds that this protocol does not have are left out:
-libfranka decodes messages, has one robot on a connection, and has neither other commanders nor safety monitors. The
-requirements are those of `injections/campaign.py`. The exit code is 1 if a requirement is not met.
+The kinds of `injections/kinds.py` that change statuses are injected. Kinds that are impossible with this protocol are
+left out: libfranka decodes messages, and a connection has one robot, one controller and no safety monitor. The
+requirements are the same as in `injections/campaign.py`. The exit code is 1 if a requirement is not met.
 """
 
 from __future__ import annotations
@@ -30,13 +30,16 @@ from guiderail.tools.hardware.connection import subprocess_tied_to_parent
 from guiderail.tools.hardware.sim_driver import START
 
 CENTER = START + np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
-AMPLITUDE, FREQUENCY = np.array([0.01, 0.01, 0.0, 0.15, 0.0, 0.0]), 1.0  # of the motion [m, rad], [Hz]
-OTHER = ("second robot", "random bytes", "message cut off")
-STATUS_KINDS = [kind for kind in KINDS if kind.where in ("sensor", "network") and not kind.name.startswith(OTHER)]
+AMPLITUDE, FREQUENCY = (
+    np.array([0.01, 0.01, 0.0, 0.15, 0.0, 0.0]),
+    1.0,
+)  # amplitude and frequency of the motion [m, rad], [Hz]
+IMPOSSIBLE = ("second robot", "random bytes", "message cut off")
+STATUS_KINDS = [kind for kind in KINDS if kind.where in ("sensor", "network") and not kind.name.startswith(IMPOSSIBLE)]
 
 
 class FaultyDriver(FciDriver):
-    """Driver that applies a fault to the statuses it reads.
+    """Driver with injected faults of the statuses.
 
     Attributes:
         fault: Applied fault; None for unchanged statuses.
@@ -51,7 +54,7 @@ class FaultyDriver(FciDriver):
         self._time, self._changed = np.nan, joint_status.MALFORMED_STATUS
 
     def begin(self, kind: Kind, rng: np.random.Generator) -> None:
-        """Begin a fault with the next status."""
+        """Begin a fault at the next status."""
         assert kind.make is not None
         self.fault, self._where, self._start, self.has_effect = kind.make(rng), kind.where, np.nan, False
 
@@ -75,7 +78,7 @@ class FaultyDriver(FciDriver):
 
 
 def encode(status: JointStatus) -> bytes:
-    """Return a status as an iiwa status message, which a fault changes."""
+    """Return a status as an encoded iiwa status message."""
     message = lcmt_iiwa_status()
     message.utime, message.num_joints = round(status.time / MICROSECOND), len(status.positions)
     for name in lcmt_iiwa_status.__slots__[2:]:
@@ -88,14 +91,14 @@ def encode(status: JointStatus) -> bytes:
 
 
 class Campaign:
-    """A simulated robot that moves, and the faults of its statuses."""
+    """Moving simulated robot with faults of its statuses."""
 
     def __init__(self) -> None:
         self.run, self.steps = SimulatedRun(FaultyDriver), 0
         self.driver: FaultyDriver = self.run.station.driver
 
     def step(self) -> None:
-        """Move the desired pose along the motion, and advance by a status period."""
+        """Set the next desired pose of the motion, and advance by a status period."""
         angle = 2.0 * np.pi * FREQUENCY * PERIOD * self.steps
         self.run.pose = CENTER + AMPLITUDE * np.sin(angle + np.array([0.0, 0.5 * np.pi, 0.0, 0.0, 0.0, 0.0]))
         self.steps += 1
@@ -108,7 +111,7 @@ class Campaign:
         return self.run["arm_state"][0] in (ArmState.DAMPING, ArmState.OFF)
 
     def move(self, seconds: float) -> float:
-        """Move without a fault for `seconds` [s]; return the largest speed of a joint [rad/s]."""
+        """Move without a fault for `seconds` [s]; return the largest joint speed [rad/s]."""
         speed = 0.0
         for _ in range(round(seconds / PERIOD)):
             self.step()
@@ -117,7 +120,7 @@ class Campaign:
         return speed
 
     def inject(self, kind: Kind, rng: np.random.Generator) -> str:
-        """Inject a fault during the motion and print the result; return the failed requirements, "" if none failed."""
+        """Inject a fault during the motion and print the result; return the failed requirements as text."""
         reference = self.move(1.0 + float(rng.uniform(0.0, 0.5)))  # a whole period
         self.driver.begin(kind, rng)
         elapsed, detected, late, fastest, steps = 0.0, np.nan, 0.0, 0.0, 0
@@ -133,15 +136,15 @@ class Campaign:
         if self.is_stopped:
             self.driver.recover()
             self.run.resume()
-        wrong = []
+        failures = []
         if kind.is_detectable and self.driver.has_effect:
-            wrong += ["late" if detected > kind.bound + 1e-9 else "undetected"] * (not detected <= kind.bound + 1e-9)
-            wrong += [f"{late:.2f} rad/s"] * (late >= SLOW) + ["faster"] * (fastest > GROWTH * reference)
+            failures += ["late" if detected > kind.bound + 1e-9 else "undetected"] * (not detected <= kind.bound + 1e-9)
+            failures += [f"{late:.2f} rad/s"] * (late >= SLOW) + ["faster"] * (fastest > GROWTH * reference)
         times = f"bound {1e3 * kind.bound:>4.0f}, detected {1e3 * detected:>4.0f} ms"
         speeds = f"then {late:.2f} rad/s, {fastest / reference:.2f} times as fast"
-        state = "WRONG" if wrong else "ok"
-        print(f"{state:<6}{kind.name:<32}{times}, {speeds}; {cause} {' '.join(wrong)}", flush=True)
-        return " ".join(wrong)
+        state = "FAIL" if failures else "ok"
+        print(f"{state:<6}{kind.name:<32}{times}, {speeds}; {cause} {' '.join(failures)}", flush=True)
+        return " ".join(failures)
 
 
 def main() -> int:
@@ -151,7 +154,7 @@ def main() -> int:
     parser.add_argument("--kinds", nargs="*", help="names of kinds (default: all)")
     arguments = parser.parse_args()
     kinds = [kind for kind in STATUS_KINDS if not arguments.kinds or kind.name in arguments.kinds]
-    campaign, wrong = Campaign(), 0
+    campaign, num_failed = Campaign(), 0
     code = (
         "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
         f"run_sim_driver({campaign.run.host!r}, 1e5, 60.0, driver='fci', log=lambda _: None)"
@@ -161,9 +164,9 @@ def main() -> int:
         campaign.run.advance(1.2)
         for instant in range(arguments.instants):
             for number, kind in enumerate(kinds):
-                wrong += bool(campaign.inject(kind, np.random.default_rng([instant, number])))
-    print(f"{arguments.instants * len(kinds)} injections, {wrong} with a failed requirement")
-    return 1 if wrong else 0
+                num_failed += bool(campaign.inject(kind, np.random.default_rng([instant, number])))
+    print(f"{arguments.instants * len(kinds)} injections, {num_failed} with a failed requirement")
+    return 1 if num_failed else 0
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""Run of a simulated Franka through its own protocol: insert, lock, stop, the loss of the robot, and a reflex.
+"""Checks of a simulated Franka over its own protocol: insertion, lock, stop, loss of the robot, and reflex.
 
-Run by `make fci`, in an environment with franky and franky-sim. The robot is a process of its own that answers
-libfranka's network protocol. It runs in lockstep with the station, so that the machine's speed does not matter.
+`make fci` runs the checks in an environment with franky and franky-sim. The robot is a separate process that answers
+libfranka's network protocol. Robot and station advance in lockstep, so the speed of the machine does not matter.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from guiderail.systems.torque_safety_limiter import ArmState
 from guiderail.tools.hardware.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent
 from guiderail.tools.hardware.sim_driver import START
 
-FORCE_LIMIT = 18.0  # bound of the impedance's force [N]
-CONTROL_STEPS = 4  # status periods of a control step
-DOWN, TURN = 0.01, 0.25  # speed of the insertion [m/s] and of the turn [rad/s], below those of `motion_limits`
+FORCE_LIMIT = 18.0  # bound of the impedance force [N]
+STATUSES_PER_STEP = 4  # number of status periods in a control step
+DOWN, TURN = 0.01, 0.25  # speeds of insertion [m/s] and turn [rad/s], below `motion_limits`
 PRESSED = -0.006  # commanded height while the plug is turned [m]
-LOW_THRESHOLDS = (6.0, 5.0)  # collision thresholds that the insertion exceeds [N, Nm]
+LOW_THRESHOLDS = (6.0, 5.0)  # collision thresholds below the loads of the insertion [N, Nm]
 
 
 class SimulatedRun:
-    """Hardware station on the simulated robot."""
+    """Hardware station connected to the simulated robot."""
 
     def __init__(self, driver: type[FciDriver] = FciDriver):
         self.host = f"127.0.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
@@ -54,16 +54,16 @@ class SimulatedRun:
         self.clock.begin()
 
     def advance(self, seconds: float, velocity: np.ndarray | None = None) -> None:
-        period = CONTROL_STEPS * self.station.period
+        period = STATUSES_PER_STEP * self.station.period
         for _ in range(round(seconds / period)):
             if velocity is not None:
                 self.pose = self.pose + period * velocity
             self.station.get_desired_pose_input_port().FixValue(self.context, self.pose)
-            self.clock.advance(self.simulator, self.station, CONTROL_STEPS)
+            self.clock.advance(self.simulator, self.station, STATUSES_PER_STEP)
             self.max_force = max(self.max_force, float(self["contact_force"][0]))
 
     def resume(self) -> None:
-        """End a stop, and hold the arm where it is until the station has full authority."""
+        """End a stop, and command the present pose until the blend factor is 1."""
         self.advance(0.6)
         self.pose = self["pose"].copy()
         self.station.resume(self.context)
@@ -94,8 +94,8 @@ def run_checks() -> list[str]:
     )
     with subprocess_tied_to_parent(code) as robot:
         run.start()
-        for one in run.station.driver.check_setup():
-            check(one.name, one.passed in (True, None), one.description)
+        for setup in run.station.driver.check_setup():
+            check(setup.name, setup.passed in (True, None), setup.description)
         run.advance(1.2)
         check("take over", run["arm_state"][0] == ArmState.RUNNING, run.describe())
         run.advance((START[2] - PRESSED) / DOWN, np.array([0.0, 0.0, -DOWN, 0.0, 0.0, 0.0]))
@@ -103,7 +103,7 @@ def run_checks() -> list[str]:
         run.advance(0.3)
         height, turn = run["pose"][2], run["pose"][3]
         check("lock", abs(height) < 0.6e-3 + 0.4e-3 and abs(turn) < np.deg2rad(8.0), run.describe())
-        check("force", run.max_force < 20.0, f"at most {run.max_force:.1f} N by the impedance")
+        check("force", run.max_force < 20.0, f"impedance force of at most {run.max_force:.1f} N")
         run.station.stop(run.context)
         run.advance(0.6)
         check("stop", run["arm_state"][0] == ArmState.OFF, run.describe())

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 @st.composite
 def edits(draw, max_size=6):
-    """Draw mutations of a byte string: position, number of removed bytes, and inserted bytes."""
+    """Draw mutations of a byte string: relative position, number of removed bytes, and inserted bytes."""
     return [
         (draw(st.floats(0, 1)), draw(st.sampled_from([0, 0, 1, 1, 2, 4, 8, 50])), draw(st.binary(max_size=8)))
         for _ in range(draw(st.integers(1, max_size)))
@@ -15,13 +15,27 @@ def edits(draw, max_size=6):
 
 
 def edited(data: bytes, changes) -> bytes:
+    """Return `data` with the mutations drawn by `edits`."""
     for position, removed, inserted in changes:
-        at = int(position * len(data))
-        data = data[:at] + inserted + data[at + removed :]
+        start = int(position * len(data))
+        data = data[:start] + inserted + data[start + removed :]
     return data
 
 
-ODD = st.sampled_from(
+def bit_flips(max_size=2):
+    """Return a strategy for bits to invert: relative position of the byte, and number of the bit."""
+    return st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), max_size=max_size)
+
+
+def flipped(data: bytes, flips) -> bytes:
+    """Return `data` with the bits drawn by `bit_flips` inverted."""
+    data = bytearray(data)
+    for position, bit in flips:
+        data[min(int(position * len(data)), len(data) - 1)] ^= 1 << bit
+    return bytes(data)
+
+
+UNUSUAL_VALUES = st.sampled_from(
     [None, True, 0, -1, 1, 2, 7, 1e-12, 1e-300, 0.1, 90, 180, 360.0, -180, 1e6, 1e300, 10**400, float("nan")]
     + [
         "",
@@ -46,15 +60,16 @@ ODD = st.sampled_from(
 )
 
 
-def places(tree, path=()):
+def paths_in(tree, path=()):
     """Yield every path in a tree of lists and mappings."""
     yield path
     entries = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     for key, value in entries:
-        yield from places(value, (*path, key))
+        yield from paths_in(value, (*path, key))
 
 
-def get(tree, path):
+def entry_at(tree, path):
+    """Return the entry of a tree at a path."""
     for key in path:
         tree = tree[key]
     return tree
@@ -62,29 +77,29 @@ def get(tree, path):
 
 @st.composite
 def changed_trees(draw, trees):
+    """Draw a tree with up to three changed entries."""
     tree = copy.deepcopy(draw(st.sampled_from(trees)))
     for _ in range(draw(st.integers(0, 3))):
-        inside = [path for path in places(tree) if path]
-        path = draw(st.sampled_from(inside))
-        holder, key = get(tree, path[:-1]), path[-1]
-        what = draw(st.sampled_from(["odd", "odd", "number", "number", "remove", "copy", "rename", "double"]))
-        if what == "odd":
-            holder[key] = copy.deepcopy(draw(ODD))
-        elif what == "number":
-            numbers = [p for p in inside if type(get(tree, p)) in (int, float)]
-            path = draw(st.sampled_from(numbers or inside))
-            get(tree, path[:-1])[path[-1]] = draw(st.floats(-1e7, 1e7) | st.integers(-400, 400))
-        elif what == "remove":
-            del holder[key]
-        elif what == "copy":
-            holder[key] = copy.deepcopy(get(tree, draw(st.sampled_from(inside))))
-        elif what == "rename" and isinstance(holder, dict):
-            holder[draw(st.sampled_from(["name", "kind", "frame", "to", "inputs", "far", "x", 1, None]))] = holder.pop(
-                key
-            )
-        elif what == "double" and isinstance(holder, list):
-            holder.append(copy.deepcopy(holder[key]))
-        if not any(True for path in places(tree) if path):
+        paths = [path for path in paths_in(tree) if path]
+        path = draw(st.sampled_from(paths))
+        parent, key = entry_at(tree, path[:-1]), path[-1]
+        action = draw(st.sampled_from(["unusual", "unusual", "number", "number", "remove", "copy", "rename", "append"]))
+        if action == "unusual":
+            parent[key] = copy.deepcopy(draw(UNUSUAL_VALUES))
+        elif action == "number":
+            numbers = [p for p in paths if type(entry_at(tree, p)) in (int, float)]
+            path = draw(st.sampled_from(numbers or paths))
+            entry_at(tree, path[:-1])[path[-1]] = draw(st.floats(-1e7, 1e7) | st.integers(-400, 400))
+        elif action == "remove":
+            del parent[key]
+        elif action == "copy":
+            parent[key] = copy.deepcopy(entry_at(tree, draw(st.sampled_from(paths))))
+        elif action == "rename" and isinstance(parent, dict):
+            name = draw(st.sampled_from(["name", "kind", "frame", "to", "inputs", "far", "x", 1, None]))
+            parent[name] = parent.pop(key)
+        elif action == "append" and isinstance(parent, list):
+            parent.append(copy.deepcopy(parent[key]))
+        if not any(paths_in(tree)):
             break
     return tree
 
@@ -142,19 +157,20 @@ PIECES = st.sampled_from(
 
 @st.composite
 def changed_texts(draw, texts):
+    """Draw a text with up to four changes of characters or lines."""
     text = draw(st.sampled_from(texts))
     for _ in range(draw(st.integers(1, 4))):
-        at = int(draw(st.floats(0, 1)) * len(text))
-        out = draw(st.sampled_from([0, 0, 1, 1, 2, 5, 40]))
-        what = draw(st.sampled_from(["piece", "piece", "nothing", "line", "swap"]))
-        if what == "line":
-            at = text.rfind("\n", 0, at) + 1
-            end = text.find("\n", at) + 1 or len(text)
-            text = text[:end] + text[at:end] + text[end:] if out else text[:at] + text[end:]
-        elif what == "swap":
+        start = int(draw(st.floats(0, 1)) * len(text))
+        removed = draw(st.sampled_from([0, 0, 1, 1, 2, 5, 40]))
+        action = draw(st.sampled_from(["insert", "insert", "remove", "line", "digit"]))
+        if action == "line":
+            start = text.rfind("\n", 0, start) + 1
+            end = text.find("\n", start) + 1 or len(text)
+            text = text[:end] + text[start:end] + text[end:] if removed else text[:start] + text[end:]
+        elif action == "digit":
             digits = [i for i, letter in enumerate(text) if letter.isdigit()]
-            at = digits[min(int(draw(st.floats(0, 1)) * len(digits)), len(digits) - 1)]
-            text = text[:at] + str(draw(st.integers(0, 9))) + text[at + 1 :]
+            start = digits[min(int(draw(st.floats(0, 1)) * len(digits)), len(digits) - 1)]
+            text = text[:start] + str(draw(st.integers(0, 9))) + text[start + 1 :]
         else:
-            text = text[:at] + (draw(PIECES) if what == "piece" else "") + text[at + out :]
+            text = text[:start] + (draw(PIECES) if action == "insert" else "") + text[start + removed :]
     return text

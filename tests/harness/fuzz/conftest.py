@@ -4,9 +4,11 @@ from fuzz.tally import COUNTS
 
 
 def pytest_terminal_summary(terminalreporter, config):
+    """Print the outcomes of the inputs of each target."""
     if config.getoption("--hypothesis-profile") != "long":
         return
     for target in sorted({target for target, _ in COUNTS}):
         accepted, refused = COUNTS[target, "accepted"], COUNTS[target, "refused"]
         terminalreporter.write_line(f"{target}: {accepted + refused} inputs, {accepted} accepted, {refused} refused")
-    terminalreporter.write_line(f"together: {sum(COUNTS.values())} inputs")
+    total = sum(count for (_, outcome), count in COUNTS.items() if outcome == "inputs")
+    terminalreporter.write_line(f"total: {total} inputs")

@@ -1,12 +1,12 @@
-"""Fuzzing of every kind of file and argument with random and mutated inputs.
+"""Fuzzing of all kinds of files and arguments with random and mutated inputs.
 
     python tests/harness/fuzz/fuzz.py                       # 25,000 inputs, about ten minutes
-    python tests/harness/fuzz/fuzz.py --inputs 200 runs     # fewer inputs, of test_runs.py only
+    python tests/harness/fuzz/fuzz.py --inputs 200 runs     # 200 inputs of each test in test_runs.py
     python tests/harness/fuzz/fuzz.py --seed 1 --add FILE   # other inputs, added to the counts in FILE
 
-An input must be accepted, with the values that an independent reader finds in it, or refused with one sentence, within
-2 s of CPU time and 200 MB. Everything else counts as a traceback, a hang, too large or a wrong number, is shown with
-its smallest input, and makes the exit code 1. The same seed tries the same inputs.
+An input must be accepted with the values that an independent reader finds, or refused with one sentence, within 2 s of
+CPU time and 200 MB. Every other outcome counts as a traceback, a hang, too large or a wrong number, and makes the exit
+code 1. The smallest such input is shown. The same seed generates the same inputs.
 """
 
 from __future__ import annotations
@@ -42,34 +42,30 @@ class WrongNumbers:
 def count(file: Path, inputs: int, seed: int, out: Path) -> None:
     """Try the inputs of one test file, and write the counts as JSON."""
     import pytest
-    from hypothesis import settings
+    from hypothesis import HealthCheck, settings
 
     from fuzz import tally
 
     tally.measuring = True
     tally.bound_memory()
     settings.register_profile("counted", settings.get_profile("default"), max_examples=inputs, deadline=None,
-                              database=None, suppress_health_check=list(_health()))  # fmt: skip
+                              database=None, suppress_health_check=list(HealthCheck))  # fmt: skip
     options = ["-q", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=short"]
     pytest.main([*options, "--hypothesis-profile=counted", f"--hypothesis-seed={seed}", str(file)], [WrongNumbers()])
     if tally.COUNTS:
         out.write_text(json.dumps([[*key, n] for key, n in tally.COUNTS.items()]))
 
 
-def _health():
-    from hypothesis import HealthCheck
-
-    return HealthCheck
-
-
 def main() -> int:
     """Run the program; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     files = {file.stem.removeprefix("test_"): file for file in sorted(FOLDER.glob("test_*.py"))}
-    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"of {', '.join(files)}; default: all")
+    parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"kinds of inputs: {', '.join(files)}; default: all")
     parser.add_argument("--inputs", type=int, default=1000, help="maximum number of inputs of each test")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--add", type=Path, metavar="FILE", help="JSON file of counts, to which new ones are added")
+    parser.add_argument(
+        "--add", type=Path, metavar="FILE", help="JSON file of counts, to which the new counts are added"
+    )
     args = parser.parse_args()
     if unknown := set(args.kinds) - set(files):
         parser.error(f"there is no {', '.join(sorted(unknown))}: choose among {', '.join(files)}")

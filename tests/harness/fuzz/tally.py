@@ -1,4 +1,4 @@
-"""Counts of fuzzed inputs by outcome, with limits of time and memory."""
+"""Counts of fuzzed inputs by outcome, with limits of CPU time and memory."""
 
 import faulthandler
 import resource
@@ -6,16 +6,19 @@ import signal
 from collections import Counter
 from pathlib import Path
 
-MAX_SECONDS = 2.0  # CPU time of an input [s]
-MAX_BYTES = 200_000_000  # growth of memory by an input [bytes]
+MAX_SECONDS = 2.0  # largest CPU time of an input [s]
+MAX_BYTES = 200_000_000  # largest growth of memory by an input [bytes]
 TIMEOUT = 300  # wall-clock time after which a process that ignores signals is ended [s]
 
 COUNTS: Counter[tuple[str, str]] = Counter()
-measuring = False  # limits are checked by fuzz.py only, not in tests
+measuring = False  # only fuzz.py checks the limits
 
 
 class TooSlowError(BaseException):
-    """Error of an input that takes too long; no `Exception`, so that the code under test does not handle it."""
+    """Error of an input that takes too long.
+
+    The class is not derived from `Exception`, because the code under test must not handle the error.
+    """
 
 
 def attempt(target: str, refusal: type[Exception], call):
@@ -57,14 +60,14 @@ class _NoLimits:
 
 
 class _Limits:
-    """Limit of CPU time and memory of an input."""
+    """Context manager that limits the CPU time and memory of an input."""
 
     def __init__(self, target: str):
         self.target = target
 
     def __enter__(self):
         faulthandler.dump_traceback_later(TIMEOUT, exit=True)
-        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak of the resident memory
         self.before = _status("VmRSS")
         signal.signal(signal.SIGPROF, _too_slow)
         signal.setitimer(signal.ITIMER_PROF, MAX_SECONDS)
@@ -74,19 +77,20 @@ class _Limits:
         faulthandler.cancel_dump_traceback_later()
         if (grown := _status("VmHWM") - self.before) > MAX_BYTES:
             COUNTS[self.target, "too large"] += 1
-            raise MemoryError(f"it took {grown / 1e6:.0f} MB")
+            raise MemoryError(f"the input took {grown / 1e6:.0f} MB")
 
 
 def _too_slow(number, frame):
-    raise TooSlowError(f"it takes more than {MAX_SECONDS:g} s")
+    raise TooSlowError(f"the input takes more than {MAX_SECONDS:g} s")
 
 
 def _status(name: str) -> int:
-    """Return a number of /proc/self/status [bytes]."""
-    line = next(one for one in Path("/proc/self/status").read_text().splitlines() if one.startswith(name))
+    """Return an entry of /proc/self/status [bytes]."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    line = next(line for line in lines if line.startswith(name))
     return 1024 * int(line.split()[1])
 
 
 def bound_memory() -> None:
-    """Limit the address space, so that an array of terabytes raises MemoryError."""
+    """Limit the address space, because an array of terabytes must raise a MemoryError."""
     resource.setrlimit(resource.RLIMIT_AS, (12 * 2**30, 12 * 2**30))

@@ -1,4 +1,4 @@
-"""Random command-line values: `--set`, `--env` and options of a reset are accepted or refused in one sentence."""
+"""Random values of `--set`, `--env` and reset options: each is accepted, or refused with one sentence."""
 
 import numpy as np
 import pytest
@@ -39,24 +39,10 @@ WORDS = st.sampled_from(
         "7",
         "0.5",
     ]
-    + [
-        "sparse",
-        "shaped",
-        "skgrl",
-        "kgrl",
-        "kmp",
-        "sct",
-        "none",
-        "gantry",
-        "arm",
-        "image",
-        "hard",
-        "per_episode",
-        "tqc",
-        "sac",
-    ]
+    + ["sparse", "shaped", "skgrl", "kgrl", "kmp", "sct", "none", "gantry", "arm", "image", "hard", "per_episode"]
+    + ["tqc", "sac"]
 )
-TYPED = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
+TEXTS = NUMBERS | WORDS | st.lists(NUMBERS, min_size=1, max_size=3).map(",".join) | st.text(max_size=8)
 BOMB = (
     "{a: &a [1,1,1,1,1,1,1,1,1], b: &b [*a,*a,*a,*a,*a,*a,*a,*a,*a], c: &c [*b,*b,*b,*b,*b,*b,*b,*b,*b], d: [*c,*c,*c]}"
 )
@@ -65,7 +51,7 @@ SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "al
 
 @given(
     st.sampled_from(sorted(PRESETS)),
-    st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), TYPED), min_size=1, max_size=2),
+    st.lists(st.tuples(st.sampled_from(SETTINGS) | st.text(max_size=5), TEXTS), min_size=1, max_size=2),
 )
 @example("tqc_contact", [("ent_coef", "inf")])
 @example("tqc_contact", [("net_arch", "1000000,1000000")])
@@ -85,15 +71,15 @@ def test_configure_accepts_or_refuses_any_learner_setting(preset, pairs):
         elif isinstance(result, str):
             assert result == text
         elif isinstance(result, tuple):
-            assert result == tuple(int(float(one)) for one in text.split(","))
+            assert result == tuple(int(float(number)) for number in text.split(","))
         else:
             assert result == float(text)
-    for name, other in PRESETS[preset].__dict__.items():
-        assert name in arguments or name == "algorithm" or getattr(config.learner, name) == other
+    for name, value in PRESETS[preset].__dict__.items():
+        assert name in arguments or name == "algorithm" or getattr(config.learner, name) == value
 
 
 def options_of(task):
-    """Return all options of a task's environments, with their defaults as typed."""
+    """Return all options of a task's environments with their defaults as text."""
     config = EnvConfig.resolve(task, {})
     models = option_models(TASKS.get(task), config.guidance, config.station).values()
     return {name: str(field.default) for model in models for name, field in model.model_fields.items()}
@@ -104,48 +90,47 @@ OPTIONS = {task: options_of(task) for task in TASK_NAMES}
 
 @st.composite
 def environments(draw):
-    task, typed = draw(st.sampled_from(TASK_NAMES)), {}
+    """Draw a task and the texts of some options."""
+    task, texts = draw(st.sampled_from(TASK_NAMES)), {}
     for _ in range(draw(st.integers(1, 3))):
         name = draw(st.sampled_from([*OPTIONS[task]] * 3 + ["guidance", "fixture_offset", "x", "", "render_mode"]))
         valid = st.just(OPTIONS[task].get(name) or "kmp") | st.floats(0, 1).map(repr) | st.integers(1, 50).map(str)
-        typed[name] = draw(valid | valid | TYPED)
-    return task, typed
+        texts[name] = draw(valid | valid | TEXTS)
+    return task, texts
 
 
 @given(environments())
 @example(("NarrowPassage", {"action_repeat": BOMB}))
 @example(("NarrowPassage", {"action_repeat": "2001-99-99"}))
-def test_check_environment_accepts_or_refuses_any_option(chosen):
-    task, typed = chosen
-    result = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in typed.items()}))
+def test_check_environment_accepts_or_refuses_any_option(environment):
+    task, texts = environment
+    result = attempt("--env", InputError, lambda: check_environment(task, {k: as_value(v) for k, v in texts.items()}))
     if result is None:
         return
-    for name, text in typed.items():
-        value, read = result[name], yaml.safe_load(text) if text.strip() else None
+    for name, text in texts.items():
+        value, parsed = result[name], yaml.safe_load(text) if text.strip() else None
         if isinstance(value, bool):
             assert text.strip().lower() in (
                 ("1", "true", "yes", "on", "1.0") if value else ("0", "false", "no", "off", "0.0", "-0")
             )
         elif isinstance(value, tuple):
-            numbers = read if isinstance(read, list) else [one for one in str(text).split(",") if one.strip()]
-            assert list(value) == [float(one) for one in numbers]
+            words = parsed if isinstance(parsed, list) else [word for word in str(text).split(",") if word.strip()]
+            assert list(value) == [float(word) for word in words]
         elif isinstance(value, int | float):
             assert value == float(text)
         else:
-            assert value == read or (value is None and read is None) or str(value) == text.strip()
+            assert value == parsed or (value is None and parsed is None) or str(value) == text.strip()
 
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3)
 VALUES = SCALARS | st.lists(SCALARS, max_size=3) | st.lists(st.floats(-0.3, 0.3), min_size=2, max_size=3)
 RESETS = {task: sorted(TASKS.get(task).Reset.model_fields) for task in TASK_NAMES}
-MADE = {
-    "NarrowPassage": {"guidance": "kmp"}, "BncConnector": {"guidance": "kmp"}, "GridClamp": {}, "Pouring": {},
-}  # fmt: skip
+GUIDANCE = {"NarrowPassage": {"guidance": "kmp"}, "BncConnector": {"guidance": "kmp"}}
 
 
 @pytest.fixture(scope="module", params=TASK_NAMES)
 def env(request):
-    env = make_env(request.param, **MADE[request.param])
+    env = make_env(request.param, **GUIDANCE.get(request.param, {}))
     yield env
     env.close()
 
@@ -156,14 +141,14 @@ def test_reset_accepts_or_refuses_any_option(env, data):
     names = st.sampled_from(RESETS[task]) | st.sampled_from(RESETS[task]) | st.text(max_size=3)
     options = data.draw(st.dictionaries(names, VALUES | st.floats(-0.1, 0.1).map(lambda x: [x, -x]), max_size=2))
     seed = data.draw(st.integers(0, 99))
-    begun = attempt(f"reset, {task}", InputError, lambda: env.reset(seed=seed, options=options))
-    if begun is None:
+    result = attempt(f"reset, {task}", InputError, lambda: env.reset(seed=seed, options=options))
+    if result is None:
         return
-    observation, info = begun
+    observation, info = result
     assert np.isfinite(observation).all()
     assert info["fallback"] in (False, 0, None) if "fallback" in info else True
-    for name, text in options.items():
-        if name in info and text is not None:
-            # The option is the estimated position; the info has the true one.
-            believed = np.asarray(info[name], float) + (info.get("mug_error", 0.0) if name == "mug_position" else 0.0)
-            np.testing.assert_allclose(believed, [float(one) for one in text], rtol=0, atol=1e-15)
+    for name, values in options.items():
+        if name in info and values is not None:
+            # The option is the estimated position of the mug, the info has the true position.
+            estimate = np.asarray(info[name], float) + (info.get("mug_error", 0.0) if name == "mug_position" else 0.0)
+            np.testing.assert_allclose(estimate, [float(value) for value in values], rtol=0, atol=1e-15)

@@ -1,8 +1,8 @@
-"""Files that contain code: no command executes the code.
+"""Files with inserted code: no reader executes the code.
 
-Each input is a valid file with code in some places: as a name to import, a tag, an expression, a format, or a pickled
-object. Executed code would touch a file. An audit hook of the interpreter also reports unpickled objects, started
-programs and imports of the name in the files. Reading may succeed, or be refused with one sentence.
+Each input is a valid file with inserted code: a name to import, a tag, an expression, a format, or a pickled object.
+Executed code would create a file. An audit hook of the interpreter also reports unpickled objects, started programs and
+imports of the inserted name. A reader may accept the input, or refuse it with one sentence.
 """
 
 import hashlib
@@ -20,7 +20,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fuzz.changes import edited, edits, get, places
+from fuzz.changes import edited, edits, entry_at, paths_in
 from fuzz.tally import attempt
 from fuzz.test_runs import ARRAYS, CONFIGS, DESCRIPTION, LAYERS, TABLE, VALUES
 from fuzz.test_templates import TEXTS as TEMPLATES
@@ -46,29 +46,23 @@ pytest.importorskip("rosbags")
 pytest.importorskip("trimesh")
 
 MODULE = "guiderail_canary"
-FORBIDDEN = (
-    "pickle.find_class",
-    "os.system",
-    "os.exec",
-    "os.posix_spawn",
-    "subprocess.Popen",
-)
+FORBIDDEN = ("pickle.find_class", "os.system", "os.exec", "os.posix_spawn", "subprocess.Popen")
 EVENTS: list[str] = []
-_armed = False
+_is_auditing = False
 
 
 def _audit(event, arguments):
     if event == "pickle.find_class" and arguments[0].split(".")[0] in ("numpy", "guiderail"):
-        return  # arrays from a worker process that reads a mesh
-    if _armed and (event in FORBIDDEN or (event == "import" and MODULE in str(arguments[0]))):
+        return  # unpickles arrays from the process that reads a mesh
+    if _is_auditing and (event in FORBIDDEN or (event == "import" and MODULE in str(arguments[0]))):
         EVENTS.append(f"{event} {str(arguments)[:200]}")
 
 
 sys.addaudithook(_audit)
 
 
-class Touch:
-    """Object that runs a program when it is unpickled."""
+class ExecutedOnUnpickling:
+    """Object that creates the canary file when it is unpickled."""
 
     def __init__(self, canary):
         self.canary = canary
@@ -79,7 +73,7 @@ class Touch:
 
 @pytest.fixture(scope="module")
 def canary(tmp_path_factory):
-    """Return the file that executed code would touch; a module named `MODULE` is on the import path."""
+    """Yield the file that executed code would create, while a module named `MODULE` is on the import path."""
     folder = tmp_path_factory.mktemp("canary")
     (folder / f"{MODULE}.py").write_text(f"open({str(folder / 'touched')!r}, 'w')\n")
     sys.path.insert(0, str(folder))
@@ -88,20 +82,21 @@ def canary(tmp_path_factory):
 
 
 @contextmanager
-def watched(canary):
-    global _armed
+def no_execution(canary):
+    """Check that no code is executed within the context."""
+    global _is_auditing
     EVENTS.clear()
-    _armed = True
+    _is_auditing = True
     try:
         yield
     finally:
-        _armed = False
+        _is_auditing = False
         assert not EVENTS
         assert not canary.exists()
 
 
-def codes(canary):
-    """Return texts that execute code where something evaluates, imports, formats or constructs them."""
+def code_texts(canary):
+    """Return texts with code that runs if a reader evaluates, imports, formats or constructs them."""
     python = f"open({str(canary)!r}, 'w')"
     shell = f"touch {canary}"
     module = str(canary.with_name(f"{MODULE}.py"))
@@ -120,46 +115,54 @@ def codes(canary):
 
 
 def pickles(canary):
-    """Return contents of files that execute code where something unpickles them."""
-    one = pickle.dumps(Touch(canary))
+    """Return contents of files with code that runs if a reader unpickles them."""
+    content = pickle.dumps(ExecutedOnUnpickling(canary))
     array = io.BytesIO()
-    np.save(array, np.array([Touch(canary)], dtype=object), allow_pickle=True)
+    np.save(array, np.array([ExecutedOnUnpickling(canary)], dtype=object), allow_pickle=True)
     archive = io.BytesIO()
-    np.savez(archive, times=np.array([Touch(canary)], dtype=object), outputs=np.array([Touch(canary)], dtype=object))
+    np.savez(
+        archive,
+        times=np.array([ExecutedOnUnpickling(canary)], dtype=object),
+        outputs=np.array([ExecutedOnUnpickling(canary)], dtype=object),
+    )
     torch = io.BytesIO()
     with zipfile.ZipFile(torch, "w") as file:
-        file.writestr("archive/data.pkl", one)
+        file.writestr("archive/data.pkl", content)
         file.writestr("archive/version", "3")
-    return [one, array.getvalue(), archive.getvalue(), torch.getvalue(), pickle.dumps({"weights": Touch(canary)})]
+    return [
+        content,
+        array.getvalue(),
+        archive.getvalue(),
+        torch.getvalue(),
+        pickle.dumps({"weights": ExecutedOnUnpickling(canary)}),
+    ]
 
 
 @st.composite
 def with_code(draw, content, canary):
-    """Draw a file with code in it: in an entry or a key of a tree, in a text, or as a pickled object."""
-    code = draw(st.sampled_from(codes(canary)))
-    what = draw(st.sampled_from(["tree", "tree", "imports", "key", "text", "text", "line", "pickle", "inside"]))
-    if what in ("tree", "key", "imports") and (tree := _tree(content)) is not None:
-        inside = [path for path in places(tree) if path]
-        path = draw(st.sampled_from(inside))
-        holder, last = get(tree, path[:-1]), path[-1]
-        if what == "imports" and isinstance(tree, dict):
+    """Draw a file with inserted code: an entry or key of a tree, a part of a text, or a pickled object."""
+    code = draw(st.sampled_from(code_texts(canary)))
+    place = draw(st.sampled_from(["tree", "tree", "imports", "key", "text", "text", "line", "pickle", "inside"]))
+    if place in ("tree", "key", "imports") and (tree := _tree(content)) is not None:
+        path = draw(st.sampled_from([path for path in paths_in(tree) if path]))
+        parent, last = entry_at(tree, path[:-1]), path[-1]
+        if place == "imports" and isinstance(tree, dict):
             tree["imports"] = [code]
-        elif what == "key" and isinstance(holder, dict):
-            holder[code] = holder.pop(last)
+        elif place == "key" and isinstance(parent, dict):
+            parent[code] = parent.pop(last)
         else:
-            holder[last] = draw(st.sampled_from([code, [code], {code: code}, {"imports": [code]}]))
+            parent[last] = draw(st.sampled_from([code, [code], {code: code}, {"imports": [code]}]))
         if content.lstrip().startswith(b"{"):
             return json.dumps(tree).encode()
         return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True).encode()
-    if what in ("pickle", "inside"):
+    start = int(draw(st.floats(0, 1)) * len(content))
+    if place in ("pickle", "inside"):
         pickled = draw(st.sampled_from(pickles(canary)))
-        at = int(draw(st.floats(0, 1)) * len(content))
-        return pickled if what == "pickle" else content[:at] + pickled + content[at:]
-    at = int(draw(st.floats(0, 1)) * len(content))
-    if what == "line":
-        at = content.rfind(b"\n", 0, at) + 1
+        return pickled if place == "pickle" else content[:start] + pickled + content[start:]
+    if place == "line":
+        start = content.rfind(b"\n", 0, start) + 1
     removed = draw(st.sampled_from([0, 0, 1, 8, 40]))
-    changed = content[:at] + code.encode() + content[at + removed :]
+    changed = content[:start] + code.encode() + content[start + removed :]
     return edited(changed, draw(edits(2))) if draw(st.booleans()) else changed
 
 
@@ -168,10 +171,10 @@ def _tree(content):
         tree = yaml.safe_load(content)
     except (yaml.YAMLError, UnicodeDecodeError, ValueError):
         return None
-    return tree if isinstance(tree, dict | list) and any(path for path in places(tree)) else None
+    return tree if isinstance(tree, dict | list) and any(paths_in(tree)) else None
 
 
-# --- Files, and what reads them ---
+# --- Files and their readers ---
 
 STUDY = b"""name: s
 task: NarrowPassage
@@ -256,7 +259,7 @@ def read_demonstrations(folder):
 
 
 def check_certificate(folder):
-    """Check a certificate whose digests fit, as those of a forged one would."""
+    """Check a certificate after its digests have been recomputed, as in a forged certificate."""
     try:
         claims = json.loads((folder / "certificate.json").read_bytes())
         names = ("primitive.npz", "constraints.npz", "witness.npz")
@@ -268,13 +271,13 @@ def check_certificate(folder):
         return
     try:
         checker.check(folder)
-    except Exception:  # the checker's program prints any exception as the reason of a refusal
+    except Exception:  # the program of the checker reports every exception as a refusal
         return
 
 
 def read_recordings(folder):
     new = folder / "new.npz"
-    for source in ("set", "it.mcap"):
+    for source in ("set", "recording.mcap"):
         attempt(f"execution, {source}", InputError, lambda source=source: import_recording(folder / source, new))
         new.unlink(missing_ok=True)
 
@@ -289,7 +292,7 @@ def recording_files(folder):
     write_mcap(folder / "bags", demonstrations)
     (mcap,) = (folder / "bags").rglob("*.mcap")
     files = {str(path.relative_to(folder)): path.read_bytes() for path in (folder / "set").rglob("*") if path.is_file()}
-    return files | {"it.mcap": mcap.read_bytes()}
+    return files | {"recording.mcap": mcap.read_bytes()}
 
 
 def read_part(folder):
@@ -328,11 +331,11 @@ def kind(request, tmp_path_factory):
     files, read = KINDS[request.param]
     files = files(folder) if callable(files) else files
     write_files(folder, files)
-    read(folder)  # imports what reading needs
+    read(folder)  # imports the modules of the reader
     return folder, files, read
 
 
-def test_task_folder_of_the_campaign_is_valid(tmp_path):
+def test_unchanged_task_folder_is_valid(tmp_path):
     write_files(tmp_path, TASK_FILES)
     file = read_task_file(tmp_path)
     write_workcell(tmp_path, file)
@@ -340,40 +343,30 @@ def test_task_folder_of_the_campaign_is_valid(tmp_path):
 
 
 @given(st.data())
-def test_no_file_of_a_folder_is_executed(kind, canary, data):
+def test_code_in_a_file_is_not_executed(kind, canary, data):
     folder, files, read = kind
     name = data.draw(st.sampled_from(sorted(files)))
     write_files(folder, {name: data.draw(with_code(files[name], canary))})
     try:
-        with watched(canary):
+        with no_execution(canary):
             read(folder)
     finally:
         write_files(folder, {name: files[name]})
 
 
 @given(st.data())
-def test_no_template_is_executed(canary, data):
+def test_code_in_a_template_is_not_executed(canary, data):
     content = data.draw(with_code(data.draw(st.sampled_from(TEMPLATES)).encode(), canary))
     text = content.decode("utf-8", errors="replace")
-    with watched(canary):
+    with no_execution(canary):
         attempt("execution, template", InputError, lambda: parse_template(text, "template"))
 
 
 @given(st.data())
-def test_no_option_is_executed(canary, data):
-    code = data.draw(st.sampled_from(codes(canary)))
-    options = [
-        "guidance",
-        "station",
-        "robot",
-        "kernel",
-        "demonstrations",
-        "difficulty",
-        "reward",
-        "observation",
-        "template",
-    ]
-    option = data.draw(st.sampled_from(options))
+def test_code_in_an_option_is_not_executed(canary, data):
+    code = data.draw(st.sampled_from(code_texts(canary)))
+    options = ["guidance", "station", "robot", "kernel", "demonstrations", "difficulty", "reward", "observation"]
+    option = data.draw(st.sampled_from([*options, "template"]))
     task = data.draw(st.sampled_from(["NarrowPassage", "BncConnector", "Pouring", "GridClamp", code]))
-    with watched(canary):
+    with no_execution(canary):
         attempt("execution, options", InputError, lambda: check_environment(task, {option: as_value(code)}))

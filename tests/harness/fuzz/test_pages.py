@@ -1,4 +1,4 @@
-"""Random messages to a page: no crash, no action without the token, and the action that an independent reader finds."""
+"""Random messages to a page: no crash, no effect without the token, and with it the effect that a reference computes."""
 
 import math
 import time
@@ -15,8 +15,8 @@ from fuzz.changes import changed_trees, edited, edits
 from fuzz.tally import COUNTS
 from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 
-TIMEOUT = 30.0  # until a message has been handled [s]
-FRAMES = 20  # messages of an example; one connection each
+TIMEOUT = 30.0  # longest time until a message has been handled [s]
+MAX_MESSAGES = 20  # largest number of messages of an example, sent on one connection
 EVENTS = [
     {"type": "slider", "name": "x", "value": 1.0},
     {"type": "button", "name": "keep"},
@@ -26,6 +26,7 @@ EVENTS = [
 
 
 def packed(tree):
+    """Return a tree as MessagePack; the invalid byte 0xC1 if the tree cannot be packed."""
     try:
         return msgpack.packb(tree)
     except (ValueError, TypeError, OverflowError):  # an integer of 400 digits
@@ -41,7 +42,7 @@ MESSAGES = (
 )
 
 
-PAGES = []  # Meshcat must not be deleted by the garbage collector in the thread of a client
+PAGES = []  # prevents the garbage collector from deleting a Meshcat in the thread of a client
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def page():
 
 
 def expected_inputs(messages, slider, gamepad):
-    """Return clicks, slider and axes after some messages, read by the rules of the page's documentation."""
+    """Return clicks, slider and gamepad axes after messages, by the rules in the documentation of the page."""
     clicks = 0
     for message in messages:
         try:
@@ -70,31 +71,31 @@ def expected_inputs(messages, slider, gamepad):
                 gamepad = []
             elif kind == "gamepad":
                 index, values = event["gamepad"]["index"], event["gamepad"]["axes"] + event["gamepad"]["button_values"]
-                numbers = all(type(value) in (int, float) and math.isfinite(value) for value in values)
-                if type(index) is int and 0 <= index < 64 and numbers:
+                are_valid = all(type(value) in (int, float) and math.isfinite(value) for value in values)
+                if type(index) is int and 0 <= index < 64 and are_valid:
                     gamepad = [max(-1.0, min(1.0, float(value))) for value in event["gamepad"]["axes"]]
-        except Exception:  # the page ignores every malformed message, and random bytes fail in any way
+        except Exception:  # the page ignores malformed messages, which raise exceptions of many types
             continue
     return clicks, slider, gamepad
 
 
 def send(page, messages, **changed):
-    """Send messages on a connection, and wait until they have been handled."""
+    """Send messages on a connection, and wait until they have been handled; return the axes of the gamepad."""
     last = page.GetButtonClicks("last")
     allowed = {"uri": page.ws_url(), "origin": f"http://localhost:{page.port()}"}
-    with connect(**(allowed | changed), compression=None, proxy=None) as one:
+    with connect(**(allowed | changed), compression=None, proxy=None) as connection:
         for message in messages:
-            one.send(message)
-        one.send(msgpack.packb({"type": "button", "name": "last"}))
-        until = time.monotonic() + TIMEOUT
+            connection.send(message)
+        connection.send(msgpack.packb({"type": "button", "name": "last"}))
+        deadline = time.monotonic() + TIMEOUT
         while page.GetButtonClicks("last") == last:
-            assert time.monotonic() < until, "the page does not answer"
+            assert time.monotonic() < deadline, "the page does not handle messages"
             time.sleep(0.001)
         return list(page.GetGamepad().axes)
 
 
-@given(st.lists(MESSAGES, min_size=1, max_size=FRAMES))
-def test_page_with_the_token(page, messages):
+@given(st.lists(MESSAGES, min_size=1, max_size=MAX_MESSAGES))
+def test_page_applies_valid_messages_when_token_is_sent(page, messages):
     COUNTS["page, message with the token", "inputs"] += len(messages)
     slider, clicks = page.GetSliderValue("x"), page.GetButtonClicks("keep")
     new_clicks, slider, gamepad = expected_inputs(messages, slider, [])
@@ -103,8 +104,8 @@ def test_page_with_the_token(page, messages):
     COUNTS["page, message with the token", "accepted"] += len(messages)
 
 
-@given(st.lists(MESSAGES, min_size=1, max_size=FRAMES), st.data())
-def test_page_without_the_token(page, messages, data):
+@given(st.lists(MESSAGES, min_size=1, max_size=MAX_MESSAGES), st.data())
+def test_page_refuses_messages_when_token_is_wrong(page, messages, data):
     COUNTS["page, message without the token", "inputs"] += len(messages)
     token = data.draw(
         st.sampled_from(["", "/", "x", page._gateway.token[:-1]]) | st.text("abcXYZ019-_./%", max_size=40)
@@ -114,5 +115,5 @@ def test_page_without_the_token(page, messages, data):
     with pytest.raises(InvalidStatus):
         send(page, messages, uri=f"ws://127.0.0.1:{page.port()}/{token}{path}")
     assert (page.GetSliderValue("x"), page.GetButtonClicks("keep"), page.GetButtonClicks("last")) == before
-    assert Meshcat.GetNumActiveConnections(page) == 1, "the gateway"
+    assert Meshcat.GetNumActiveConnections(page) == 1, "only the gateway is connected"
     COUNTS["page, message without the token", "refused"] += len(messages)

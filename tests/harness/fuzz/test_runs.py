@@ -1,4 +1,4 @@
-"""Mutated files of a run: each is read with the values that it has, or refused with one sentence."""
+"""Mutated files of a run: each is read exactly, or refused with one sentence."""
 
 import csv
 import io
@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from safetensors.numpy import load_file
 
-from fuzz.changes import changed_texts, changed_trees, edited, edits
+from fuzz.changes import bit_flips, changed_texts, changed_trees, edited, edits, flipped
 from fuzz.tally import attempt
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy, _digest
@@ -35,6 +35,7 @@ def folder(tmp_path_factory):
 
 
 def config_text(config, folder):
+    """Return a configuration as the text of its file."""
     folder.write_config(config)
     return (folder.path / "config.yaml").read_text()
 
@@ -60,6 +61,7 @@ def read(folder):
 
 
 def try_config(target, folder, text):
+    """Check that a text of config.yaml is refused, or read with the values that PyYAML finds."""
     (folder.path / "config.yaml").write_text(text, encoding="utf-8", newline="")
     config = attempt(target, InputError, lambda: read(folder))
     if config is None:
@@ -85,16 +87,16 @@ def try_config(target, folder, text):
 
 
 @given(st.data())
-def test_configurations_with_entries_changed(folder, texts, data):
+def test_config_with_changed_entries_is_exact_or_refused(folder, texts, data):
     tree = data.draw(changed_trees([yaml.safe_load(text) for text in texts]))
-    # Imports are code, so that a changed import is not wrong input.
+    # Imported modules are executed, so a changed import can raise any exception.
     if isinstance(tree, dict):
         tree.pop("imports", None)
     try_config("config.yaml, entries changed", folder, yaml.safe_dump(tree, sort_keys=False, allow_unicode=True))
 
 
 @given(st.data())
-def test_configurations_with_characters_changed(folder, texts, data):
+def test_config_with_changed_characters_is_exact_or_refused(folder, texts, data):
     text = data.draw(changed_texts([text.replace("imports: []\n", "") for text in texts]))
     try_config("config.yaml, characters changed", folder, text)
 
@@ -110,6 +112,7 @@ FIELDS = st.sampled_from(
 
 
 def try_table(target, folder, content):
+    """Check that the content of episodes.csv is refused, or read with the values that the csv module finds."""
     (folder.path / "episodes.csv").write_bytes(content)
     table = attempt(target, InputError, lambda: _summarized(folder))
     if table is None:
@@ -136,30 +139,26 @@ def _summarized(folder):
 
 
 @given(st.lists(st.tuples(st.integers(0, 12), st.integers(0, 8), FIELDS), min_size=1, max_size=3))
-def test_tables_of_episodes_with_odd_fields(folder, odd):
+def test_episodes_with_changed_fields_are_exact_or_refused(folder, changes):
     rows = [line.split(",") for line in TABLE.decode().splitlines()]
-    for row, column, field in odd:
+    for row, column, field in changes:
         rows[row][column] = field
     try_table("episodes.csv, odd fields", folder, "\n".join(map(",".join, rows)).encode())
 
 
 @given(edits(3))
-def test_tables_of_episodes_with_bytes_changed(folder, changes):
+def test_episodes_with_changed_bytes_are_exact_or_refused(folder, changes):
     try_table("episodes.csv, bytes changed", folder, edited(TABLE, changes))
 
 
 ARRAYS = {"weights": np.linspace(-1, 1, 6, dtype=np.float32).reshape(2, 3), "count": np.arange(3), "none": np.zeros(0)}
-FLIPS = st.lists(st.tuples(st.floats(0, 1), st.integers(0, 7)), max_size=2)
 VALUES = {"rows": ROWS[:2], "learner": {"decisions": 12, "selection": {}}, "environment": {"state": 2**100}}
 
 
-@given(edits(3), FLIPS)
-def test_checkpoints_with_bytes_changed(folder, changes, flips):
+@given(edits(3), bit_flips())
+def test_checkpoint_with_changed_bytes_is_exact_or_refused(folder, changes, flips):
     save_checkpoint(folder.checkpoint, ARRAYS, VALUES)
-    content = bytearray(edited(folder.checkpoint.read_bytes(), [] if flips else changes))
-    for where, bit in flips:
-        content[min(int(where * len(content)), len(content) - 1)] ^= 1 << bit
-    folder.checkpoint.write_bytes(content)
+    folder.checkpoint.write_bytes(flipped(edited(folder.checkpoint.read_bytes(), [] if flips else changes), flips))
     loaded = attempt("checkpoint, bytes changed", InputError, lambda: load_checkpoint(folder.checkpoint))
     if loaded is not None:
         assert loaded[1] == VALUES
@@ -178,6 +177,7 @@ OBSERVATION = np.array([0.5, -1.0, 2.0])
 
 
 def try_policy(target, folder, expected):
+    """Check that a policy is refused, or acts within its limits and with the expected action unless it is None."""
     policy = attempt(target, InputError, lambda: Policy.load(folder.path))
     if policy is None:
         return
@@ -189,20 +189,18 @@ def try_policy(target, folder, expected):
         np.testing.assert_array_equal(action, expected)
 
 
-@given(st.sampled_from(["policy.json", "policy.safetensors"]), edits(3), FLIPS)
-def test_policies_with_bytes_changed(folder, file, changes, flips):
+@given(st.sampled_from(["policy.json", "policy.safetensors"]), edits(3), bit_flips())
+def test_policy_with_changed_bytes_is_exact_or_refused(folder, file, changes, flips):
     policy = Policy(LAYERS, DESCRIPTION)
     policy.save(folder.path)
-    content = bytearray(edited((folder.path / file).read_bytes(), [] if flips else changes))
-    for where, bit in flips:
-        content[min(int(where * len(content)), len(content) - 1)] ^= 1 << bit
-    (folder.path / file).write_bytes(content)
+    path = folder.path / file
+    path.write_bytes(flipped(edited(path.read_bytes(), [] if flips else changes), flips))
     try_policy("policy, bytes changed", folder, policy(OBSERVATION))
 
 
 @given(st.data())
-def test_policies_with_entries_changed_that_have_their_digest(folder, data):
-    """A policy forged with a valid digest is refused or acts within its limits."""
+def test_policy_with_changed_entries_is_bounded_or_refused(folder, data):
+    """The changed policies have a valid digest."""
     tree = data.draw(changed_trees([DESCRIPTION | {"format": FORMAT}]))
     Policy(LAYERS, DESCRIPTION).save(folder.path)
     tree = json.loads(json.dumps(tree, default=str))
@@ -214,8 +212,8 @@ def test_policies_with_entries_changed_that_have_their_digest(folder, data):
 
 @pytest.fixture(scope="module")
 def resumable(folder):
-    """Return an environment, a small learner, and the arrays and values of its checkpoint."""
-    env = Line()
+    """Return an environment, a small learner, and the arrays and values of the learner's checkpoint."""
+    env = SpacesOnlyEnv()
     settings = {"net_arch": "4", "learning_starts": 2, "batch_size": 2, "gradient_steps": 1, "train_freq": 1}
     learner = LEARNERS.get("tqc")(
         resolve_preset("tqc_contact", "tqc", settings), env, action_repeat=1, seed=0, max_transitions=12, symmetry=None
@@ -231,29 +229,30 @@ def resumable(folder):
     return env, learner, arrays, json.loads(json.dumps(values))
 
 
-class Line(gymnasium.Env):
-    """Environment with spaces and a random generator only."""
+class SpacesOnlyEnv(gymnasium.Env):
+    """Environment without dynamics, with spaces and a random generator."""
 
     observation_space = spaces.Box(-1, 1, (3,), np.float32)
     action_space = spaces.Box(-1, 1, (2,), np.float32)
 
 
 @given(st.data())
-def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable, data):
+def test_checkpoint_with_changed_content_is_exact_or_refused(folder, resumable, data):
+    """The changed checkpoints have a valid digest."""
     env, learner, arrays, values = resumable
     changed = dict(arrays)
     for name in data.draw(st.lists(st.sampled_from(sorted(arrays)), max_size=2)):
-        what = data.draw(st.sampled_from(["remove", "reshape", "type", "number", "rename", "longer"]))
+        action = data.draw(st.sampled_from(["remove", "reshape", "type", "number", "rename", "repeat"]))
         array = changed.pop(name, arrays[name])
-        if what == "reshape":
+        if action == "reshape":
             changed[name] = array.reshape(-1, 1)
-        elif what == "type":
+        elif action == "type":
             changed[name] = array.astype(data.draw(st.sampled_from(["f2", "f8", "i4", "u1"])))
-        elif what == "number":
+        elif action == "number":
             changed[name] = np.full_like(array, data.draw(st.integers(0, 9)))
-        elif what == "rename":
+        elif action == "rename":
             changed[data.draw(st.sampled_from(["", "x", "optimizer/x", f"{name}/0"]))] = array
-        elif what == "longer":
+        elif action == "repeat":
             changed[name] = np.concatenate([array.ravel(), array.ravel()])
     tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
     save_checkpoint(folder.checkpoint, changed, tree)
@@ -264,11 +263,11 @@ def test_checkpoints_with_another_content_that_have_its_digest(folder, resumable
     if resumed is not None:
         rows, _ = resumed
         assert rows == tree["rows"]
-        result, known = learner.state()
-        assert json.loads(json.dumps(known)) == tree["learner"]
-        assert result.keys() == changed.keys()
+        restored_arrays, restored_values = learner.state()
+        assert json.loads(json.dumps(restored_values)) == tree["learner"]
+        assert restored_arrays.keys() == changed.keys()
         for name, array in changed.items():
-            np.testing.assert_array_equal(result[name], array, strict=True)
+            np.testing.assert_array_equal(restored_arrays[name], array, strict=True)
         assert env.np_random.bit_generator.state == tree["environment"]
 
 

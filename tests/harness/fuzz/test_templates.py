@@ -1,4 +1,4 @@
-"""Randomly mutated template files: each is read exactly and works, or is refused in one sentence."""
+"""Mutated template files: each is read exactly and has finite results, or is refused with one sentence."""
 
 import copy
 import dataclasses
@@ -60,7 +60,7 @@ TREES = [yaml.safe_load(text) for text in TEXTS]
 
 
 def check_numbers(template, text):
-    """Check that every number equals that of an independent reader at the same place in the file."""
+    """Check that every number equals the number that an independent reader finds at the same place in the file."""
     result = template_numbers(text)
     data = parse_yaml(text)
     for name, value in template.parameters.items():
@@ -94,6 +94,7 @@ def _scaled(si, value):
 
 
 def check_fields(part, entry, place, found):
+    """Check the fields of a part of a template against its entry in the file and the numbers `found` by the reader."""
     assert set(entry) - {"kind"} <= {field.name for field in dataclasses.fields(part)}
     for key, value in entry.items():
         if key == "of":
@@ -103,6 +104,7 @@ def check_fields(part, entry, place, found):
 
 
 def check_value(value, entry, place, found):
+    """Check a value against its entry in the file; numbers against those `found` by the independent reader."""
     if isinstance(value, tuple):
         assert len(value) == len(entry)
         for number, (inner, inner_entry) in enumerate(zip(value, entry, strict=True)):
@@ -114,7 +116,7 @@ def check_value(value, entry, place, found):
 
 
 def check_laws(template):
-    """Check that every law of every state returns finite values, near the object and far from it."""
+    """Check that all laws of all states return finite values, at a pose near the object and at a distant pose."""
     X_WF = {
         name: RigidTransform(RotationMatrix.MakeZRotation(0.3 + i), [0.5, 0.1 * i, 0.1])
         for i, name in enumerate(template.frames)
@@ -164,7 +166,7 @@ def test_arithmetic_is_exact_or_refused(expression):
     try_template("template, arithmetic", yaml.safe_dump(tree, sort_keys=False))
 
 
-# PyYAML writes the text "1e3" without quotes: to YAML 1.2 it is a number.
+# PyYAML writes the text "1e3" without quotes, which is a number in YAML 1.2.
 WORDS = st.text(max_size=12).filter(lambda text: not re.fullmatch(r"[-+]?[0-9]+[eE][-+]?[0-9]+", text))
 VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | WORDS,

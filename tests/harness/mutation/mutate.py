@@ -1,15 +1,15 @@
 """Mutation testing of the safety code.
 
     python tests/harness/mutation/mutate.py                         # all mutants, hours
-    python tests/harness/mutation/mutate.py --every 8               # an eighth of them, by hashes of the names
-    python tests/harness/mutation/mutate.py qp window               # of these files
+    python tests/harness/mutation/mutate.py --every 8               # an eighth, chosen by hashes of their names
+    python tests/harness/mutation/mutate.py qp window               # mutants of these files
     python tests/harness/mutation/mutate.py --results mutants.json  # resumes an interrupted run
 
-Every operator below is applied wherever it fits: comparisons, arithmetic, logic, numbers, branches, statements, calls
-with a counterpart, slices, keyword arguments, limits and constants × 1.001 (`mutations.py`). A mutant is tried with the
-tests that execute its line, fastest and most successful first, in a fork of a process that has collected them. A mutant
-that passes them survives. `survivors.yaml` explains why a survivor makes no difference. A survivor without an
-explanation is an error, and so is an explanation without a surviving mutant.
+The operators in `mutations.py` change comparisons, arithmetic, logic, numbers, branches, statements, calls with a
+counterpart, slices and keyword arguments, and multiply limits and constants by 1.001. A mutant is tested in a fork of a
+process that has collected the tests. The tests that execute its line run until one fails, fast tests and tests that
+have killed many mutants first. A mutant that passes all of them survives. `survivors.yaml` explains why a survivor
+makes no difference. A survivor without an explanation is an error, and so is an explanation without a surviving mutant.
 """
 
 from __future__ import annotations
@@ -72,10 +72,17 @@ TARGETS = {
     ],
 }
 SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
-# Slow imports without mutants, imported before a process is forked for each mutant.
-HEAVY = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
-HEAVY += ("scipy.optimize", "scipy.sparse", "scipy.spatial.transform", "sklearn.mixture", "yaml", "matplotlib.figure")
-HEAVY += (
+# Modules without mutants whose import is slow: imported before a process is forked for each mutant.
+SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+SLOW_IMPORTS += (
+    "scipy.optimize",
+    "scipy.sparse",
+    "scipy.spatial.transform",
+    "sklearn.mixture",
+    "yaml",
+    "matplotlib.figure",
+)
+SLOW_IMPORTS += (
     "pydrake.multibody.plant",
     "pydrake.systems.analysis",
     "pydrake.systems.framework",
@@ -102,9 +109,9 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owne
         before, value = (_function(each) for each in (old.get(key), value))
         if isinstance(value, FunctionType) and isinstance(before, FunctionType) and value.__module__ == module:
             before.__code__ = value.__code__
-            before.__defaults__ = _grafted(before.__defaults__, value.__defaults__)
-            kept, defaults = before.__kwdefaults__ or {}, value.__kwdefaults__ or {}
-            before.__kwdefaults__ = {k: v if _is_numeric(v) else kept.get(k, v) for k, v in defaults.items()}
+            before.__defaults__ = _graft_defaults(before.__defaults__, value.__defaults__)
+            previous, defaults = before.__kwdefaults__ or {}, value.__kwdefaults__ or {}
+            before.__kwdefaults__ = {k: v if _is_numeric(v) else previous.get(k, v) for k, v in defaults.items()}
         elif isinstance(value, type) and isinstance(before, type) and value.__module__ == module:
             if not issubclass(value, Enum):
                 _graft_all(vars(before), vars(value), module, before)
@@ -112,25 +119,25 @@ def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owne
             if not key.startswith("__") and not np.array_equal(value, before):
                 setattr(owner, key, value)
         elif isinstance(value, CONSTANTS) and not np.array_equal(value, before):
-            for other in list(sys.modules.values()):
-                if vars(other).get(key) is before and other.__name__.split(".")[0] in ("guiderail", *TEST_MODULES):
-                    setattr(other, key, value)
+            for user in list(sys.modules.values()):
+                if vars(user).get(key) is before and user.__name__.split(".")[0] in ("guiderail", *TEST_MODULES):
+                    setattr(user, key, value)
 
 
-def _grafted(before: tuple | None, after: tuple | None) -> tuple | None:
-    """Return the defaults of a function with their numbers replaced by those of a mutant."""
+def _graft_defaults(before: tuple | None, after: tuple | None) -> tuple | None:
+    """Return the defaults of a function, with numbers replaced by the numbers of a mutant."""
     if before is None or after is None or len(before) != len(after):
         return after
     return tuple(b if _is_numeric(b) else a for a, b in zip(before, after, strict=True))
 
 
 def _is_numeric(value: Any) -> bool:
-    """Return True for a number, or a tuple of numbers."""
+    """Return True for a number or a tuple of numbers."""
     return all(map(_is_numeric, value)) if isinstance(value, tuple) else isinstance(value, int | float)
 
 
 def _function(value: Any) -> Any:
-    """Return the function in a property, class method, static method or decorated function."""
+    """Return the function wrapped by a property, class method, static method or decorator."""
     for name in ("fget", "__func__", "func"):
         value = getattr(value, name) if isinstance(value, WRAPPERS) and hasattr(value, name) else value
     return unwrap(value) if isinstance(value, FunctionType) else value
@@ -180,14 +187,14 @@ class _Session:
 
 
 def with_tests(tests: list[str], work: Callable[[dict[str, Any]], None], plugins: list[Any]) -> None:
-    """Collect tests and call `work` with them, by name."""
+    """Collect tests and call `work` with a mapping from their names to the tests."""
     quiet = ["-q", "--no-header", "--no-summary", "-p", "no:cacheprovider", "-p", "no:xdist", "-W", "ignore"]
     if pytest.main([*quiet, *tests], plugins=[_Session(work), *plugins]) != 0:
         raise SystemExit(f"{' '.join(tests)} cannot be collected")
 
 
 def run(items: list[Any]) -> int:
-    """Run tests until one fails; return its index, -1 if all pass."""
+    """Run tests until the first failure; return the index of the failed test, or -1 if all pass."""
     for index, item in enumerate(items):
         following = items[index + 1] if index + 1 < len(items) else None
         item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
@@ -197,7 +204,7 @@ def run(items: list[Any]) -> int:
 
 
 def _forked(work: Callable[[], Any], cpu_seconds: float, default: Any) -> Any:
-    """Run `work` in a silent child process with limits; return its result, or the default if the process is killed."""
+    """Run `work` in a child process without output; return its result, or the default if the process is killed."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -218,44 +225,45 @@ def _forked(work: Callable[[], Any], cpu_seconds: float, default: Any) -> Any:
     return json.loads(text) if text else default
 
 
-def coverage(tests: list[str], items: dict[str, Any], watcher: _Coverage, store: Path) -> dict:
-    """Return the lines of each file that each test executes and the CPU time of each test, without mutations.
+def coverage(tests: list[str], items: dict[str, Any], recorder: _Coverage, store: Path) -> dict:
+    """Return the lines that each test executes in each file, and the CPU time of each test, without mutations.
 
     Args:
         tests: Test files or folders.
         items: Tests by name.
-        watcher: Plugin of the session.
-        store: JSON file in which results are stored, because measuring takes longer than many mutants.
+        recorder: Plugin that records the coverage of the session.
+        store: JSON file of earlier results, because a measurement takes longer than many mutants.
     """
     key = f"{' '.join(tests)} {_newest(tests)}"
-    kept = json.loads(store.read_text()) if store.exists() else {}
-    if key not in kept:
+    stored = json.loads(store.read_text()) if store.exists() else {}
+    if key not in stored:
 
         def work():
             failed = run(list(items.values()))
-            lines = {file: {test: sorted(n) for test, n in of.items()} for file, of in watcher.lines.items()}
-            return {"lines": lines, "seconds": watcher.seconds, "failed": failed}
+            lines = {file: {test: sorted(n) for test, n in tested.items()} for file, tested in recorder.lines.items()}
+            return {"lines": lines, "seconds": recorder.seconds, "failed": failed}
 
-        kept[key] = _forked(work, 3600, {"failed": 0})
-        if kept[key].pop("failed") >= 0:
-            raise SystemExit(f"{' '.join(tests)} fails without a mutation: fix it first")
-        store.write_text(json.dumps(kept))
-    return kept[key]
+        stored[key] = _forked(work, 3600, {"failed": 0})
+        if stored[key].pop("failed") >= 0:
+            raise SystemExit(f"{' '.join(tests)} fails without a mutation: fix the code or the tests first")
+        store.write_text(json.dumps(stored))
+    return stored[key]
 
 
 def _newest(tests: list[str]) -> float:
-    """Return the time of the last change of the tests or of mutated files."""
-    places = [ROOT / test for test in tests] + [ROOT / file for file in TARGETS]
-    files = [file for place in places for file in (place.rglob("*.py") if place.is_dir() else [place])]
+    """Return the time of the last change of a test or mutated file."""
+    paths = [ROOT / test for test in tests] + [ROOT / file for file in TARGETS]
+    files = [file for path in paths for file in (path.rglob("*.py") if path.is_dir() else [path])]
     return max(file.stat().st_mtime for file in files)
 
 
 def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[str]) -> str:
-    """Return the test that fails with a mutant, of those that execute its line; an empty text if all pass."""
-    here, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
+    """Return the first test that fails with a mutant, or "" if all tests that execute its line pass."""
+    mutated, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
     lines = covered["lines"].get(mutant.file, {})
-    chosen = {test for test in seconds if any(line in here for line in lines.get(test, ()))}
-    # Only the first test executes a shared fixture, and none executes constants and defaults: add the file's own tests.
+    chosen = {test for test in seconds if any(line in mutated for line in lines.get(test, ()))}
+    # Only the first test executes a shared fixture, and no test executes constants and defaults. Therefore all tests of
+    # the test file with the same name are added.
     chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
     chosen = sorted(chosen or seconds, key=lambda test: (seconds[test] + 1e-3) / (1.0 + kills[test]))
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
@@ -272,31 +280,33 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("files", nargs="*", help="names of files without .py (default: all)")
     parser.add_argument("--every", type=int, default=1, help="try one mutant of this many")
-    parser.add_argument("--results", type=Path, help="JSON file of results, for resuming")
+    parser.add_argument("--results", type=Path, help="JSON file of results; an interrupted run is resumed from it")
     parser.add_argument("--again", action="store_true", help="try survivors again")
     arguments = parser.parse_args()
     if unknown := {*arguments.files} - {Path(file).stem for file in TARGETS}:
         parser.error(f"there is no file of the safety code called {min(unknown)}")
     os.chdir(ROOT)
-    for name in HEAVY:
+    for name in SLOW_IMPORTS:
         importlib.import_module(name)
     with tempfile.TemporaryDirectory() as folder:
         results = arguments.results.absolute() if arguments.results else Path(folder) / "mutants.json"
         files = [file for file in TARGETS if not arguments.files or Path(file).stem in arguments.files]
-        wrong, total, killed = np.sum([try_file(file, arguments.every, results, arguments.again) for file in files], 0)
-    print(f"total: {killed} of {total} killed ({killed / max(total, 1):.1%}); {wrong} to be explained or fixed")
-    return min(int(wrong), 1)
+        problems, total, killed = np.sum(
+            [try_file(file, arguments.every, results, arguments.again) for file in files], 0
+        )
+    print(f"total: {killed} of {total} killed ({killed / max(total, 1):.1%}); {problems} to be explained or fixed")
+    return min(int(problems), 1)
 
 
-def try_mutants(file: str, found: list[Mutant], kept: Path, again: bool) -> None:
+def try_mutants(file: str, sample: list[Mutant], store: Path, again: bool) -> None:
     """Try the mutants of a file that have no result yet, in a process that has collected its tests."""
-    tried = json.loads(kept.read_text()) if kept.exists() else {}
-    results, reasons = tried.setdefault(file, {}), _reasons(file)
-    watcher, kills = _Coverage(), Counter[str]()
+    stored = json.loads(store.read_text()) if store.exists() else {}
+    results, reasons = stored.setdefault(file, {}), _reasons(file)
+    recorder, kills = _Coverage(), Counter[str]()
 
     def work(items):
-        covered = coverage(TARGETS[file], items, watcher, kept.with_suffix(".coverage"))
-        for mutant in found:
+        covered = coverage(TARGETS[file], items, recorder, store.with_suffix(".coverage"))
+        for mutant in sample:
             if mutant.name in results and not (again and results[mutant.name] == "survived"):
                 continue
             test = killer(mutant, items, covered, kills)
@@ -304,38 +314,43 @@ def try_mutants(file: str, found: list[Mutant], kept: Path, again: bool) -> None
             results[mutant.name] = f"killed by {test}" if test else "survived"
             if not test and mutant.name not in reasons:
                 print(f"{file}:{mutant.line}: survives: {mutant.name}", file=sys.__stderr__, flush=True)
-            kept.write_text(json.dumps(tried, indent=1, ensure_ascii=False))
+            store.write_text(json.dumps(stored, indent=1, ensure_ascii=False))
 
-    with_tests(TARGETS[file], work, [watcher])
+    with_tests(TARGETS[file], work, [recorder])
 
 
 def _reasons(file: str) -> dict[str, str]:
     return yaml.safe_load(SURVIVORS.read_text()).get(file, {})
 
 
-def try_file(file: str, every: int, kept: Path, again: bool) -> tuple[int, int, int]:
-    """Return the numbers of unexplained survivors and stale explanations, of mutants, and of killed mutants."""
-    everything, reasons = mutants(file), _reasons(file)
-    result = [mutant for mutant in everything if mutant.is_in_sample(every)]
+def try_file(file: str, every: int, store: Path, again: bool) -> tuple[int, int, int]:
+    """Try a sample of a file's mutants; return the numbers of problems, of mutants, and of killed mutants.
+
+    Problems are unexplained survivors and stale explanations.
+    """
+    all_mutants, reasons = mutants(file), _reasons(file)
+    sample = [mutant for mutant in all_mutants if mutant.is_in_sample(every)]
     child = os.fork()
     if child == 0:
         status = 1
         try:
-            try_mutants(file, result, kept, again)
+            try_mutants(file, sample, store, again)
             status = 0
         finally:
             os._exit(status)
     if os.waitpid(child, 0)[1]:
         raise SystemExit(f"{file}: the mutants could not be tried")
-    results = json.loads(kept.read_text())[file] if kept.exists() else {}
-    survivors = {mutant.name for mutant in result if results[mutant.name] == "survived"}
-    killed = {mutant.name for mutant in result} - survivors
-    stale = (set(reasons) - {mutant.name for mutant in everything}) | (killed & set(reasons))
+    results = json.loads(store.read_text())[file] if store.exists() else {}
+    survivors = {mutant.name for mutant in sample if results[mutant.name] == "survived"}
+    killed = {mutant.name for mutant in sample} - survivors
+    stale = (set(reasons) - {mutant.name for mutant in all_mutants}) | (killed & set(reasons))
     for name in sorted(stale):
-        print(f"{file}: explained, but not a survivor: {name}", flush=True)
-    known = len(survivors & set(reasons))
-    print(f"{file}: {len(killed)} of {len(result)} killed, {known} explained, {len(survivors) - known} not", flush=True)
-    return len(survivors) - known + len(stale), len(result), len(killed)
+        print(f"{file}: explanation without a survivor: {name}", flush=True)
+    explained = len(survivors & set(reasons))
+    unexplained = len(survivors) - explained
+    counts = f"{len(killed)} of {len(sample)} killed, {explained} explained, {unexplained} not explained"
+    print(f"{file}: {counts}", flush=True)
+    return unexplained + len(stale), len(sample), len(killed)
 
 
 if __name__ == "__main__":

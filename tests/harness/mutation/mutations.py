@@ -40,10 +40,10 @@ COUNTERPART = {
     **{"max": "min", "all": "any", "maximum": "minimum", "argmax": "argmin", "cos": "sin", "ones": "zeros"},
     **{"radians": "degrees", "deg2rad": "rad2deg", "sum": "max", "mean": "max", "asin": "sin", "flatnonzero": "argmin"},
 }
-# Calls that are replaced by their argument. Conversions of a number's type are not among them: NumPy's numbers behave
-# like Python's.
+# Calls that are replaced by their argument. Conversions of a number's type are left out: NumPy's numbers behave like
+# Python's.
 DROPPED = {"abs", "sqrt", "copy", "sorted", "round", "array", "asarray"}
-# Keyword arguments that are not removed: they only make Drake evaluate less often, check a length, or choose a type.
+# Keyword arguments that are not removed: they only reduce evaluations by Drake, check a length, or choose a type.
 KEPT_KEYWORDS = {"prerequisites_of_calc", "strict", "dtype"}
 LIMITS = ast.Lt | ast.LtE | ast.Gt | ast.GtE
 
@@ -52,15 +52,15 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
     """Yield the mutations of a node; None removes a statement."""
     if isinstance(node, ast.Compare) and len(node.ops) >= 1:
         for i, operator in enumerate(node.ops):
-            for other in ORDER[type(operator)]:
-                yield _with(node, ops=[*node.ops[:i], other(), *node.ops[i + 1 :]])
+            for replacement in ORDER[type(operator)]:
+                yield _with(node, ops=[*node.ops[:i], replacement(), *node.ops[i + 1 :]])
             left, right = ([node.left, *node.comparators][j] for j in (i, i + 1))
-            # Scaling `right` has no effect if it is infinite, or if `left` is zero and nothing but infinity follows:
-            # then only the sign of `right` matters.
-            following = [ast.unparse(other) for other in node.comparators[i : i + 2]]
+            # Scaling `right` has no effect if `right` is infinite, or if `left` is zero and no finite limit follows:
+            # only the sign of `right` matters then.
+            following = [ast.unparse(comparator) for comparator in node.comparators[i : i + 2]]
             is_zero = isinstance(left, ast.Constant) and left.value == 0
-            is_same = following[0] == "np.inf" or (is_zero and following[1:] in ([], ["np.inf"]))
-            if isinstance(operator, LIMITS) and not is_same and not isinstance(right, ast.Constant | ast.UnaryOp):
+            has_no_effect = following[0] == "np.inf" or (is_zero and following[1:] in ([], ["np.inf"]))
+            if isinstance(operator, LIMITS) and not has_no_effect and not isinstance(right, ast.Constant | ast.UnaryOp):
                 wider = ast.copy_location(ast.BinOp(right, ast.Mult(), ast.Constant(1.001)), right)
                 yield _with(node, comparators=[*node.comparators[:i], wider, *node.comparators[i + 1 :]])
     elif isinstance(node, ast.BinOp) and type(node.op) in ARITHMETIC:
@@ -77,11 +77,11 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
     elif isinstance(node, ast.BoolOp):
         yield _with(node, op=ast.Or() if isinstance(node.op, ast.And) else ast.And())
     elif isinstance(node, ast.Constant):
-        yield from (ast.copy_location(ast.Constant(value), node) for value in _other_constants(node.value))
+        yield from (ast.copy_location(ast.Constant(value), node) for value in _changed_constants(node.value))
     elif isinstance(node, ast.If | ast.While | ast.IfExp):
         yield from (_with(node, test=ast.copy_location(ast.Constant(value), node.test)) for value in (True, False))
     elif isinstance(node, ast.Call):
-        yield from _other_calls(node)
+        yield from _changed_calls(node)
     elif isinstance(node, ast.Attribute) and node.attr == "T" and isinstance(node.ctx, ast.Load):
         yield node.value
     elif isinstance(node, ast.Slice):
@@ -93,13 +93,13 @@ def changes(node: ast.AST) -> Iterator[ast.AST | None]:
 
 
 def _can_be_removed(node: ast.AST) -> bool:
-    """Return True for a statement that defines no name for the following ones."""
+    """Return True for a statement that defines no name for the following statements."""
     if isinstance(node, ast.Assign):
         return not any(isinstance(target, ast.Name | ast.Tuple) for target in node.targets)
     return isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Call))
 
 
-def _other_constants(value):
+def _changed_constants(value):
     if isinstance(value, bool):
         return [not value]
     if isinstance(value, int):
@@ -109,7 +109,7 @@ def _other_constants(value):
     return []
 
 
-def _other_calls(node: ast.Call) -> Iterator[ast.AST]:
+def _changed_calls(node: ast.Call) -> Iterator[ast.AST]:
     called = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
     if called in COUNTERPART:
         func = copy.deepcopy(node.func)
@@ -129,13 +129,13 @@ def _other_calls(node: ast.Call) -> Iterator[ast.AST]:
 
 
 def _with(node: ast.AST, **fields) -> ast.AST:
-    other = copy.copy(node)
+    changed = copy.copy(node)
     for name, value in fields.items():
-        setattr(other, name, value)
-    return other
+        setattr(changed, name, value)
+    return changed
 
 
-Place = tuple[tuple[str, int | None], ...]
+NodePath = tuple[tuple[str, int | None], ...]
 
 
 @dataclass(frozen=True)
@@ -146,8 +146,8 @@ class Mutant:
     name: str
     line: int
     last_line: int
-    path: Place
-    change: int
+    path: NodePath
+    change: int  # index of the mutation among those of the node
 
     def tree(self) -> ast.Module:
         """Return the syntax tree of the mutated file."""
@@ -164,7 +164,7 @@ def mutants(file: str) -> list[Mutant]:
     """Return the mutants of a file in the order of its lines."""
     tree = ast.parse((ROOT / file).read_text())
     result, seen = [], Counter()
-    for path in list(_places(tree)):
+    for path in list(_node_paths(tree)):
         for i, _ in enumerate(changes(_at(tree, path))):
             depth = _depth_of_statement(tree, path)
             before = _at(tree, path[:depth])
@@ -179,10 +179,10 @@ def mutants(file: str) -> list[Mutant]:
     return result
 
 
-def _places(node: ast.AST, path: Place = ()) -> Iterator[Place]:
-    """Yield the paths of all code nodes: no docstrings, annotations, decorators, messages, imports or enumerators.
+def _node_paths(node: ast.AST, path: NodePath = ()) -> Iterator[NodePath]:
+    """Yield the paths of all nodes except those of annotations, decorators, messages, imports and enumerations.
 
-    The index of a port's value is left out too: most ports have one entry.
+    The index of a port's value is left out as well, because most ports have one entry.
     """
     if isinstance(node, ast.ClassDef) and any("Enum" in ast.unparse(base) for base in node.bases):
         return
@@ -195,36 +195,36 @@ def _places(node: ast.AST, path: Place = ()) -> Iterator[Place]:
         if field == "slice" and ".Eval(" in ast.unparse(node.value):
             continue
         if isinstance(value, ast.AST):
-            yield from _places(value, (*path, (field, None)))
+            yield from _node_paths(value, (*path, (field, None)))
         elif isinstance(value, list):
             for i, entry in enumerate(value):
                 if isinstance(entry, ast.AST):
-                    yield from _places(entry, (*path, (field, i)))
+                    yield from _node_paths(entry, (*path, (field, i)))
 
 
-def _at(node, path: Place):
+def _at(node, path: NodePath):
     for field, i in path:
         node = getattr(node, field) if i is None else getattr(node, field)[i]
     return node
 
 
-def _replace(tree: ast.Module, path: Place, new: ast.AST | None) -> None:
-    holder, (field, i) = _at(tree, path[:-1]), path[-1]
+def _replace(tree: ast.Module, path: NodePath, new: ast.AST | None) -> None:
+    parent, (field, i) = _at(tree, path[:-1]), path[-1]
     if new is None:
         new = ast.copy_location(ast.Pass(), _at(tree, path))
     if i is None:
-        setattr(holder, field, new)
+        setattr(parent, field, new)
     else:
-        getattr(holder, field)[i] = new
+        getattr(parent, field)[i] = new
 
 
-def _depth_of_statement(tree: ast.Module, path: Place) -> int:
-    """Return the length of the path to the innermost statement around a node."""
+def _depth_of_statement(tree: ast.Module, path: NodePath) -> int:
+    """Return the length of the path to the innermost statement that contains a node."""
     return next(n for n in range(len(path), -1, -1) if isinstance(_at(tree, path[:n]), ast.stmt))
 
 
 def _source(statement: ast.stmt) -> str:
-    """Return the source of a statement, of a block only its head."""
+    """Return the source of a statement without the body of a compound statement."""
     head = copy.copy(statement)
     if hasattr(head, "body"):
         head.body = [ast.Pass()]
@@ -234,14 +234,14 @@ def _source(statement: ast.stmt) -> str:
     return " ".join(ast.unparse(head).removesuffix("pass").split()).removesuffix(":")
 
 
-def _function(tree: ast.Module, path: Place) -> str:
-    """Return the function or class around a node."""
-    around = [_at(tree, path[:n]) for n in range(len(path))]
-    return ".".join(node.name for node in around if isinstance(node, ast.FunctionDef | ast.ClassDef)) or "module"
+def _function(tree: ast.Module, path: NodePath) -> str:
+    """Return the qualified name of the function or class that contains a node; "module" outside of both."""
+    parents = [_at(tree, path[:n]) for n in range(len(path))]
+    return ".".join(node.name for node in parents if isinstance(node, ast.FunctionDef | ast.ClassDef)) or "module"
 
 
 def _difference(before: str, after: str, context: int = 30) -> str:
-    """Return the difference between two lines, with context."""
+    """Return the difference between two lines with `context` characters on each side."""
     start = _common(before, after)
     end = _common(before[start:][::-1], after[start:][::-1])
     left, right = before[max(0, start - context) : start], before[len(before) - end :][:context]
