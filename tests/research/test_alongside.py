@@ -1,4 +1,4 @@
-"""Student trained alongside a teacher: the equivalent task-space actions, and the comparison."""
+"""Training of a student alongside its teacher: equivalent task-space actions, and the comparison of variants."""
 
 import numpy as np
 import pandas as pd
@@ -12,7 +12,7 @@ from guiderail.tools.tables import write_table
 
 
 class RecordingStudent:
-    """Student that records the transitions that it gets."""
+    """Stub of a student that records its transitions."""
 
     def __init__(self):
         self.transitions, self.episodes = [], 0
@@ -28,22 +28,22 @@ class RecordingStudent:
 
 
 @pytest.mark.parametrize("action", [[0.0, 0.0], [0.6, -0.3]])
-def test_equivalent_actions_command_nearly_the_same(action):
-    """The student's environment, driven by the equivalent actions, commands what the teacher commanded."""
-    teacher, student = (make_environment(alongside.TASK, one) for one in (alongside.TEACHER, alongside.STUDENT))
+def test_equivalent_actions_command_nearly_the_same_poses(action):
+    """Equivalent actions in the student's environment command nearly the same poses as the teacher's actions."""
+    teacher, student = (make_environment(alongside.TASK, env) for env in (alongside.TEACHER, alongside.STUDENT))
     recorder = RecordingStudent()
     callback = alongside.TaskSpaceTransitions(teacher, recorder, alongside.STUDENT)
     rollout(teacher, lambda observation: np.array(action, np.float32), callback, seed=3)
-    commanded = teacher.unwrapped.trace.commanded.copy()
+    teacher_poses = teacher.unwrapped.trace.commanded.copy()
     assert recorder.episodes == 1
     assert recorder.transitions[-1].is_last
-    actions = iter([one.action for one in recorder.transitions])
+    actions = iter([transition.action for transition in recorder.transitions])
     rollout(student, lambda observation: next(actions, np.zeros(2, np.float32)), seed=3)
-    other = student.unwrapped.trace.commanded[: len(commanded)]
-    size = min(len(commanded), len(other))
-    # Within an action the teacher's displacement changes, the student's does not.
-    np.testing.assert_allclose(other[:size, :2], commanded[:size, :2], atol=2.5e-4)
-    np.testing.assert_allclose(other[:size, 2:], commanded[:size, 2:], atol=2e-2)
+    student_poses = student.unwrapped.trace.commanded[: len(teacher_poses)]
+    size = min(len(teacher_poses), len(student_poses))
+    # During an action, the displacement changes for the teacher and is constant for the student.
+    np.testing.assert_allclose(student_poses[:size, :2], teacher_poses[:size, :2], atol=2.5e-4)  # [m]
+    np.testing.assert_allclose(student_poses[:size, 2:], teacher_poses[:size, 2:], atol=2e-2)
 
 
 @pytest.fixture
@@ -58,7 +58,7 @@ def evaluated(monkeypatch):
 
     def train(out, episodes, refinement, seed):
         acting = ["teacher"] * episodes + ["student"] * refinement
-        write_table(out / "training", [{"seed": seed, "acting": one} for one in acting])
+        write_table(out / "training", [{"seed": seed, "acting": name} for name in acting])
 
     monkeypatch.setattr(alongside, "evaluate_variant", evaluate)
     monkeypatch.setattr(alongside, "train_both", train)
@@ -66,7 +66,7 @@ def evaluated(monkeypatch):
     return evaluated
 
 
-def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, evaluated):
+def test_comparison_has_a_row_per_variant_and_stores_blocks(tmp_path, evaluated):
     for _ in range(2):
         rows = alongside.compare(tmp_path / "out", episodes=11)
         assert [row["variant"] for row in rows] == list(alongside.VARIANTS)
@@ -77,8 +77,8 @@ def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, evalu
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"training": 3}, {"refinement": 2}])
 def test_comparison_is_refused_when_other_training_is_stored(change, tmp_path, evaluated):
-    given = {"episodes": 1, "training": 2, "refinement": 1, "seed": 0}
-    alongside.compare(tmp_path, **given)
+    arguments = {"episodes": 1, "training": 2, "refinement": 1, "seed": 0}
+    alongside.compare(tmp_path, **arguments)
     with pytest.raises(InputError, match="--seed, --training and --refinement, or another --out"):
-        alongside.compare(tmp_path, **given | change)
+        alongside.compare(tmp_path, **arguments | change)
     assert len(evaluated) == len(alongside.VARIANTS)

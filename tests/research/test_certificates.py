@@ -1,4 +1,4 @@
-"""Certificates of several skills in one table."""
+"""Certification of several skills, with a table of results."""
 
 import pandas as pd
 import pytest
@@ -9,11 +9,12 @@ from research.command import run_program
 
 
 def declaration(guidance="kgrl"):
-    environment = {"guidance": guidance, "control_period": 0.05}  # a third of the time
+    """Return a declaration of a single skill."""
+    environment = {"guidance": guidance, "control_period": 0.05}  # fewer control steps, which shortens the test
     return Declaration(skills={"passage": {"task": "NarrowPassage", "env": environment}}, attack=2000)
 
 
-def test_certificates_are_reused_if_already_computed(tmp_path, monkeypatch):
+def test_certificates_are_reused_when_skill_is_unchanged(tmp_path, monkeypatch):
     result = certify_skills(tmp_path, declaration())
     rows = pd.read_csv(tmp_path / "certificates.csv")
     assert rows["skill"].tolist() == ["passage"]
@@ -24,7 +25,7 @@ def test_certificates_are_reused_if_already_computed(tmp_path, monkeypatch):
     assert row["attack_steps"] >= 2000
     monkeypatch.setattr("research.certificates.certify_skill", None)
     assert certify_skills(tmp_path, declaration())["table"] == result["table"]
-    with pytest.raises(TypeError):  # the result of another skill with the same name is not reused
+    with pytest.raises(TypeError):  # another skill with the same name is certified again
         certify_skills(tmp_path, declaration("skgrl"))
 
 
@@ -51,7 +52,7 @@ def test_declaration_is_refused_when_invalid(text, message, tmp_path):
 
 
 def certified(checker="yes", violations=0):
-    """Result of certifying a skill."""
+    """Return the result of certifying a skill."""
     row = {"quantity": "pose", "output": 0, "constraint": "never active", "ratio": 1.0, "violations": violations}
     numbers = dict.fromkeys(("checker_seconds", "steps", "constrained_steps"), 1)
     return {"checker": checker, "attack": [row], "attack_steps": 1, "attack_corrected": 0, **numbers}

@@ -18,7 +18,7 @@ PROGRAMS = (action_fuzzing, benchmarks, certificates, figures, generate, results
 
 
 def run(capsys, program, *arguments):
-    """Return exit code, standard output and standard error of a program."""
+    """Run a program; return exit code, standard output and standard error of a program."""
     with pytest.raises(SystemExit) as ended:
         run_program(program, [str(argument) for argument in arguments])
     out, err = capsys.readouterr()
@@ -68,7 +68,7 @@ def test_wrong_input_is_one_sentence_with_exit_code_2(program, arguments, messag
     assert list(tmp_path.iterdir()) == []
 
 
-def test_generators_write_into_the_named_folder(tmp_path, capsys):
+def test_generator_writes_into_the_given_folder(tmp_path, capsys):
     assert run(capsys, generate, "clamp-objects", "--out", tmp_path)[0] == 0
     assert any(tmp_path.iterdir())
 

@@ -1,4 +1,4 @@
-"""Comparison of a student with its teacher: options of the variants, stored blocks, and refused arguments."""
+"""Comparison of a distilled student with its teacher: options of the variants, stored blocks, refused arguments."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 
 
-def test_variants_change_the_guidance_of_the_teachers_environment_only():
+def test_variants_replace_only_the_guidance_of_the_teacher():
     arguments = "NarrowPassage", ENVIRONMENT, Path("student"), 10
     assert distillation.options_of("teacher", *arguments)["guidance"] == "kgrl"
     for variant in list(distillation.VARIANTS)[1:]:
@@ -23,7 +23,7 @@ def test_variants_change_the_guidance_of_the_teachers_environment_only():
         assert options["action_repeat"] == 10
 
 
-def test_comparison_has_a_row_for_each_variant_and_stores_blocks(tmp_path, monkeypatch):
+def test_comparison_has_a_row_per_variant_and_stores_blocks(tmp_path, monkeypatch):
     evaluated = []
 
     def evaluate(teacher, student, variant, episodes, seed):

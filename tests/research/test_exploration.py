@@ -1,4 +1,4 @@
-"""Exploration noise."""
+"""Samplers of exploration noise."""
 
 import numpy as np
 import pytest
@@ -17,12 +17,14 @@ SAMPLERS = {
 
 
 def sequence(name, seed=0):
+    """Return the actions of a sampler, (STEPS, SIZE)."""
     sample, arguments = SAMPLERS[name]
     act = open_loop(sample, np.random.default_rng(seed), STEPS, SIZE, **arguments)
     return np.array([act(np.zeros(3)) for _ in range(STEPS)])
 
 
 def roughness(actions):
+    """Return the RMS of the third differences of actions."""
     return np.sqrt(np.mean(np.diff(actions, 3, axis=0) ** 2))
 
 
@@ -57,13 +59,13 @@ def test_pink_noise_has_the_same_power_in_every_octave():
 def test_state_dependent_noise_is_resampled_after_the_interval():
     act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
     states = [np.ones(5), np.ones(5), 2.0 * np.ones(5) - np.arange(5), np.ones(5)]
-    first, repeated, elsewhere, resampled = (act(state) for state in states)
+    first, repeated, other_state, resampled = (act(state) for state in states)
     np.testing.assert_array_equal(first, repeated)
-    assert not np.allclose(first, elsewhere)
+    assert not np.allclose(first, other_state)
     assert not np.allclose(first, resampled)
 
 
-def test_state_dependent_noise_is_zero_when_the_observation_is():
+def test_state_dependent_noise_is_zero_for_a_zero_observation():
     act = state_dependent(np.random.default_rng(0), STEPS, SIZE, interval=3)
     np.testing.assert_array_equal(act(np.zeros(5)), np.zeros(SIZE))
 

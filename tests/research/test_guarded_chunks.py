@@ -1,4 +1,4 @@
-"""Independent check of commands, on both sides of each limit, and the comparison of guards."""
+"""Check of commands just below and above each limit, and the comparison of guards."""
 
 import numpy as np
 import pandas as pd
@@ -11,6 +11,7 @@ PERIOD, ONES = 0.5, np.ones(2)
 
 
 def check(commands, **limits):
+    """Check commands (N, 2) against wide limits, some of which are replaced; return the counts and excesses."""
     arguments = {"lower": -ONES, "upper": ONES, "speed": 1e3 * ONES, "jerk": 1e3 * ONES, "period": PERIOD} | limits
     return guarded.check_commands(np.asarray(commands, float), **arguments)
 
@@ -21,7 +22,7 @@ def test_check_counts_commands_beyond_each_limit_only():
     assert check(ramp, upper=np.array([0.45, 1.0]))["bound_violations"] == 1
     assert check(ramp, speed=np.array([0.2, 1.0]))["speed_violations"] == 0
     assert check(ramp, speed=np.array([0.199, 1.0]))["speed_violations"] == 5
-    cubic = np.outer(np.arange(6) ** 3, [0.01, 0.0])  # third difference 0.06
+    cubic = np.outer(np.arange(6) ** 3, [0.01, 0.0])  # the third difference is 0.06 at each of 3 steps
     assert check(cubic, jerk=np.array([0.06 / PERIOD**3, 1.0]), upper=9 * ONES)["jerk_violations"] == 0
     result = check(cubic, jerk=np.array([0.03 / PERIOD**3, 1.0]), upper=9 * ONES)
     assert result["jerk_violations"] == 3

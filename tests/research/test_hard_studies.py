@@ -1,4 +1,4 @@
-"""The studies of difficulty `hard`."""
+"""Studies of difficulty "hard", and the scripted policies for pouring."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ HARD = (
     "grid_clamp_robot_sensing",
 )
 SWEEPS = ("connector_sweep", "grid_clamp_sweep", "pouring_sweep", "narrow_passage_sweep")
-# Study whose policies a sweep evaluates.
+# The study whose policies each sweep evaluates.
 TRAINED_BY = {
     "connector_sweep": "connector_hard",
     "grid_clamp_sweep": "grid_clamp_hard",
@@ -30,7 +30,7 @@ TRAINED_BY = {
 
 
 @pytest.mark.parametrize("name", [*HARD, *SWEEPS])
-def test_every_method_can_be_configured(name, tmp_path):
+def test_all_methods_of_a_study_can_be_configured(name, tmp_path):
     study = load_study(study_path(name))
     for method in study.methods:
         job = Job(study, method, study.seeds[0], tmp_path)
@@ -38,16 +38,19 @@ def test_every_method_can_be_configured(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", TRAINED_BY)
-def test_sweep_evaluates_policies_of_another_study(name, tmp_path):
+def test_sweep_evaluates_the_policies_of_its_study(name, tmp_path):
     sweep, trained = load_study(study_path(name)), load_study(study_path(TRAINED_BY[name]))
-    shared = [m for m, one in sweep.methods.items() if one.policy == LEARNED]
-    assert shared
-    for method in shared:
+    learned = [name for name, method in sweep.methods.items() if method.policy == LEARNED]
+    assert learned
+    for method in learned:
         for seed in sweep.methods[method].seeds or sweep.seeds:
-            ours, theirs = (Job(study, method, seed, tmp_path) for study in (sweep, trained))
             assert seed in trained.seeds
-            assert ours.folder.path == theirs.folder.path
-            assert ours.config(ours.after_episodes[-1]) == theirs.config(theirs.after_episodes[-1])
+            jobs = [Job(study, method, seed, tmp_path) for study in (sweep, trained)]
+            folders, configs = zip(
+                *((job.folder.path, job.config(job.after_episodes[-1])) for job in jobs), strict=True
+            )
+            assert folders[0] == folders[1]
+            assert configs[0] == configs[1]
 
 
 @pytest.mark.parametrize("name", SWEEPS)
@@ -58,19 +61,20 @@ def test_sweep_is_monotonic(name):
 
 
 def pouring_observation(tip, error=(0.0, 0.0), state=1.0, tilt=0.0):
+    """Return an observation of the pouring task from positions [m] and a tilt [rad]."""
     values = [*(POSITION_SCALE * np.array(tip)), -tilt, 0.0, 0.0, *(np.array(error) / MAX_MUG_ERROR), state]
     return np.array(values)
 
 
-def test_aimed_policy_aims_before_it_pours():
+def test_aimed_policy_aims_before_tilting():
     np.testing.assert_array_equal(scripted_pour_aimed(pouring_observation((0.05, -0.2, 0.06)))[[0, 2]], [-1.0, 0.0])
     assert scripted_pour_aimed(pouring_observation((0.0, -0.045, 0.06)))[2] == 1.0
     tilted = pouring_observation((0.05, -0.2, 0.06), tilt=np.deg2rad(100))
-    assert scripted_pour_aimed(tilted)[2] == 1.0  # the balls roll: tilting back does not help
+    assert scripted_pour_aimed(tilted)[2] == 1.0  # the balls already roll, so tilting back would not help
 
 
-def test_blind_policy_ignores_the_displacement():
-    """The actions are the same in the frame of the expected mug position."""
+def test_blind_policy_ignores_the_displacement_of_the_mug():
+    """The blind policy acts like the aimed policy for a mug at the estimated position."""
     for state in (-1.0, 0.0, 1.0):
         blind = scripted_pour_blind(pouring_observation((0.01 + 0.04, -0.1 - 0.02, 0.06), (0.04, -0.02), state))
         np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""The benchmark of smoothness and its measures."""
+"""Smoothness benchmark and its measures."""
 
 import numpy as np
 import pytest
@@ -15,16 +15,17 @@ from research.smoothness import (
 
 
 def minimum_jerk(duration=1.0, period=0.01, size=1.0):
+    """Return a minimum-jerk motion along the first of two axes, (N, 2)."""
     t = np.arange(0.0, duration + period / 2, period) / duration
     return size * np.column_stack([10 * t**3 - 15 * t**4 + 6 * t**5, 0 * t])
 
 
 def test_log_dimensionless_jerk_of_minimum_jerk_is_closed_form():
-    """∫ jerk² dt = 720 D²/T⁵ and v = 1.875 D/T."""
+    """For distance D and duration T, ∫ jerk² dt = 720 D²/T⁵, and the peak velocity is 1.875 D/T."""
     assert log_dimensionless_jerk(minimum_jerk(), 0.01) == pytest.approx(-np.log(720 / 1.875**2), abs=0.1)
 
 
-def test_measures_do_not_depend_on_tempo_or_unit():
+def test_measures_do_not_depend_on_duration_or_unit():
     reference = log_dimensionless_jerk(minimum_jerk(), 0.01)
     assert log_dimensionless_jerk(minimum_jerk(size=1e-3), 0.01) == pytest.approx(reference, abs=1e-9)
     assert log_dimensionless_jerk(minimum_jerk(), 0.02) == pytest.approx(reference, abs=1e-9)
@@ -42,11 +43,11 @@ def test_measures_decrease_with_noise():
     for frequency in (0, 4, 8):
         tremor = 1e-2 * np.sin(2 * np.pi * frequency * 0.01 * np.arange(101))
         arcs.append(spectral_arc_length(minimum_jerk() + tremor[:, None] * [1.0, 0.0], 0.01))
-    assert arcs[0] == pytest.approx(-1.41, abs=0.01)  # the value of the paper
+    assert arcs[0] == pytest.approx(-1.41, abs=0.01)  # value in the paper
     assert arcs[0] > arcs[1] > arcs[2]
 
 
-def test_measures_of_no_motion():
+def test_measures_have_fixed_values_without_motion():
     motionless = np.zeros((50, 3))
     assert log_dimensionless_jerk(motionless, 0.02) == -np.inf
     assert spectral_arc_length(motionless, 0.02) == 0.0
@@ -54,7 +55,7 @@ def test_measures_of_no_motion():
 
 
 @pytest.mark.parametrize("wrong", [{"episodes": 0}, {"action_scale": 0.0}, {"outputs": "some"}])
-def test_smoothness_refuses_numbers_out_of_range(tmp_path, wrong):
+def test_smoothness_refuses_invalid_arguments(tmp_path, wrong):
     with pytest.raises(InputError):
         smoothness(tmp_path / "new", **wrong)
     assert not (tmp_path / "new").exists()
@@ -64,7 +65,7 @@ def test_methods_have_different_names():
     names = [method.name for method in methods()]
     assert len(set(names)) == len(names)
     for kind in ("KGRL", "adaptive", "white", "gSDE", "pink", "OU", "low-pass", "repeat"):
-        assert any(kind in name for name in names), kind
+        assert any(kind in name for name in names), f"no method of kind {kind}"
 
 
 @pytest.fixture(scope="module")

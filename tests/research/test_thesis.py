@@ -1,4 +1,4 @@
-"""Differences between configurations and the thesis."""
+"""Description of the differences between a configuration and the thesis."""
 
 from dataclasses import replace
 
@@ -15,10 +15,11 @@ from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
 
 
 def differences_of(task, environment=None, **given):
+    """Return the described differences of a configuration from the thesis."""
     return describe_differences(configure(task, environment or {}, **with_defaults(task, given)))
 
 
-def test_thesis_options_exist_and_take_the_values_of_the_thesis():
+def test_thesis_options_exist_and_accept_the_thesis_values():
     for task, setting in THESIS.items():
         known = configure(task, {}).environment
         for name, values in setting.options.items():
@@ -39,12 +40,12 @@ AS_PRINTED = {
 
 
 def test_printed_connector_settings_differ_in_remarks_only():
-    words = differences_of("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
-    assert all("thesis: " in one for one in words)
-    assert not any(one.startswith(("control steps", "ρ", "learning rate", "gamma", "station")) for one in words)
-    assert any(one.startswith("simulated") for one in words)
-    applies = [holds(configure("BncConnector", AS_PRINTED).environment) for _, holds in THESIS["BncConnector"].remarks]
-    assert len(words) == sum(applies)
+    remarks = differences_of("BncConnector", AS_PRINTED, algorithm="tqc", preset="table_4_1_robot")
+    assert all("thesis: " in remark for remark in remarks)
+    assert not any(remark.startswith(("control steps", "ρ", "learning rate", "gamma", "station")) for remark in remarks)
+    assert any(remark.startswith("simulated") for remark in remarks)
+    environment = configure("BncConnector", AS_PRINTED).environment
+    assert len(remarks) == sum(applies(environment) for _, applies in THESIS["BncConnector"].remarks)
 
 
 @pytest.mark.parametrize(
@@ -79,36 +80,39 @@ OTHER_VALUES = {
     "max_jerk": (100.0,), "num_demonstrations": 1, "prior_std": (0.001, 0.001, 0.001, 0.01, 0.01, 0.01),
     "reference_model": "promp", "gap_scale": 0.1,
 }  # fmt: skip
-TOGETHER = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
-"""Further options that an option needs to take a value that the thesis does not have."""
+# Options without which the value in `OTHER_VALUES` is refused.
+FURTHER_OPTIONS = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
 
 
-def _another(task, name, field, default):
-    """Return a value that differs from the thesis if the default does not, and vice versa."""
+def other_value(task, name, field, default):
+    """Return a value that equals neither the default nor, if the default has the thesis's value, a value of the thesis.
+
+    None is returned if there is no such value.
+    """
     if name in OTHER_VALUES:
         return OTHER_VALUES[name]
-    theirs = THESIS[task].options.get(name, (default,))
-    usual = theirs if default in theirs else (default,)
-    words = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
-    words["history_source"], words["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
-    words["fixture_offset"], words["solver"] = ("per_run", "per_episode", "none"), ("daqp", "osqp")
-    words["kernel"], words["sensing"] = ("squared_exponential", "matern52"), ("exact", "robot")
+    thesis_values = THESIS[task].options.get(name, (default,))
+    excluded = thesis_values if default in thesis_values else (default,)
+    choices = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
+    choices["history_source"], choices["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
+    choices["fixture_offset"], choices["solver"] = ("per_run", "per_episode", "none"), ("daqp", "osqp")
+    choices["kernel"], choices["sensing"] = ("squared_exponential", "matern52"), ("exact", "robot")
     if isinstance(default, bool):
         values = (True, False)
-    elif name in words:
-        values = words[name]
+    elif name in choices:
+        values = choices[name]
     elif isinstance(default, tuple):
-        values = (tuple(1.0 + one for one in default), tuple(0.5 * one for one in default))
-        values = tuple((min(one), max(one)) for one in values)
+        values = (tuple(1.0 + number for number in default), tuple(0.5 * number for number in default))
+        values = tuple((min(numbers), max(numbers)) for numbers in values)
     elif isinstance(default, int):
         values = (1, 2, 3)
     else:
-        limits = [getattr(one, bound, None) for one in field.metadata for bound in ("le", "ge")]
+        limits = [getattr(constraint, bound, None) for constraint in field.metadata for bound in ("le", "ge")]
         values = (*(limit for limit in limits if limit is not None), 0.5 * default, 0.25)
-    return next((value for value in values if value not in usual), None)
+    return next((value for value in values if value not in excluded), None)
 
 
-def _options():
+def all_options():
     """Yield every option of every task, guidance and station."""
     for task in THESIS:
         declared = TASKS.get(task)
@@ -124,22 +128,19 @@ def test_every_non_default_option_is_described_unless_neutral(monkeypatch):
     monkeypatch.setattr(BASE_POLICIES, "_origins", {})
     BASE_POLICIES.register("other", lambda observation: np.zeros((1, 2, 6)))
     checked = set()
-    for task, guidance, station, name, field in _options():
+    for task, guidance, station, name, field in all_options():
         is_skipped = name in (*NEUTRAL, "station") or (name in HISTORY and guidance != "skgrl")
         if is_skipped or (task, guidance, name) in checked or (task, name) == ("Pouring", "reward"):
             continue
-        usual = configure(task, {"guidance": guidance, "station": station})
-        value = _another(task, name, field, usual.environment[name])
+        default = configure(task, {"guidance": guidance, "station": station})
+        value = other_value(task, name, field, default.environment[name])
         if value is None:
             assert name in ("reward", "observation"), f"add a non-default value of {name} here"
             continue
-        beside = {"guidance": guidance, "station": station} | TOGETHER.get(name, {})
-        before, after = configure(task, beside), configure(task, beside | {name: value})
-        assert set(describe_differences(after, learns=False)) != set(describe_differences(before, learns=False)), (
-            task,
-            guidance,
-            name,
-        )
+        options = {"guidance": guidance, "station": station} | FURTHER_OPTIONS.get(name, {})
+        configs = configure(task, options), configure(task, options | {name: value})
+        before, after = (set(describe_differences(config, learns=False)) for config in configs)
+        assert before != after, f"{task}, {guidance}: {name}"
         checked.add((task, guidance, name))
     assert {name for task, _, name in checked if task == "BncConnector"} >= set(Disturbances.model_fields)
 
@@ -162,13 +163,14 @@ def test_non_default_option_is_described_with_its_default(task, given, words):
 
 @pytest.mark.parametrize("task", THESIS)
 def test_difficulty_is_described_once(task):
-    words = differences_of(task, {"difficulty": "hard"})
-    assert sum("difficulty" in one for one in words) == 1
-    assert not any("default:" in one for one in words)
+    remarks = differences_of(task, {"difficulty": "hard"})
+    assert sum("difficulty" in remark for remark in remarks) == 1
+    assert not any("default:" in remark for remark in remarks)
 
 
 def test_history_is_not_compared_when_guidance_is_kgrl():
-    assert not any("ρ" in one or "history" in one for one in differences_of("BncConnector", {"guidance": "kgrl"}))
+    remarks = differences_of("BncConnector", {"guidance": "kgrl"})
+    assert not any("ρ" in remark or "history" in remark for remark in remarks)
 
 
 @pytest.mark.parametrize(
@@ -190,25 +192,24 @@ def test_learner_setting_difference_is_described(setting, words):
 
 
 @pytest.mark.parametrize(
-    ("task", "guidance", "sides"), [("BncConnector", "kgrl", 1), ("NarrowPassage", "kgrl", 0), ("GridClamp", "sct", 0)]
+    ("task", "guidance", "count"), [("BncConnector", "kgrl", 1), ("NarrowPassage", "kgrl", 0), ("GridClamp", "sct", 0)]
 )
-def test_symmetry_is_described_when_the_task_has_one(task, guidance, sides):
-    words = differences_of(task, {"guidance": guidance}, algorithm="tqc", preset="tqc_contact")
-    assert sum("symmetry data augmentation" in one for one in words) == sides
+def test_symmetry_is_described_when_the_task_is_symmetric(task, guidance, count):
+    remarks = differences_of(task, {"guidance": guidance}, algorithm="tqc", preset="tqc_contact")
+    assert sum("symmetry data augmentation" in remark for remark in remarks) == count
 
 
 def test_gamma_is_compared_per_control_step():
-    words = differences_of(
-        "BncConnector", {**AS_PRINTED, "action_repeat": 10}, algorithm="tqc", preset="table_4_1_robot"
-    )
-    assert not any("gamma" in one for one in words)
+    options = AS_PRINTED | {"action_repeat": 10}
+    remarks = differences_of("BncConnector", options, algorithm="tqc", preset="table_4_1_robot")
+    assert not any("gamma" in remark for remark in remarks)
 
 
 def test_pouring_remarks_depend_on_reward():
-    assert any("weights in equation 3.7" in one for one in differences_of("Pouring"))
+    assert any("weights in equation 3.7" in remark for remark in differences_of("Pouring"))
     sparse = differences_of("Pouring", {"reward": "sparse"})
-    assert any("1.7 times" in one for one in sparse)
-    assert not any("equation 3.7" in one for one in sparse)
+    assert any("1.7 times" in remark for remark in sparse)
+    assert not any("equation 3.7" in remark for remark in sparse)
 
 
 def test_connector_remarks_have_the_dimensions_of_the_run():
@@ -222,5 +223,5 @@ def test_learner_is_not_compared_when_nothing_is_trained():
     config = configure("Pouring", {"difficulty": "hard"}, algorithm="tqc", preset="tqc_contact")
     without = describe_differences(config, learns=False)
     assert set(without) < set(describe_differences(config))
-    assert not any("learning rate" in one or "hidden units" in one for one in without)
-    assert any("difficulty" in one for one in without)
+    assert not any("learning rate" in remark or "hidden units" in remark for remark in without)
+    assert any("difficulty" in remark for remark in without)

@@ -1,4 +1,4 @@
-"""Random messages to a page: no crash, no effect without the token, and with it the effect that a reference computes."""
+"""Random messages to a page: no crash, the expected effect with the token, and no effect without the token."""
 
 import math
 import time

@@ -30,6 +30,8 @@ from research.action_fuzzing.tasks import CAMPAIGNS, fuzz
 
 
 class TransitionCounter(Callback):
+    """Callback that counts the transitions of an episode."""
+
     def __init__(self, env):
         self.transitions = 0
 
@@ -47,6 +49,7 @@ BEAD = Campaign("Bead", [Case("bead", {}, constrained=True)], {}, make_callback=
 
 
 def at_least(count):
+    """Return a stopping rule that ends a campaign after `count` episodes."""
     return lambda rows: len(rows) >= count
 
 
@@ -69,14 +72,14 @@ def test_actions_are_within_limits_and_deterministic(name):
 
 
 def test_campaign_is_resumed_from_its_table(tmp_path):
-    whole = run_campaign(BEAD, at_least(6), seed=3, out=tmp_path / "whole.csv")
+    rows = run_campaign(BEAD, at_least(6), seed=3, out=tmp_path / "whole.csv")
     table = tmp_path / "parts.csv"
     run_campaign(BEAD, at_least(2), seed=3, out=table)
     assert len(read_table(table)) == 2
     run_campaign(BEAD, at_least(6), seed=3, out=table)
     assert table.read_text() == (tmp_path / "whole.csv").read_text()
-    assert [row["seed"] for row in whole] == [3, 4, 5, 6, 7, 8]
-    assert {row["actions"] for row in whole} == set(ACTIONS)
+    assert [row["seed"] for row in rows] == [3, 4, 5, 6, 7, 8]
+    assert {row["actions"] for row in rows} == set(ACTIONS)
     with pytest.raises(InputError, match="another campaign"):
         run_campaign(BEAD, at_least(6), seed=4, out=table)
     with pytest.raises(InputError, match="another campaign"):
@@ -85,11 +88,11 @@ def test_campaign_is_resumed_from_its_table(tmp_path):
 
 
 def test_campaign_closes_its_environments(monkeypatch):
-    made, closed = [], []
+    created, closed = [], []
 
     def make(*arguments):
         env = make_environment(*arguments)
-        made.append(env)
+        created.append(env)
         monkeypatch.setattr(env, "close", lambda: closed.append(env))
         return env
 
@@ -102,8 +105,8 @@ def test_campaign_closes_its_environments(monkeypatch):
     run_campaign(BEAD, at_least(1))
     with pytest.raises(KeyboardInterrupt):
         run_campaign(BEAD, interrupt)
-    assert len(made) == 2
-    assert closed == made
+    assert len(created) == 2
+    assert closed == created
 
 
 def test_callback_receives_every_transition():
@@ -112,8 +115,8 @@ def test_callback_receives_every_transition():
         assert row["transitions"] == -(-row["steps"] // action_repeat)
 
 
-def _tilted_env(*steps, state=0):
-    """Return an environment with a trace of twenty commands, which are tilted at `steps`."""
+def tilted_env(*steps, state=0):
+    """Return an environment with a trace of twenty commands, which are tilted by 0.3 rad at `steps`."""
     trace = EpisodeTrace(20, 6, 0.01, {"state": 1})
     for step in range(20):
         pose = transform_to_pose(RigidTransform(RollPitchYaw(0.3 * (step in steps), 0.0, 0.5), [0.1, 0.0, 0.2]))
@@ -123,7 +126,7 @@ def _tilted_env(*steps, state=0):
 
 @pytest.mark.parametrize(
     ("env", "tilt"),
-    [(_tilted_env(), 0.0), (_tilted_env(3), 0.3), (_tilted_env(9), 0.3), (_tilted_env(3, state=1), 0.0)],
+    [(tilted_env(), 0.0), (tilted_env(3), 0.3), (tilted_env(9), 0.3), (tilted_env(3, state=1), 0.0)],
 )
 def test_early_tilt_covers_every_control_step(env, tilt):
     callback = EarlyTilt(env)
@@ -132,38 +135,27 @@ def test_early_tilt_covers_every_control_step(env, tilt):
 
 
 def test_nan_observations_are_counted():
-    class Broken(gymnasium.Wrapper):
+    class NanObservation(gymnasium.Wrapper):
         def step(self, action):
             observation, *rest = super().step(action)
             return np.full_like(observation, np.nan), *rest
 
     env = make_environment("Bead", {})
-    for tested, count in ((env, 0), (Broken(env), 3)):
-        row = rollout(tested, lambda observation: np.zeros(2), NonFiniteCounter(tested), seed=0)
-        assert row["not_finite"] == count * row["steps"]
+    for wrapped, size in ((env, 0), (NanObservation(env), 3)):
+        row = rollout(wrapped, lambda observation: np.zeros(2), NonFiniteCounter(wrapped), seed=0)
+        assert row["not_finite"] == size * row["steps"]  # 3 values in an observation
 
 
-DISAGREES = "reported and recomputed violations differ"
+DIFFERS = "reported and recomputed violations differ"
 EPISODE = {
-    "case": "one",
-    "actions": "uniform_random",
-    "seed": 0,
-    "constrained": 1,
-    "may_wait": 0,
-    "termination": "success",
-    "steps": 3,
-    "not_finite": 0,
-    "fallback_steps": 0,
-    "max_commanded_violation": -0.1,
-    "recomputed_violation": -0.1,
-    "collisions": 0,
-    "peak_force": 5.0,
-    "depth": 0.1,
-}
+    "case": "a", "actions": "uniform_random", "seed": 0, "constrained": 1, "may_wait": 0, "termination": "success",
+    "steps": 3, "not_finite": 0, "fallback_steps": 0, "max_commanded_violation": -0.1, "recomputed_violation": -0.1,
+    "collisions": 0, "peak_force": 5.0, "depth": 0.1,
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(
-    ("wrong", "failures"),
+    ("changed", "failures"),
     [
         ({}, []),
         ({"termination": "simulation_failure"}, ["the simulation failed"]),
@@ -171,24 +163,24 @@ EPISODE = {
         ({"fallback_steps": 1}, ["a prediction failed"]),
         ({"fallback_steps": 1, "may_wait": 1}, []),
         ({"max_commanded_violation": 1e-6, "recomputed_violation": 1e-6}, ["a command violated the constraints"]),
-        ({"recomputed_violation": 1e-6}, ["a command violated the constraints", DISAGREES]),
-        ({"max_commanded_violation": float("nan")}, ["a command violated the constraints", DISAGREES]),
-        ({"recomputed_violation": -0.2}, [DISAGREES]),
+        ({"recomputed_violation": 1e-6}, ["a command violated the constraints", DIFFERS]),
+        ({"max_commanded_violation": float("nan")}, ["a command violated the constraints", DIFFERS]),
+        ({"recomputed_violation": -0.2}, [DIFFERS]),
         ({"max_commanded_violation": 1e-6, "constrained": 0}, []),
         ({"depth": 0.3}, ["depth beyond 0.2"]),
     ],
 )
-def test_find_failures_has_a_sentence_per_failed_check(wrong, failures):
-    assert find_failures(outcome([EPISODE, EPISODE | wrong]), {"depth": 0.2}) == failures
+def test_find_failures_has_a_sentence_per_failed_check(changed, failures):
+    assert find_failures(outcome([EPISODE, EPISODE | changed]), {"depth": 0.2}) == failures
 
 
 def test_connector_passes_with_uniform_actions():
     campaign = CAMPAIGNS["BncConnector"]()
     (case,) = (case for case in campaign.cases if case.name == "skgrl, per_episode, x, y")
-    one = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
-    (row,) = run_campaign(one, at_least(1))
+    campaign = Campaign(campaign.task, [case], campaign.limits, make_callback=campaign.make_callback)
+    (row,) = run_campaign(campaign, at_least(1))
     assert find_failures(outcome([row]), campaign.limits) == []
-    # Compliant surfaces penetrate each other only in contact.
+    # Depths and a force above zero show that the plug touched the jack.
     assert max(row["lug_impact_mm"], row["barrel_impact_mm"]) > 0.05
     assert row["peak_force"] > 5.0
 
@@ -202,13 +194,13 @@ def test_narrow_passage_passes_with_every_kind_of_action():
 
 @pytest.mark.parametrize("error", [0.0, 1e-8])
 def test_violation_is_recomputed_from_the_commands(error):
-    """A command that differs from the one that the environment reports is detected."""
+    """An error added to the recorded commands changes only the recomputed violation."""
     (case,) = (case for case in CAMPAIGNS["NarrowPassage"]().cases if case.name == "skgrl, action repeat 5")
     env = make_environment("NarrowPassage", case.environment)
-    base, recorded = env.unwrapped, env.unwrapped.trace.append
-    base.trace.append = lambda commanded, *rest: recorded(commanded + [error, 0.0], *rest)
+    trace, append = env.unwrapped.trace, env.unwrapped.trace.append
+    trace.append = lambda commanded, *rest: append(commanded + [error, 0.0], *rest)
     row = rollout(env, lambda observation: np.ones(2), RecomputedViolation(env), seed=0)
-    assert row["max_commanded_violation"] > -1e-9, "the robot never reached the edge of the zone"
+    assert row["max_commanded_violation"] > -1e-9, "no command was at the edge of the zone"
     assert row["recomputed_violation"] == pytest.approx(row["max_commanded_violation"] + error, abs=1e-15)
 
 
@@ -233,10 +225,10 @@ def test_pouring_passes_with_shaking_inputs():
     assert 0.0 <= result["all"]["early_tilt"] <= 1e-9
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"steps": 0}, {"seed": -1}, {"episodes": 2, "steps": 9}])
-def test_fuzz_refuses_numbers_out_of_range(wrong):
+@pytest.mark.parametrize("arguments", [{"episodes": 0}, {"steps": 0}, {"seed": -1}, {"episodes": 2, "steps": 9}])
+def test_fuzz_refuses_invalid_arguments(arguments):
     with pytest.raises(InputError):
-        fuzz("NarrowPassage", **wrong)
+        fuzz("NarrowPassage", **arguments)
 
 
 def test_fuzz_names_the_tasks_when_the_task_is_unknown():

@@ -1,4 +1,4 @@
-"""The benchmark of parallel actors."""
+"""Benchmark of parallel actors."""
 
 from dataclasses import replace
 

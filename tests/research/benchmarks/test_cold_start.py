@@ -1,4 +1,4 @@
-"""The benchmark of the cold start."""
+"""Benchmark of the cold start of training."""
 
 import subprocess
 from pathlib import Path
@@ -11,7 +11,7 @@ from guiderail.tools.learning.trainer import run_training
 from research.benchmarks import cold_start
 
 
-def test_both_kinds_of_each_seed_are_timed(monkeypatch, bead_config, capsys):
+def test_measure_times_both_kinds_for_each_seed(monkeypatch, bead_config, capsys):
     settings = []
 
     def run(command, **_):
@@ -32,10 +32,10 @@ def test_both_kinds_of_each_seed_are_timed(monkeypatch, bead_config, capsys):
 
 @pytest.mark.parametrize(
     ("code", "stderr", "reason"),
-    [(2, "at work\nguiderail: hold must be at least 1\n", "hold must be at least 1"), (-9, "", "exit status -9")],
+    [(2, "progress\nguiderail: hold must be at least 1\n", "hold must be at least 1"), (-9, "", "exit status -9")],
 )
-def test_failing_run_is_reported(code, stderr, reason, monkeypatch):
-    said = subprocess.CompletedProcess([], code, stderr=stderr)
-    monkeypatch.setattr(cold_start.subprocess, "run", lambda *_, **__: said)
+def test_measure_reports_the_error_of_a_failed_run(code, stderr, reason, monkeypatch):
+    completed = subprocess.CompletedProcess([], code, stderr=stderr)
+    monkeypatch.setattr(cold_start.subprocess, "run", lambda *_, **__: completed)
     with pytest.raises(InputError, match=reason):
         cold_start.measure("NarrowPassage", {"action_repeat": -1}, episodes=1)

@@ -1,4 +1,4 @@
-"""The benchmark of physics engines."""
+"""Benchmark of physics engines."""
 
 import numpy as np
 import pytest
@@ -24,25 +24,26 @@ def test_lever_is_even_when_soft_and_shorter_when_hard():
 
 def test_lever_is_similar_in_mujoco():
     pytest.importorskip("mujoco")
-    ours, theirs = (engines._lever(station, 2.0 * MM, 1.0) for station in ("gantry", "mujoco"))
-    assert rigid_lever(D, 2.0 * MM) < theirs < ours == pytest.approx(theirs, rel=0.4)
+    drake, mujoco = (engines._lever(station, 2.0 * MM, 1.0) for station in ("gantry", "mujoco"))
+    assert rigid_lever(D, 2.0 * MM) < mujoco < drake == pytest.approx(mujoco, rel=0.4)
 
 
 def test_capture_offset_is_close_to_the_geometry():
-    """At the plant's step, the capture offset in Drake is up to 1.5 times that of the geometry."""
+    """With the time step of the plant, the capture offset in Drake is up to 1.5 times the offset of the geometry."""
     pytest.importorskip("mujoco")
-    drawn = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
-    ours, theirs = (engines._capture(station) for station in ("gantry", "mujoco"))
-    assert theirs == pytest.approx(drawn, abs=0.02 * MM)
-    assert drawn < ours < 1.5 * drawn
-    assert engines._capture("gantry", equal_area=True) == pytest.approx(drawn, abs=0.05 * MM)
+    geometric = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
+    drake, mujoco = (engines._capture(station) for station in ("gantry", "mujoco"))
+    assert mujoco == pytest.approx(geometric, abs=0.02 * MM)
+    assert geometric < drake < 1.5 * geometric
+    assert engines._capture("gantry", equal_area=True) == pytest.approx(geometric, abs=0.05 * MM)
 
 
 def test_drag_is_friction_when_steps_are_short():
-    """At the default step and margin the drag is up to 4.2 times the friction."""
-    fine, taken = (engines.drag(*engines.CONTACTS[how], 0.02) for how in ("Drake, 2.5 ms, no margin", "Drake, 10 ms"))
+    """With the default time step and margin, the drag is up to 4.2 times the friction."""
+    names = ("Drake, 2.5 ms, no margin", "Drake, 10 ms")
+    fine, default = (engines.drag(*engines.CONTACTS[name], 0.02) for name in names)
     assert fine == pytest.approx(engines.FRICTION, rel=0.25)
-    assert fine < taken < 4.2 * engines.FRICTION
+    assert fine < default < 4.2 * engines.FRICTION
 
 
 def test_drag_is_friction_in_mujoco():
@@ -50,7 +51,7 @@ def test_drag_is_friction_in_mujoco():
     assert engines.drag(*engines.CONTACTS["MuJoCo"], 0.02) == pytest.approx(engines.FRICTION, rel=0.05)
 
 
-def test_picture_is_drawn(tmp_path):
+def test_draw_writes_a_picture(tmp_path):
     names = ("time", "height_mm", "push_n", "torque_nm")
     profiles = {
         f"{task} {engine}": {name: [0.0, 1.0] for name in names} | {"real_time_factor": 1.0, "peak_force_n": 1.0}

@@ -1,4 +1,4 @@
-"""The benchmark of the gantry's impedances, without simulation."""
+"""Benchmark of the gantry's impedances, with simulations replaced by constant results."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,8 @@ from research.benchmarks import impedance
 
 @pytest.fixture
 def results(monkeypatch):
+    """Return the results of the benchmark, whose positions differ by the time step and by 1 mm between impedances."""
+
     def insertion(control, time_step):
         pose = np.zeros((3, 6))
         pose[:, 0] = time_step + (0.001 if control == "cartesian" else 0.0)
@@ -34,7 +36,7 @@ def test_motions_are_compared_with_the_finest_step(results):
     assert len(results["episodes"]) == 8
 
 
-def test_results_have_a_line_each(results, capsys):
+def test_show_prints_a_line_per_result(results, capsys):
     impedance.show(results)
     output = capsys.readouterr().out
     assert output.count(" yes ") == 7

@@ -1,10 +1,10 @@
-"""The benchmark of learners."""
+"""Benchmark of learners."""
 
 from guiderail.tools.learning.config import PRESETS
 from research.benchmarks import learner
 
 
-def test_every_pair_is_measured(monkeypatch):
+def test_measure_covers_algorithms_and_presets(monkeypatch):
     assert set(learner.PRESETS) <= set(PRESETS)
     monkeypatch.setattr(learner, "PRESETS", ("tqc_contact",))
     monkeypatch.setattr(learner, "_TRANSITIONS", 100)

@@ -1,4 +1,4 @@
-"""The benchmark of the control loop."""
+"""Benchmark of the control loop."""
 
 import operator
 import os
@@ -9,7 +9,7 @@ import pytest
 from research.benchmarks import loop
 
 
-def test_parts_are_compared_with_their_periods(monkeypatch, capsys):
+def test_times_of_parts_are_measured_with_their_periods(monkeypatch, capsys):
     monkeypatch.setattr(loop, "SECONDS", 0.3)
     rows = loop._parts()
     assert [round(row["period_ms"], 6) for row in rows] == [200.0, 20.0, 5.0]
@@ -27,8 +27,8 @@ def test_missing_answer_counts_as_infinite():
     assert row["median_ms"] < row["p99_ms"] < 2.0
     assert row["worst_ms"] == np.inf
     assert (row["over"], row["number"]) == (1, 300)
-    one_of_few = loop._row("round trip over LCM", 0.005, np.append(np.full(10, 0.001), np.inf))
-    assert one_of_few["median_ms"] == 1.0
+    few = loop._row("round trip over LCM", 0.005, np.append(np.full(10, 0.001), np.inf))
+    assert few["median_ms"] == 1.0
 
 
 def test_late_answer_belongs_to_its_own_message():
@@ -44,9 +44,9 @@ def test_late_answer_belongs_to_its_own_message():
     assert answers.seconds() == [1.5, 0.75, float("inf")]
 
 
-def test_transport_raises_when_the_sender_ends_without_a_result(monkeypatch):
+def test_transport_raises_when_the_sender_fails(monkeypatch):
     monkeypatch.delenv("DRAKE_ALLOW_NETWORK", raising=False)
-    monkeypatch.setattr(loop, "_send_statuses", operator.sub)  # raises a TypeError for a pipe and a URL
+    monkeypatch.setattr(loop, "_send_statuses", operator.sub)  # the difference of a pipe and a URL raises a TypeError
     with pytest.raises(EOFError):
         loop._transport()
     assert "DRAKE_ALLOW_NETWORK" not in os.environ  # otherwise Meshcat would be forbidden for the whole process

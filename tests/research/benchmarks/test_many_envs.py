@@ -1,4 +1,4 @@
-"""The benchmark of parallel environments."""
+"""Benchmark of parallel environments."""
 
 import pytest
 

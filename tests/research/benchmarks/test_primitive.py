@@ -1,11 +1,11 @@
-"""The benchmark of the movement primitive."""
+"""Benchmark of the movement primitive."""
 
 from research.benchmarks.primitive import REGIMES, SIZES, measure
 
 
 def test_primitive_benchmark_satisfies_constraints(monkeypatch):
-    for name, few in (("SIZES", SIZES[:1]), ("DENSE_SECONDS", 0.1), ("_MOTION", 100)):
-        monkeypatch.setattr(f"research.benchmarks.primitive.{name}", few)
+    for name, value in (("SIZES", SIZES[:1]), ("DENSE_SECONDS", 0.1), ("_MOTION", 100)):
+        monkeypatch.setattr(f"research.benchmarks.primitive.{name}", value)
     (parts,) = measure(steps=400).values()
     assert set(parts["predict"]) == {*REGIMES, "together"}
     for row in parts["predict"].values():

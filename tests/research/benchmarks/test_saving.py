@@ -1,4 +1,4 @@
-"""The benchmark of saving."""
+"""Benchmark of the time that a training run spends on saving."""
 
 from research.benchmarks import saving
 from research.benchmarks.saving import saving_share, timed

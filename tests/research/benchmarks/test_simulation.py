@@ -1,4 +1,4 @@
-"""The benchmark of contact simulation."""
+"""Benchmark of contact simulation."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.systems.wrench_sensor import WrenchSensor
-from research.benchmarks import simulation as bench_simulation
+from research.benchmarks import simulation
 from research.benchmarks.simulation import CALLBACKS, real_time_factor, scripted_motion, timed_callbacks
 
 
@@ -22,9 +22,9 @@ def test_timed_callbacks_restores_the_systems():
     ("name", "contact"), [("gantry", "CONTACT"), ("grid_clamp", "CLAMP_CONTACT"), ("pouring", "POUR_CONTACT")]
 )
 def test_python_share_is_between_0_and_1(monkeypatch, name, contact):
-    monkeypatch.setattr("research.benchmarks.simulation.REPEATS", 1)
-    first, _ = getattr(bench_simulation, contact)
-    monkeypatch.setattr(f"research.benchmarks.simulation.{contact}", (first, first + 0.8))
+    monkeypatch.setattr(simulation, "REPEATS", 1)
+    start, _ = getattr(simulation, contact)
+    monkeypatch.setattr(simulation, contact, (start, start + 0.8))  # 0.8 s of contact
     result = real_time_factor(name)
     assert result["real_time_factor"] > 0.0
     assert 0.0 < result["python_share"] < 1.0

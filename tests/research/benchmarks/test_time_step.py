@@ -1,4 +1,4 @@
-"""The benchmark of the plant's time step."""
+"""Benchmark of the plant's time step."""
 
 import pytest
 
@@ -8,6 +8,7 @@ from research.benchmarks import run_benchmark, time_step
 
 @pytest.fixture(scope="module")
 def results():
+    """Return the results of the motion of the clamp with three time steps."""
     patch = pytest.MonkeyPatch()
     patch.setattr(time_step, "HALVINGS", (0, 1, 2))
     patch.setattr(time_step, "MOTIONS", {"clamp": time_step.MOTIONS["clamp"]})
@@ -22,7 +23,7 @@ def test_error_grows_with_the_time_step(results):
     assert results["default"] in [row["time_step"] for row in rows]
 
 
-def test_results_are_printed_and_drawn(results, tmp_path, capsys, monkeypatch):
+def test_show_prints_and_draw_writes_results(results, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(time_step, "MOTIONS", {"clamp": time_step.MOTIONS["clamp"]})
     time_step.show(results)
     assert "clamp" in capsys.readouterr().out
@@ -35,6 +36,6 @@ def test_picture_is_refused_when_benchmark_has_none(tmp_path):
 
 
 def test_picture_is_refused_before_measuring(monkeypatch, tmp_path):
-    monkeypatch.setattr(time_step, "measure", lambda: pytest.fail("it was measured"))
+    monkeypatch.setattr(time_step, "measure", lambda: pytest.fail("the benchmark was started"))
     with pytest.raises(InputError, match=r"\.txt"):
         run_benchmark("time_step", picture=tmp_path / "errors.txt")

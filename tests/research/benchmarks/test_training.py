@@ -1,4 +1,4 @@
-"""The profile of a training run."""
+"""Profile of a training run."""
 
 import contextlib
 import inspect

@@ -1,4 +1,4 @@
-"""The selection of episodes of figure 5.7."""
+"""Selection of the episodes in figure 5.7."""
 
 import numpy as np
 import pytest
@@ -11,14 +11,17 @@ from guiderail.tools.evaluation.subject import EpisodeSpec
 from research.figures.chapter_5 import _first
 
 
-def sometimes(rng, size):
-    """Return a policy with one action per episode, to the goal or away from it."""
+def random_direction(rng, size):
+    """Return a policy whose constant action points to the goal or away from the goal, at random."""
     action = np.full(size, rng.choice([-1.0, 1.0]))
     return lambda observation: action
 
 
 def random_spec(seed):
-    return EpisodeSpec("Bead", {}, lambda env: BaselinePolicy(sometimes, env, seed=seed), "at random", "", seed=5)
+    """Return a subject whose policy has a random direction in each episode."""
+    return EpisodeSpec(
+        "Bead", {}, lambda env: BaselinePolicy(random_direction, env, seed=seed), "at random", "", seed=5
+    )
 
 
 @pytest.mark.parametrize("success", [True, False])
@@ -32,6 +35,6 @@ def test_selected_episode_ends_as_requested_when_repeated(success):
 
 
 def test_selection_uses_a_new_random_stream_per_episode():
-    """With this seed the first action of a new stream leads away from the goal."""
+    """The first direction of each new stream of this seed points away from the goal."""
     with pytest.raises(InputError, match="all ended alike"):
         _first(random_spec(seed=6), success=True)

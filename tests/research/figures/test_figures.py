@@ -1,4 +1,4 @@
-"""The figures of the thesis."""
+"""Figures and tables of the thesis."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -30,16 +30,16 @@ def test_violation_of_a_path_with_nan_is_nan():
 
 
 @pytest.mark.parametrize("figure", FIGURES)
-def test_every_figure_has_a_function(figure):
+def test_find_figure_returns_a_function(figure):
     assert callable(find_figure(figure))
 
 
-def test_every_figure_has_the_result_of_the_thesis():
+def test_thesis_results_exist_for_all_figures():
     assert set(THESIS) == set(FIGURES)
 
 
 @pytest.mark.parametrize("figure", ["2.2", "3.4", "5.3", "table 3.2", "table 4.1"])
-def test_figure_without_learning_is_a_picture_or_a_table(figure, tmp_path):
+def test_reproduce_writes_a_picture_or_a_table(figure, tmp_path):
     result = reproduce(figure, out=tmp_path)
     assert result["the thesis"] == THESIS[figure]
     if "table" in figure:
@@ -59,12 +59,12 @@ def test_figure_4_2_satisfies_the_constraints(tmp_path):
     result = reproduce("4.2", out=tmp_path)
     rows = read_table(tmp_path / "figure_4_2.csv")
     assert rows["max_commanded_violation"].max() <= 1e-9
-    once = rows[rows["panel"].str.startswith("A2")]
-    assert (once["max_commanded_violation"] > -1e-9).any()
-    # One action changes the motion locally: half a second away less than a sixth as much.
-    assert (once[MOVED_ELSEWHERE] < once["moved_at_3.2_s"] / 6).all()
-    assert (once[MOVED_ELSEWHERE] > 0.0).all()
-    assert (rows.loc[~rows.index.isin(once.index), MOVED_ELSEWHERE] > 0.05).all()
+    single = rows[rows["panel"].str.startswith("A2")]  # motions with a single action
+    assert (single["max_commanded_violation"] > -1e-9).any()
+    # A single action changes the motion locally: the change half a second away is less than a sixth.
+    assert (single[MOVED_ELSEWHERE] < single["moved_at_3.2_s"] / 6).all()
+    assert (single[MOVED_ELSEWHERE] > 0.0).all()
+    assert (rows.loc[~rows.index.isin(single.index), MOVED_ELSEWHERE] > 0.05).all()
     assert result["exploration_follows_the_demonstrated_spread"] > 0.8
     assert (tmp_path / "figure_4_2.png").stat().st_size > 10_000
 
@@ -79,9 +79,9 @@ def test_figure_5_4_recovers_from_pushes(tmp_path):
     assert narrow.max() < wide.max()
 
 
-def finished(out, study, method, seed, endings):
-    """Write a finished run of a study with the given endings of episodes."""
-    words = {"s": "success", "p": "spill", "c": "collision", "t": "time_limit"}
+def write_finished_run(out, study, method, seed, endings):
+    """Write a finished run of a study; `endings` has the initial of the termination of each episode."""
+    terminations = {"s": "success", "p": "spill", "c": "collision", "t": "time_limit"}
     learner = study.learner.model_copy(update={"episodes": len(endings)})
     methods = {method: study.methods[method].model_copy(update={"learner": type(learner)()})}
     job = Job(study.model_copy(update={"learner": learner, "methods": methods}), method, seed, out)
@@ -90,7 +90,7 @@ def finished(out, study, method, seed, endings):
     numbers |= {f"jerk_{which}_{part}": 1.0 for which in ("commanded", "measured") for part in ("linear", "angular")}
     counts = {"max_commanded_violation": -1.0, "max_measured_violation": -1.0, "collisions": 0, "fallback_steps": 0}
     rows = [
-        {"episode": i, "success": int(end == "s"), "termination": words[end], **numbers, **counts}
+        {"episode": i, "success": int(end == "s"), "termination": terminations[end], **numbers, **counts}
         for i, end in enumerate(endings)
     ]
     job.folder.create(job.config(len(endings)))
@@ -105,8 +105,8 @@ def test_pouring_figures_use_every_finished_seed(tmp_path):
         study = load_study(study_path(f"pouring_{algorithm}"))
         for method in METHODS:
             ending = "s" if method.startswith("rl_sct") else "c"
-            finished(tmp_path, study, method, study.seeds[0], "tp" + ending * 10)
-        finished(tmp_path, study, "rl_sct_shaped", study.seeds[0] + 3, "s" * 12)
+            write_finished_run(tmp_path, study, method, study.seeds[0], "tp" + ending * 10)
+        write_finished_run(tmp_path, study, "rl_sct_shaped", study.seeds[0] + 3, "s" * 12)
     for figure in ("3.5", "3.6", "table 3.3"):
         result = reproduce(figure, seeds=1, episodes=12, out=tmp_path)
         assert result["RL-SCT-Shaped, episodes to convergence"] == "2, 0"
@@ -121,7 +121,7 @@ def test_pouring_figures_use_every_finished_seed(tmp_path):
 def test_grid_clamp_figure_has_the_force_of_each_seed(tmp_path):
     study = load_study(study_path("grid_clamp_figures"))
     for method in study.methods:
-        finished(tmp_path, study, method, 0, "t" + "s" * 11)
+        write_finished_run(tmp_path, study, method, 0, "t" + "s" * 11)
     result = reproduce("3.11", seeds=1, episodes=12, out=tmp_path)
     assert result["with the cost of force, return of the last ten episodes, each seed"] == "0.5"
     assert not set(EVALUATED) & set(read_table(tmp_path / "figure_3_11.csv").columns)

@@ -1,4 +1,4 @@
-"""Guidance in metaworld and robosuite: every command is inside. `make outside` runs this."""
+"""Guidance in metaworld and robosuite: every command satisfies the constraints. `make outside` runs the tests."""
 
 from importlib import import_module
 
@@ -9,12 +9,13 @@ PACKAGES = {"peg": "metaworld", "assembly": "metaworld", "nut": "robosuite"}
 
 
 def load(name):
+    """Return a task; skip the test if its package is not installed."""
     pytest.importorskip(PACKAGES[name], reason=f"{PACKAGES[name]} is installed by make outside")
     return import_module(f"research.outside_envs.{name}").TASK
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_commands_are_inside_and_the_motion_ends(name):
+def test_commands_satisfy_constraints_and_motion_ends(name):
     task = load(name)
     segments = task.make_segments(count=4)
     assert all(segment.recorded.num_demonstrations == 4 for segment in segments)
@@ -30,7 +31,7 @@ def test_commands_are_inside_and_the_motion_ends(name):
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_scene_is_the_same_when_the_seed_is(name):
+def test_scene_is_reproducible_for_a_seed(name):
     env = load(name).make_env(0)
     first, _ = env.reset(seed=3)
     env.reset()
@@ -40,17 +41,16 @@ def test_scene_is_the_same_when_the_seed_is(name):
 
 
 @pytest.mark.parametrize("name", PACKAGES)
-def test_assumed_goal_is_on_the_side_that_was_chosen(name):
+def test_assumed_goal_is_on_the_selected_side(name):
     task = load(name)
     env = task.make_env(0)
-    least, most = import_module(f"research.outside_envs.{name}").OFFSETS
+    smallest, largest = import_module(f"research.outside_envs.{name}").OFFSETS
     for side in (-1.0, 1.0):
         env.reset(seed=5, options={"side": side})
-        true = env.true_goal
-        assert least <= side * (env.assumed_goal - true)[1] <= most
+        assert smallest <= side * (env.assumed_goal - env.true_goal)[1] <= largest
 
 
-def test_scheduled_attempts_insert_the_peg_on_both_sides():
+def test_scheduled_actions_insert_the_peg_on_both_sides():
     task = load("peg")
     env = task.make("kgrl", 0, task.make_segments())
     for episode, side in enumerate((-1.0, 1.0)):

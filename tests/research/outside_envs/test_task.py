@@ -1,4 +1,4 @@
-"""Tasks around environments of other packages, with an environment made here, and the table of results."""
+"""Tasks around environments of other packages, with a point environment, and the table of results."""
 
 import csv
 import json
@@ -23,6 +23,8 @@ PARTS = {
 
 
 class Point(gymnasium.Env):
+    """Point in a plane whose actions are a displacement and a grip."""
+
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
 
@@ -43,6 +45,7 @@ class Point(gymnasium.Env):
 
 
 def record(count, seed):
+    """Return recordings of straight motions to the goal, with noise along the second axis."""
     rng = np.random.default_rng(seed)
     origins = {"start": np.zeros(2), "goal": np.array([0.5, 0.1])}
     paths = [np.linspace([0, 0], [0.5, 0.1], 21) + [0, 1] * rng.normal(0, 0.02, 2) for _ in range(count)]
@@ -62,13 +65,13 @@ def segments():
     return TASK.make_segments(5, 0)
 
 
-def test_segments_have_frames_limits_and_reversed_parts(segments):
+def test_segments_have_frames_limits_and_reversed_motions(segments):
     approach, insert, retract = segments
     assert [segment.name for segment in segments] == list(PARTS)
     assert np.allclose(approach.recorded.outputs[0][0][0], 0.0)
     assert np.allclose(insert.recorded.outputs[0][-1][0], 0.0), "in the goal's frame"
-    for forwards, backwards in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
-        assert np.array_equal(forwards[::-1], backwards)
+    for forward, backward in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
+        assert np.array_equal(forward[::-1], backward)
     assert insert.constraints.violation(np.array([-0.021, 0.0])) == pytest.approx(0.001)
     assert insert.constraints.violation(np.array([-0.019, 0.0])) < 0.0
     assert retract.constraints.violation(np.array([-0.021, 0.0])) < 0.0
@@ -77,18 +80,18 @@ def test_segments_have_frames_limits_and_reversed_parts(segments):
 def test_part_of_a_recording_is_reversed():
     parts = {**PARTS, "retract": Part(12, "goal", 1.0, source="insert", until_fraction=0.5, is_reversed=True)}
     _, insert, retract = replace(TASK, parts=parts).make_segments(5, 0)
-    for forwards, backwards in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
-        half = round(0.5 * len(forwards))
-        assert np.array_equal(forwards[:half][::-1], backwards)
+    for forward, backward in zip(insert.recorded.outputs, retract.recorded.outputs, strict=True):
+        half = round(0.5 * len(forward))
+        assert np.array_equal(forward[:half][::-1], backward)
     assert num_steps(parts) == num_steps(PARTS)
 
 
-def test_fitted_guide_serves_the_next_seed(segments):
+def test_fitted_guide_is_reused_for_other_seeds(segments):
     guide = TASK.make("kgrl", 0, segments).guide
     assert TASK.make(guide, 1, segments).guide is guide
 
 
-def test_action_lasts_until_a_segment_of_a_decision_begins(segments):
+def test_action_lasts_until_the_next_decision(segments):
     task = replace(TASK, decisions=("retract",), observed=(1, 2), action_dims=(1,))
     env = task.make("kgrl", 0, segments)
     assert env.action_space.shape == (1,)
@@ -103,7 +106,7 @@ def test_action_lasts_until_a_segment_of_a_decision_begins(segments):
     assert first + second == -info["control_steps"] == -num_steps(PARTS)
 
 
-def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
+def test_guided_commands_satisfy_constraints_and_have_grips(segments):
     env, rng = TASK.make("kgrl", 0, segments), np.random.default_rng(0)
     env.reset(seed=0)
     done, worst = False, -np.inf
@@ -111,10 +114,10 @@ def test_guided_commands_are_inside_and_extra_is_passed_on(segments):
         *_, truncated, info = env.step(rng.choice([-1.0, 1.0], 2))
         worst, done = max(worst, info["constraint_violation"]), truncated
     assert worst <= 1e-9
-    assert env.unwrapped.grips == [-1.0] * 12 + [1.0] * 27
+    assert env.unwrapped.grips == [-1.0] * 12 + [1.0] * 27  # 12 steps of the first part, 12 + 3 + 12 of the others
 
 
-def test_bare_environment_measures_distance_to_nearest_box(segments):
+def test_unguided_violation_is_the_distance_to_the_segments(segments):
     env = TASK.make("none", 0, segments)
     observation, _ = env.reset(seed=0)
     assert observation.shape == (3,)
@@ -126,18 +129,18 @@ def test_bare_environment_measures_distance_to_nearest_box(segments):
     assert env.unwrapped.steps == 10
 
 
-@pytest.mark.parametrize("when", [1, 2])
-def test_unknown_violation_of_the_bare_environment_is_not_dropped(when, segments):
+@pytest.mark.parametrize("step", [1, 2])
+def test_unguided_violation_is_nan_when_a_pose_is_nan(step, segments):
     env = TASK.make("none", 0, segments)
     env.reset(seed=0)
     pose = env._pose
-    env._pose = lambda inner, seen: pose(inner, seen) * (np.nan if inner.unwrapped.steps == when else 1.0)
+    env._pose = lambda inner, observation: pose(inner, observation) * (np.nan if inner.unwrapped.steps == step else 1.0)
     *_, info = env.step(np.zeros(3))
     assert np.isnan(info["constraint_violation"])
 
 
 @pytest.mark.parametrize("violations", [(np.nan, -0.1), (-0.1, np.nan)])
-def test_unknown_violation_counts_as_one(violations):
+def test_nan_violation_counts_as_violated_episode(violations):
     info = {"is_success": True, "fallback": 0, "side": 1.0}
     row = {}
     for violation in violations:
@@ -147,7 +150,7 @@ def test_unknown_violation_counts_as_one(violations):
     assert np.isnan(summary["max_violation"])
 
 
-def test_table_has_an_unknown_violation(tmp_path):
+def test_table_has_a_nan_violation(tmp_path):
     row = {
         "episodes": 1, "successes": 1, "by_side": [[1, 1], [0, 0]], "violated_episodes": 1, "max_violation": np.nan,
         "fallbacks": 0, "median_force": 1.0, "max_force": 20.0,
@@ -157,7 +160,7 @@ def test_table_has_an_unknown_violation(tmp_path):
     assert np.isnan(read_rows(tmp_path)[0]["max_commanded_violation"])
 
 
-def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
+def test_table_has_intervals_and_maxima_of_all_episodes(tmp_path, capsys):
     row = {
         "episodes": 10, "successes": 9, "by_side": [[5, 5], [4, 5]], "violated_episodes": 0, "max_violation": -0.1,
         "fallbacks": 0, "median_force": 1.0, "max_force": 20.0,
@@ -178,27 +181,28 @@ def test_table_has_intervals_and_the_worst_of_all_episodes(tmp_path, capsys):
     assert len(list(csv.DictReader((tmp_path / "outside_envs.csv").open()))) == 2
 
 
-def test_critics_observe_the_hidden_values_and_the_actor_does_not(segments):
+def test_critics_but_not_the_actor_observe_hidden_values(segments):
     env = TASK.make("kgrl", 0, segments)
     model, rows = learn.train(env, 16, 0, LearnerSettings())
     assert len(rows) == 16
     assert model.num_timesteps > LearnerSettings.learning_starts
     observation, _ = env.reset(seed=0)
-    known = [np.append(observation, value).astype(np.float32) for value in (0.0, 0.7)]
-    assert np.array_equal(*(model.predict(one, deterministic=True)[0] for one in known))
-    assert np.array_equal(learn.policy_of(model)(observation, {}), model.predict(known[0], deterministic=True)[0])
+    extended = [np.append(observation, value).astype(np.float32) for value in (0.0, 0.7)]
+    first, second = (model.predict(values, deterministic=True)[0] for values in extended)
+    assert np.array_equal(first, second)
+    assert np.array_equal(learn.policy_of(model)(observation, {}), first)
     stored = model.replay_buffer.observations[: model.replay_buffer.pos, 0]
     assert stored.shape[1] == len(observation) + 1
     assert (stored[:, -1] == np.float32(0.7)).all()
     inputs = model.critic.q_networks[0][0].in_features
-    assert inputs == len(observation) + 1 + 2  # and the action
+    assert inputs == len(observation) + 1 + 2  # observation, hidden value and action
 
 
 def test_demonstrated_transitions_have_the_hidden_values(segments, monkeypatch):
     step = Point.step
     monkeypatch.setattr(Point, "step", lambda self, action: (*step(self, action)[:4], {"is_success": True}))
     rows = learn.demonstrate_transitions(TASK, TASK.make("none", 0, segments), 1)
-    assert all(first[0, -1] == next_[0, -1] == np.float32(0.7) for first, next_, *_ in rows)
+    assert all(before[0, -1] == after[0, -1] == np.float32(0.7) for before, after, *_ in rows)
 
 
 def test_interrupted_write_leaves_no_result(tmp_path, monkeypatch):

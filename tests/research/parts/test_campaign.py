@@ -1,4 +1,4 @@
-"""The benchmark finds pairs by their names, stores each step and gives the reason of a failure."""
+"""Benchmark of assembly pairs: search for pairs, stored steps, and the table of results."""
 
 import json
 
@@ -14,7 +14,7 @@ from research.parts.campaign import StepError, describe_calibration, finish, sum
 from research.parts.pairs import find_pairs
 
 
-def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_path):
+def test_find_pairs_finds_plugs_with_their_sockets(tmp_path):
     names = (
         "a/asset_plug.obj", "a/asset_socket.obj", "b/plug.stl", "b/socket.stl", "c/plug.stl",
         "d/industreal_gear_small.obj", "d/industreal_gear_base.obj",
@@ -36,18 +36,23 @@ def test_find_pairs_takes_known_names_and_folders_with_a_plug_and_a_socket(tmp_p
 
 def test_finished_steps_are_not_repeated(tmp_path):
     def fail():
-        raise StepError("too intricate")
+        raise StepError("invalid mesh")
 
     assert finish(tmp_path / "a.json", lambda: {"inserted": True}) == {"inserted": True}
     assert finish(tmp_path / "a.json", fail) == {"inserted": True}
-    assert finish(tmp_path / "b.json", fail) == {"error": "too intricate"}
-    assert json.loads((tmp_path / "b.json").read_text()) == {"error": "too intricate"}
+    assert finish(tmp_path / "b.json", fail) == {"error": "invalid mesh"}
+    assert json.loads((tmp_path / "b.json").read_text()) == {"error": "invalid mesh"}
 
 
-def test_tables_hold_measurements_and_reasons(tmp_path):
-    good = {"inserted": True, "clearance_mm": 0.1, "penetration_pushed_on_the_rim_mm": 0.06, "real_time_factor": 9.0}
-    good |= {"preparation_s": 1.0, "inserted_s": 2.0, "hard-0": {"success_rate": 0.98}}
-    rows = {"a": good, "b": {"error": "the parts overlap | here"}}
+def test_table_has_measurements_and_summary_has_errors(tmp_path):
+    measured = {
+        "inserted": True,
+        "clearance_mm": 0.1,
+        "penetration_pushed_on_the_rim_mm": 0.06,
+        "real_time_factor": 9.0,
+    }
+    measured |= {"preparation_s": 1.0, "inserted_s": 2.0, "hard-0": {"success_rate": 0.98}}
+    rows = {"a": measured, "b": {"error": "the parts overlap | here"}}
     write_table(tmp_path / "table", to_table(rows))
     lines = (tmp_path / "table.md").read_text().splitlines()
     assert len({line.count(" | ") for line in lines}) == 1
@@ -58,7 +63,7 @@ def test_tables_hold_measurements_and_reasons(tmp_path):
     assert summary["reasons"] == {"b": "the parts overlap | here"}
 
 
-def test_calibration_is_described_with_its_verdict():
+def test_calibration_is_described_with_its_result():
     result = {"offset_mm": [2.55, 3.0], "turn_degrees": 3.0, "force_limit": 15.0, "calibrated": True}
     result |= {"uniform_random": "0 of 10", "scripted": "10 of 10"}
     text = describe_calibration(result)

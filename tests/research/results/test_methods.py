@@ -1,4 +1,4 @@
-"""Tables of all methods, on the pages of results and in the README."""
+"""Tables of all methods on the pages of results and in the README."""
 
 import sys
 from pathlib import Path
@@ -54,16 +54,16 @@ def test_pages_have_the_stored_results(tmp_path):
         assert page.read_text() == stored.read_text(), f"{stored} is stale: python -m research.results"
 
 
-def test_every_row_names_a_method_of_a_study():
+def test_rows_of_sections_name_methods_of_studies():
     assert set(SECTIONS) == set(PAGES)
     for row in (row for sections in SECTIONS.values() for section in sections for row in section.rows):
         study = load_study(study_path(row.study))
         assert row.method in study.methods, f"{row.study} has no {row.method}"
-        assert row.eval_set is None or row.eval_set in [one.name for one in study.eval_set]
+        assert row.eval_set is None or row.eval_set in [eval_set.name for eval_set in study.eval_set]
         assert row.eval_set is not None or len(study.eval_set) < 2, f"{row.study} has several evaluation sets"
 
 
-def test_every_readme_row_names_methods_of_its_section():
+def test_guided_methods_are_rows_of_their_section():
     for section in (section for sections in SECTIONS.values() for section in sections):
         assert set(section.guided) <= {row.name for row in section.rows}
 
@@ -77,7 +77,7 @@ def test_missing_study_is_left_out(tmp_path):
     assert len(NO_DEMONSTRATION) == len(BASELINES)
 
 
-HEAD = (
+HEADER = (
     "method,seed,after_episodes,eval_set,episodes,success_rate,success_low,success_high,max_commanded_violation,"
     "violating_episodes,peak_force,training_episodes,training_success_rate,training_episodes_to_convergence,"
     "training_max_commanded_violation,training_violating_episodes,training_peak_force,training_ended_in_collision,"
@@ -85,9 +85,9 @@ HEAD = (
 )
 
 
-def test_each_seed_is_listed_after_its_last_episode(tmp_path):
+def test_table_has_the_last_evaluation_of_each_seed(tmp_path):
     (tmp_path / "peers_connector_hard.csv").write_text(
-        HEAD
+        HEADER
         + "residual,7,20,fresh,100,0.1,0,0,0,0,1.0,20,0.1,,0,0,2.0,1,0\n"
         + "residual,7,60,fresh,100,0.98,0,0,0.0001,3,12.25,60,0.8,15,0.0004,5,31.0,3,1\n"
         + "residual,8,60,fresh,100,1.0,0,0,-0.1,0,14.5,60,0.8,,0.0,0,20.0,3,0\n"
@@ -105,36 +105,38 @@ def test_each_seed_is_listed_after_its_last_episode(tmp_path):
     ]
     (row,) = rows(hard_tasks_table(tmp_path))
     effort = "60 (1); residual RL: 60 (2)"
-    # 3 of 200 held-out episodes with violations are 1.5 %, 4 of 60 + 3 of 60 stopped ones 6 %.
+    # Residual RL: 3 of 200 held-out episodes have violations (1.5 %), 7 of 120 training episodes were stopped (6 %).
     assert row == ["Connector, hard", "KGRL 97 (one seed)", "99 (98–100)", "– / –", "3 / 6", "0 / 2", effort]
 
 
 def test_guided_methods_are_compared_with_the_best_peer(tmp_path):
     template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2,0\n"
     rates = {"kgrl": (0.9, 1.0, 1.0, 1.0), "residual": (0.5, 0.9, 0.9, 1.0), "residual_cbf": (0.1, 0.2, 0.3, 0.4)}
-    lines = [template.format(name, seed, rate) for name, each in rates.items() for seed, rate in enumerate(each)]
-    (tmp_path / "peers_connector_hard.csv").write_text(HEAD + "".join(lines))
+    lines = [template.format(name, seed, rate) for name, values in rates.items() for seed, rate in enumerate(values)]
+    (tmp_path / "peers_connector_hard.csv").write_text(HEADER + "".join(lines))
     text = task_table("BncConnector", tmp_path)
     assert [row[3].split(" (")[0] for row in rows(text) if len(row) > 3] == ["100", "90", "25"]
-    # Of the 16 pairs of KGRL and residual RL, ten are won and five are ties.
+    # KGRL is better in 10 of the 16 pairs of seeds, and equal in 5: (10 + 5 / 2) / 16 = 0.78.
     assert "A seed of KGRL succeeds more often than one of residual RL with probability 0.78 (95 %: " in text
     assert "equal knowledge" not in text
 
 
-@pytest.mark.parametrize(("number", "middle"), [(4, "100"), (5, "100 (100–100)")])
-def test_few_equal_seeds_have_no_interval(number, middle, tmp_path):
+@pytest.mark.parametrize(("num_seeds", "cell"), [(4, "100"), (5, "100 (100–100)")])
+def test_fewer_than_five_seeds_have_no_interval(num_seeds, cell, tmp_path):
     template = "{},{},60,fresh,100,{},0,0,-0.1,0,12.25,60,0.97,15,-0.1,0,31.0,2,0\n"
     lines = [
-        template.format(name, seed, rate) for name, rate in (("kgrl", 1.0), ("residual", 0.5)) for seed in range(number)
+        template.format(name, seed, rate)
+        for name, rate in (("kgrl", 1.0), ("residual", 0.5))
+        for seed in range(num_seeds)
     ]
-    (tmp_path / "peers_connector_hard.csv").write_text(HEAD + "".join(lines))
+    (tmp_path / "peers_connector_hard.csv").write_text(HEADER + "".join(lines))
     text = task_table("BncConnector", tmp_path)
-    assert rows(text)[0][3] == middle
-    interval = "95 %: 1.00–1.00; " if number == 5 else ""
+    assert rows(text)[0][3] == cell
+    interval = "95 %: 1.00–1.00; " if num_seeds == 5 else ""
     assert f"residual RL with probability 1.00 ({interval}ties count half)" in text
 
 
-def test_methods_of_unequal_knowledge_are_marked():
+def test_knowledge_lists_demonstrated_episodes_when_unequal():
     (hard,) = (section for section in SECTIONS["GridClamp"] if section.title == "Grid clamp, hard")
     (sentence,) = knowledge(hard, TABLES)
     assert "; 3 demonstrated episodes: RL-SCT, 3 demonstration episodes; none: the other methods." in sentence
@@ -149,14 +151,17 @@ def test_methods_of_unequal_knowledge_are_marked():
 def test_knowledge_is_stated_when_a_learner_is_imported(monkeypatch):
     monkeypatch.delitem(LEARNERS._entries, "plain_tqc", raising=False)
     monkeypatch.delitem(sys.modules, "research.benchmarks.learner", raising=False)
-    rows = [Row("here", "connector_learners", "here"), Row("Stable-Baselines3", "connector_learners", "sb3_contrib")]
-    assert knowledge(Section("Learners", rows), TABLES) == []
+    learners = [
+        Row("here", "connector_learners", "here"),
+        Row("Stable-Baselines3", "connector_learners", "sb3_contrib"),
+    ]
+    assert knowledge(Section("Learners", learners), TABLES) == []
     assert "plain_tqc" in LEARNERS.names()
 
 
 def test_stopped_episodes_are_a_dash_when_the_column_is_missing(tmp_path):
     line = "kgrl,7,60,fresh,100,0.97,0,0,-0.1,0,12.25,60,0.8,15,-0.1,0,31.0,0\n"
-    (tmp_path / "peers_connector_hard.csv").write_text(HEAD.replace(",training_ended_in_collision", "") + line)
+    (tmp_path / "peers_connector_hard.csv").write_text(HEADER.replace(",training_ended_in_collision", "") + line)
     assert rows(hard_tasks_table(tmp_path))[0][4] == "– / –"
 
 
@@ -170,7 +175,7 @@ def test_training_success_is_marked_when_not_evaluated(tmp_path):
     assert row[1:] == ["60 (0–2)", "100, 50, 25 in training", "–", "0, 3, never", "none", "(3.0)"]
 
 
-def test_results_with_the_offset_of_the_run_are_marked():
+def test_results_with_a_constant_offset_are_marked():
     table = {row[0]: row for row in rows(hard_tasks_table(TABLES))}
     assert table["Grid clamp, hard"][1:4] == ["RL-SCT 99 (93–100) †", "100 †", "98 / 52"]
     assert table["Grid clamp, hard"][6] == "60 (10)"

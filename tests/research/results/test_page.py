@@ -1,4 +1,4 @@
-"""The pages of results."""
+"""Pages of results."""
 
 import pandas as pd
 import pytest
@@ -21,7 +21,8 @@ def write_results(folders, out):
 
 
 @pytest.fixture
-def finished(tmp_path):
+def connector_study(tmp_path):
+    """Return the folder of a study of the connector, with the rows of two seeds and of a baseline."""
     rows = [
         {
             "method": "skgrl", "after_episodes": 40, "eval_set": "gantry", "seed": seed, "success_rate": rate,
@@ -38,8 +39,8 @@ def finished(tmp_path):
     return tmp_path / "study"
 
 
-def test_page_has_every_seed_the_thesis_and_the_differences(finished, tmp_path):
-    page = write_results([finished], tmp_path / "results")
+def test_page_has_seeds_thesis_results_and_differences(connector_study, tmp_path):
+    page = write_results([connector_study], tmp_path / "results")
     assert "| skgrl | 40 | gantry | 100%, 97% | 12, never | none | 2 | 6 + 2 spills of 80 | 1.00 |" in page
     assert "| nothing | – | gantry | 14% | – | – | – | – | – |" in page
     assert THESIS["5.9"] in page
@@ -49,37 +50,37 @@ def test_page_has_every_seed_the_thesis_and_the_differences(finished, tmp_path):
     assert "Not run: skgrl, seeds 32–34; kgrl." in page
 
 
-def test_differences_of_all_methods_are_stated_once(finished, tmp_path):
-    table = read_table(finished / "connector.csv")
-    both = pd.concat([table, table[table["method"] == "skgrl"].assign(method="kgrl")], ignore_index=True)
-    write_table(tmp_path / "both" / "connector", both)
+def test_common_differences_of_methods_are_stated_once(connector_study, tmp_path):
+    table = read_table(connector_study / "connector.csv")
+    methods = pd.concat([table, table[table["method"] == "skgrl"].assign(method="kgrl")], ignore_index=True)
+    write_table(tmp_path / "both" / "connector", methods)
     page = write_results([tmp_path / "both"], tmp_path / "results")
     assert "Differences from the thesis (skgrl, kgrl): " in page
     assert page.count("reward shaped (thesis: sparse)") == 1
     assert "\n- skgrl: history of poses: commanded (thesis: measured)" in page
 
 
-def test_page_has_the_rows_of_a_study_without_evaluation(finished, tmp_path):
-    table = read_table(finished / "connector.csv").iloc[:2]
+def test_page_has_the_rows_of_a_study_without_evaluation(connector_study, tmp_path):
+    table = read_table(connector_study / "connector.csv").iloc[:2]
     table = table.drop(columns="success_rate").assign(eval_set="", training_success_rate=0.5)
-    write_table(tmp_path / "unjudged" / "connector", table)
-    page = write_results([tmp_path / "unjudged"], tmp_path / "results")
+    write_table(tmp_path / "training" / "connector", table)
+    page = write_results([tmp_path / "training"], tmp_path / "results")
     assert "| skgrl | 40 | – | – | 12, never | none | 2 | 6 + 2 spills of 80 | 1.00 |" in page
 
 
 def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     rates = {"rl_sct": (1.0, 1.0, 0.95, 0.85, 0.6, 0.0), "uniform_random": (0.05,) * 6}
     rows = [
-        {"method": method, "after_episodes": 100 * learned, "eval_set": one.name, "seed": 110, "episodes": 40,
+        {"method": method, "after_episodes": 100 * learned, "eval_set": eval_set.name, "seed": 110, "episodes": 40,
          "success_rate": rate, "training_episodes": 100 if learned else None, "training_episodes_to_convergence": None,
          "training_max_commanded_violation": -1e-4, "training_collisions": 0, "training_wall_time": 600.0,
          "training_ended_in_collision": 0, "training_ended_in_spill": 0}
         for method, learned in (("rl_sct", True), ("uniform_random", False))
-        for one, rate in zip(load_study(study_path("pouring_sweep")).eval_sets, rates[method], strict=True)
+        for eval_set, rate in zip(load_study(study_path("pouring_sweep")).eval_sets, rates[method], strict=True)
     ]  # fmt: skip
     write_table(tmp_path / "study" / "pouring_sweep", pd.DataFrame(rows))
     page, picture = write_results([tmp_path / "study"], tmp_path / "results"), tmp_path / "results/pouring_sweep.svg"
-    drawn = picture.read_bytes()
+    content = picture.read_bytes()
     assert "](pouring_sweep.svg)" in page
     assert "| rl_sct | 100% | 100% | 95% | 85% | 60% | 0% | 30 |" in page
     assert "| uniform_random | 5% | 5% | 5% | 5% | 5% | 5% | from the easiest on |" in page
@@ -87,7 +88,7 @@ def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     assert "| uniform_random | – |" not in page
     assert "Not run: " in page
     write_results([], tmp_path / "results")
-    assert picture.read_bytes() == drawn
+    assert picture.read_bytes() == content
 
 
 def test_smoothness_table_has_the_selected_columns(tmp_path):
@@ -99,8 +100,8 @@ def test_smoothness_table_has_the_selected_columns(tmp_path):
     assert "ldlj" not in page
 
 
-def test_pages_are_identical_when_written_from_stored_results(finished, tmp_path):
-    first = write_results([finished], tmp_path / "results")
+def test_pages_are_identical_when_written_from_stored_results(connector_study, tmp_path):
+    first = write_results([connector_study], tmp_path / "results")
     assert write_results([], tmp_path / "results") == first
 
 
@@ -118,9 +119,9 @@ def test_figures_of_studies_exist():
     assert {number for numbers in FIGURES_OF_STUDIES.values() for number in numbers} <= set(THESIS)
 
 
-def test_figures_page_has_every_figure_with_its_results(finished, tmp_path):
+def test_figures_page_has_all_figures_with_results(connector_study, tmp_path):
     reproduce("table 4.1", out=tmp_path / "figures")
-    page = write_results([finished, tmp_path / "figures"], tmp_path / "results")
+    page = write_results([connector_study, tmp_path / "figures"], tmp_path / "results")
     lines = {line.split(" | ")[0].removeprefix("| "): line for line in page.splitlines() if line.startswith("| ")}
     for number, words in THESIS.items():
         assert words in lines[number]

@@ -9,7 +9,9 @@ from research.results.statistics import bootstrap_interval, interquartile_mean, 
 def test_interquartile_mean_ignores_the_outer_quarters():
     scores = [np.array([0.0, 0.5, 0.7, 100.0])]
     assert interquartile_mean(scores) == pytest.approx(0.6)
-    assert interquartile_mean([scores[0][:2], scores[0][2:]]) == pytest.approx(0.6)  # tasks are pooled
+    assert interquartile_mean([scores[0][:2], scores[0][2:]]) == pytest.approx(
+        0.6
+    )  # the scores of all tasks are pooled
 
 
 @pytest.mark.parametrize(
@@ -26,21 +28,21 @@ def test_probability_of_improvement_counts_pairs(first, second, probability):
     assert probability_of_improvement([np.array(second)], [np.array(first)]) == 1.0 - probability
 
 
-def test_interval_contains_the_truth_as_often_as_it_claims():
-    rng, hits, count = np.random.default_rng(0), 0, 40
-    for seed in range(count):
+def test_bootstrap_interval_covers_the_true_mean():
+    rng, hits, repetitions = np.random.default_rng(0), 0, 40
+    for seed in range(repetitions):
         scores = [rng.uniform(0, 1, 12), rng.uniform(0, 1, 12)]
         low, high = bootstrap_interval(interquartile_mean, scores, seed=seed)
         hits += low <= 0.5 <= high
-    assert 0.8 * count <= hits <= count
+    assert hits >= 0.8 * repetitions  # the nominal coverage is 95 %
 
 
-def test_tasks_are_resampled_by_themselves():
-    """Both tasks are constant, so that a resampling within each of them changes nothing."""
+def test_bootstrap_resamples_within_each_task():
+    """The scores of each task are equal, so resampling within a task does not change them."""
     low, high = bootstrap_interval(interquartile_mean, [np.zeros(4), np.ones(4)])
     assert low == high == 0.5
 
 
-def test_equal_scores_have_equal_intervals():
+def test_bootstrap_interval_is_reproducible():
     scores = [np.array([0.2, 0.9, 1.0])]
     assert bootstrap_interval(interquartile_mean, scores) == bootstrap_interval(interquartile_mean, scores)
