@@ -51,7 +51,7 @@ def half_spaces(kind: str, rng: np.random.Generator) -> tuple[np.ndarray, np.nda
     return G, np.einsum("nfo,no->nf", G, center) - width[:, None]
 
 
-def actions(rng: np.random.Generator) -> np.ndarray:
+def random_actions(rng: np.random.Generator) -> np.ndarray:
     """Return actions (N, 2) of a random constant size from 1 to 1e5, with sign changes at no, some or all steps."""
     parity = np.cumsum(rng.uniform(size=(STEPS, 2)) < rng.choice([0.0, 0.05, 0.3, 1.0]), axis=0) % 2
     return (1.0 - 2.0 * parity) * rng.choice([-1.0, 1.0], 2) * 10.0 ** rng.uniform(0.0, 5.0)
@@ -75,7 +75,7 @@ def attack(steps: int, seed: int = 0) -> dict[str, Result]:
         primitive = LcNsKmp(reference, horizon=10, history=history, constraints=constraints)
         norms = np.linalg.norm(G, axis=2)
         for _ in range(5):
-            run(primitive, actions(rng), (G, c, norms), results[kind])
+            run(primitive, random_actions(rng), (G, c, norms), results[kind])
     return results
 
 

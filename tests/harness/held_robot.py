@@ -34,7 +34,7 @@ def set_held(env: object, is_held: bool) -> None:
 
 
 def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> dict:
-    """Run an episode in which the robot is held; return the last `info` and, as "late", the delay of the motion [s].
+    """Run an episode in which the robot is held; return the last `info` and the "delay" of the motion [s].
 
     Args:
         env: Environment.
@@ -53,8 +53,8 @@ def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> 
             set_held(env, step == first)
         observation, _, terminated, truncated, info = env.step(scripted_center_of_pressure(observation))
     port = env.task.diagram.GetOutputPort("motion_time")
-    late = round_period(period) * info["control_steps"] - float(port.Eval(env.simulator.get_context())[0])
-    return {**info, "late": late}
+    delay = round_period(period) * info["control_steps"] - float(port.Eval(env.simulator.get_context())[0])
+    return {**info, "delay": delay}
 
 
 def run_episodes(progress: str, begin: float | None, episodes: int, seconds: float = 2.0) -> list[dict]:
@@ -82,9 +82,9 @@ def main() -> None:
         for progress in options.progress:
             infos = run_episodes(progress, begin, options.episodes)
             reasons = dict(Counter(info["termination"] for info in infos))
-            late, force = np.mean([info["late"] for info in infos]), max(info["contact_force"] for info in infos)
+            delay, force = np.mean([info["delay"] for info in infos]), max(info["contact_force"] for info in infos)
             success = f"{reasons.get('success', 0)}/{len(infos)}"
-            print(f"{progress} | {begin} | {success} | {reasons} | {late:.2f} | {force:.1f}")
+            print(f"{progress} | {begin} | {success} | {reasons} | {delay:.2f} | {force:.1f}")
 
 
 if __name__ == "__main__":

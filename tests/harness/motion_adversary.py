@@ -79,7 +79,9 @@ class Result:
         self.outside = max(self.outside, outside)
 
 
-def push(rng: np.random.Generator, style: int, last: np.ndarray, center: np.ndarray, before: np.ndarray) -> np.ndarray:
+def pushing_action(
+    rng: np.random.Generator, style: int, last: np.ndarray, center: np.ndarray, before: np.ndarray
+) -> np.ndarray:
     """Return an action (D,) in [−1, 1]: towards or around the obstacle, random, or the previous action `before`."""
     towards = (center - last) / max(float(np.linalg.norm(center - last)), 1e-12)
     around = np.roll(towards, 1) * np.where(np.arange(len(towards)) % 2, 1.0, -1.0)
@@ -130,7 +132,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
                 action = np.linalg.solve(effect, sphere.center - mean) / gain if not history else action
                 action = np.clip(action + 0.1 * rng.standard_normal(2), -30.0, 30.0)
             if style or history:
-                action = push(rng, style, commands[-1] if commands else start, sphere.center, action)
+                action = pushing_action(rng, style, commands[-1] if commands else start, sphere.center, action)
             command = stepper.step(action)
             commands.append(command.output)
             result.fallbacks += command.is_fallback
@@ -149,7 +151,7 @@ def attack_template(rng: np.random.Generator, radius: float, result: Result, per
         style, action, X = int(rng.integers(5)), np.zeros(3), RigidTransform([0.3, 0.05, 0.0])
         commands, outside = [X.translation()], -np.inf
         for _ in range(400):
-            action = push(rng, style, commands[-1], center, action)
+            action = pushing_action(rng, style, commands[-1], center, action)
             request = template.displace(X, template.map(0, action, X, frames, period))
             command = template.command(0, X, request, frames, period)
             X = command.X_WE

@@ -54,10 +54,10 @@ def test_measures_have_fixed_values_without_motion():
     assert log_dimensionless_jerk(np.zeros((3, 3)), 0.02) == -np.inf
 
 
-@pytest.mark.parametrize("wrong", [{"episodes": 0}, {"action_scale": 0.0}, {"outputs": "some"}])
-def test_smoothness_refuses_invalid_arguments(tmp_path, wrong):
+@pytest.mark.parametrize("arguments", [{"episodes": 0}, {"action_scale": 0.0}, {"outputs": "some"}])
+def test_smoothness_refuses_invalid_arguments(tmp_path, arguments):
     with pytest.raises(InputError):
-        smoothness(tmp_path / "new", **wrong)
+        smoothness(tmp_path / "new", **arguments)
     assert not (tmp_path / "new").exists()
 
 

@@ -1,4 +1,6 @@
-"""One fault of the bus of each kind; `make injections` injects hundreds."""
+"""Faults of the bus and its programs, at least one of each kind; `make injections` injects hundreds."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,27 +10,27 @@ from injections.bus import Bus
 RNG = np.random.default_rng(0)
 STATUS, COMMAND = "on_status", "on_command"
 INJECTIONS = [
-    faults.lost(STATUS, 0.015),
-    faults.lost(STATUS, 0.06),
-    faults.delayed(STATUS, 0.03),
-    faults.delayed(STATUS, 0.05),
-    faults.duplicated(STATUS, 0.02),
-    faults.reordered(STATUS, 3),
-    faults.not_finite("joint_velocity_estimated", [2], np.nan, 3),
-    faults.resized(3, 2),
-    faults.garbage(RNG, 2),
-    faults.jumped("joint_velocity_estimated", 5, 5.0, 8),
+    faults.message_loss(STATUS, 0.015),
+    faults.message_loss(STATUS, 0.06),
+    faults.message_delay(STATUS, 0.03),
+    faults.message_delay(STATUS, 0.05),
+    faults.message_duplication(STATUS, 0.02),
+    faults.message_swap(STATUS, 3),
+    faults.non_finite_status("joint_velocity_estimated", [2], np.nan, 3),
+    faults.resized_status(3, 2),
+    faults.malformed_status(RNG, 2),
+    faults.status_jump("joint_velocity_estimated", 5, 5.0, 8),
     faults.external_load(4, 120.0),
     faults.clock_jump(-3.0),
     faults.clock_jump(1e4),
-    faults.lost(COMMAND, 0.015),
-    faults.lost(COMMAND, 0.06),
-    faults.controller_paused(0.015),
-    faults.controller_paused(0.3),
-    faults.controller_killed(0.06),
-    faults.robot_killed(0.05),
-    faults.robot_killed(0.1),
-    faults.monitor_killed(0.1),
+    faults.message_loss(COMMAND, 0.015),
+    faults.message_loss(COMMAND, 0.06),
+    faults.controller_pause(0.015),
+    faults.controller_pause(0.3),
+    faults.controller_kill(0.06),
+    faults.robot_kill(0.05),
+    faults.robot_kill(0.1),
+    faults.monitor_kill(0.1),
 ]
 
 
@@ -44,11 +46,7 @@ def test_station_stops_in_time_and_resumes(bus, injection):
 
 
 def test_injection_reports_a_missed_or_needless_stop(bus):
-    tolerated = faults.duplicated(STATUS, 0.02)
-    must = faults.Injection(
-        tolerated.kind, tolerated.description, tolerated.begin, tolerated.end, tolerated.duration, True
-    )
-    assert must.inject(bus).failures == ["not detected"]
-    stopped = faults.resized(3, 1)
-    may_not = faults.Injection(stopped.kind, stopped.description, stopped.begin, stopped.end, stopped.duration, False)
-    assert may_not.inject(bus).failures == ["stopped the arm: WRONG_SIZE"]
+    tolerated = faults.message_duplication(STATUS, 0.02)
+    assert replace(tolerated, stops=True).inject(bus).failures == ["not detected"]
+    stopping = faults.resized_status(3, 1)
+    assert replace(stopping, stops=False).inject(bus).failures == ["stopped the arm: WRONG_SIZE"]

@@ -22,7 +22,7 @@ class TooSlowError(BaseException):
 
 
 def attempt(target: str, refusal: type[Exception], call):
-    """Return the result of `call`, or None if it refuses the input; other exceptions are failures.
+    """Return the result of `call`, or None if the input is refused; other exceptions are failures.
 
     Args:
         target: Kind of input, for the counts.

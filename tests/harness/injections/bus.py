@@ -263,9 +263,9 @@ class Bus:
                 repair()
                 is_repaired = True
             self.step_once()
-            now, speed = (self.step - begin) * PERIOD, float(np.abs(self.velocities).max())
+            elapsed, speed = (self.step - begin) * PERIOD, float(np.abs(self.velocities).max())
             if observation.detected is None and self.is_detected:
-                observation.detected, observation.fastest = now, speed
+                observation.detected, observation.fastest = elapsed, speed
                 observation.fault = self.fault.name if self.has_controller else "MONITOR_STOP"
             # A restarted station moves the arm again without `resume`: the speed of this motion is not counted.
             is_moving_again = (
@@ -275,7 +275,7 @@ class Bus:
                 observation.detected is not None
                 and self.has_robot
                 and not is_moving_again
-                and now - observation.detected > STOPPED_WITHIN - 1e-9
+                and elapsed - observation.detected > STOPPED_WITHIN - 1e-9
             ):
                 observation.after = max(observation.after, speed)
         if not is_repaired:

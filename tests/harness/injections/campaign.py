@@ -61,7 +61,7 @@ class Result:
     failures: list[str]
 
 
-def fastest(bus: Bus) -> float:
+def largest_speed(bus: Bus) -> float:
     """Return the true speed of the fastest joint [rad/s]."""
     return float(np.abs(bus.velocities).max())
 
@@ -73,7 +73,7 @@ def undisturbed_speeds(bus: Bus) -> np.ndarray:
     bus.run_until_following(0.5)
     for _ in range(steps):
         bus.step_once()
-        speeds[bus.step % steps] = fastest(bus)
+        speeds[bus.step % steps] = largest_speed(bus)
     return speeds
 
 
@@ -120,9 +120,9 @@ def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random
     bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
     for kind in kinds:
         begin(bus, kind, rng, effects)
-    result, speed, elapsed = Result(np.nan, "", 0.0, 0.0, []), fastest(bus), 0.0
+    result, speed, elapsed = Result(np.nan, "", 0.0, 0.0, []), largest_speed(bus), 0.0
     while elapsed < DURATION - 1e-9 and bus.step - first_step < MAX_STEPS:
-        before = fastest(bus)
+        before = largest_speed(bus)
         bus.step_once()
         if start is None and effects:
             start = effects[0] - 1
@@ -133,9 +133,9 @@ def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random
             result.detected = elapsed
             result.cause = bus.fault.name if bus.has_controller and bus.fault else f"monitor: {bus.monitor.fault.name}"
         if bus.has_robot and start is not None:
-            result.growth = max(result.growth, fastest(bus) / speed)
+            result.growth = max(result.growth, largest_speed(bus) / speed)
             if elapsed > SLOW_AFTER - 1e-9:
-                result.late_speed = max(result.late_speed, fastest(bus))
+                result.late_speed = max(result.late_speed, largest_speed(bus))
     is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
     if is_detectable and not result.detected <= bound + 1e-9:
         result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
@@ -146,7 +146,7 @@ def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random
     return result
 
 
-def in_child(bus: Bus, work: Callable[[], Result]) -> Result:
+def run_in_child(bus: Bus, work: Callable[[], Result]) -> Result:
     """Return the result of `work` in a forked process, so that this process continues without the fault."""
     bus.deliver()  # both processes share the pipes of the buses in memory, which must be empty
     reading, writing = os.pipe()
@@ -170,7 +170,7 @@ def in_child(bus: Bus, work: Callable[[], Result]) -> Result:
     return pickle.loads(content)
 
 
-def pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[tuple[Kind, Kind]]:
+def random_pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[tuple[Kind, Kind]]:
     """Yield random pairs of faults in different places: sensor, network, command or program."""
     while number and len({kind.where for kind in kinds}) > 1:
         first, second = (kinds[i] for i in rng.choice(len(kinds), 2, replace=False))
@@ -179,7 +179,7 @@ def pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[
             yield first, second
 
 
-def table(results: dict[str, list[Result]]) -> int:
+def print_table(results: dict[str, list[Result]]) -> int:
     """Print a row for each kind; return the number of failed injections."""
     bounds = {kind.name: kind.bound for kind in KINDS}
     print(
@@ -216,15 +216,15 @@ def main() -> int:
         rng = np.random.default_rng([arguments.seed, instant])
         bus.run_until_following(float(rng.uniform(0.02, 0.3)))
         injections = [(KINDS.index(kind), (kind,)) for kind in kinds]
-        injections += [(len(KINDS), pair) for pair in pairs(kinds, arguments.pairs // arguments.instants, rng)]
+        injections += [(len(KINDS), pair) for pair in random_pairs(kinds, arguments.pairs // arguments.instants, rng)]
         for index, (number, chosen) in enumerate(injections):
             rng = np.random.default_rng([arguments.seed, instant, number, index])
-            result = in_child(bus, partial(inject, bus, chosen, speeds, rng))
+            result = run_in_child(bus, partial(inject, bus, chosen, speeds, rng))
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
             for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)
                 print(f"FAIL  {name}, instant {instant}: {failure} ({result.cause})", flush=True)
-    failed = table(results)
+    failed = print_table(results)
     total = sum(len(rows) for rows in results.values())
     print(f"{total} injections, {failed} with a failed requirement, in {time.monotonic() - started:.0f} s")
     return 1 if failed else 0

@@ -28,16 +28,16 @@ def resident_memory() -> float:
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE / 2**20
 
 
-def stops(rng: np.random.Generator) -> Iterator[faults.Injection]:
+def stopping_faults(rng: np.random.Generator) -> Iterator[faults.Injection]:
     """Yield an endless sequence of faults that must stop the arm."""
     while True:
-        yield faults.lost("on_status", 0.2)
-        yield faults.not_finite("joint_position_measured", [int(rng.integers(7))], np.nan, 3)
+        yield faults.message_loss("on_status", 0.2)
+        yield faults.non_finite_status("joint_position_measured", [int(rng.integers(7))], np.nan, 3)
         yield faults.external_load(int(rng.integers(7)), 150.0)
-        yield faults.lost("on_command", 0.2)
-        yield faults.controller_paused(0.2)
-        yield faults.controller_killed(0.1)
-        yield faults.garbage(rng, 3)
+        yield faults.message_loss("on_command", 0.2)
+        yield faults.controller_pause(0.2)
+        yield faults.controller_kill(0.1)
+        yield faults.malformed_status(rng, 3)
 
 
 def main() -> int:
@@ -49,7 +49,7 @@ def main() -> int:
     rng, bus = np.random.default_rng(arguments.seed), Bus()
     started, last_report, num_failed, num_stops = time.monotonic(), 0.0, 0, 0
     sizes: list[tuple[float, float]] = []  # wall clock time [s], memory [MiB]
-    for injection in stops(rng):
+    for injection in stopping_faults(rng):
         bus.run_until_following(MOTION_TIME)
         observation = injection.inject(bus)
         num_stops, num_failed = num_stops + 1, num_failed + bool(observation.failures)

@@ -74,14 +74,14 @@ def _set_relay(where: str, relay: Callable[[bytes], list[bytes]]) -> Callable[[B
     return begin
 
 
-def lost(where: str, seconds: float) -> Injection:
-    """Drop all messages for `seconds` [s]."""
+def message_loss(where: str, seconds: float) -> Injection:
+    """Return a fault that drops all messages for `seconds` [s]."""
     kind = "status stopped" if where == "on_status" else "commands lost"
     return Injection(kind, f"{seconds} s", _set_relay(where, lambda m: []), _end_relay, seconds, _must_stop(seconds))
 
 
-def delayed(where: str, seconds: float) -> Injection:
-    """Delay all messages by `seconds` [s] for 0.3 s."""
+def message_delay(where: str, seconds: float) -> Injection:
+    """Return a fault that delays all messages by `seconds` [s] for 0.3 s."""
     name = "status" if where == "on_status" else "commands"
     queue: deque[bytes] = deque()
     steps = round(seconds / PERIOD)
@@ -96,8 +96,8 @@ def delayed(where: str, seconds: float) -> Injection:
     return Injection(f"{name} delayed", f"{seconds} s", _set_relay(where, relay), _end_relay, 0.3, stops)
 
 
-def reordered(where: str, pairs: int) -> Injection:
-    """Swap the two messages of each pair of consecutive messages."""
+def message_swap(where: str, pairs: int) -> Injection:
+    """Return a fault that swaps the messages of several consecutive pairs."""
     name = "status" if where == "on_status" else "commands"
     pending: list[bytes] = []
 
@@ -114,16 +114,16 @@ def reordered(where: str, pairs: int) -> Injection:
     )
 
 
-def duplicated(where: str, seconds: float) -> Injection:
-    """Send all messages twice for `seconds` [s], which must not stop the arm."""
+def message_duplication(where: str, seconds: float) -> Injection:
+    """Return a fault that sends all messages twice for `seconds` [s], which must not stop the arm."""
     name = "status" if where == "on_status" else "commands"
     return Injection(
         f"{name} duplicated", f"{seconds} s", _set_relay(where, lambda m: [m, m]), _end_relay, seconds, False
     )
 
 
-def replaced(kind: str, description: str, change: Callable[[bytes], bytes], messages: int) -> Injection:
-    """Change statuses; the first changed status must stop the arm."""
+def status_replacement(kind: str, description: str, change: Callable[[bytes], bytes], messages: int) -> Injection:
+    """Return a fault that changes a number of statuses; the first changed status must stop the arm."""
 
     def relay(message: bytes) -> list[bytes]:
         return [change(message)] if message else [message]
@@ -133,8 +133,8 @@ def replaced(kind: str, description: str, change: Callable[[bytes], bytes], mess
     )
 
 
-def not_finite(field: str, joints: list[int], value: float, messages: int) -> Injection:
-    """Replace values of a field with NaN or infinity."""
+def non_finite_status(field: str, joints: list[int], value: float, messages: int) -> Injection:
+    """Return a fault that replaces values of a field with NaN or infinity."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
@@ -142,20 +142,20 @@ def not_finite(field: str, joints: list[int], value: float, messages: int) -> In
             values[joint] = value
         return with_fields(message, **{field: values})
 
-    return replaced("status NaN", f"{value} in {field}{joints}", change, messages)
+    return status_replacement("status NaN", f"{value} in {field}{joints}", change, messages)
 
 
-def resized(joints: int, messages: int) -> Injection:
-    """Change the number of joints in the status."""
+def resized_status(joints: int, messages: int) -> Injection:
+    """Return a fault that changes the number of joints in the status."""
 
     def change(message: bytes) -> bytes:
         return with_fields(message, num_joints=joints, **{name: [0.0] * joints for name in JOINT_FIELDS})
 
-    return replaced("status wrong size", f"{joints} joints", change, messages)
+    return status_replacement("status wrong size", f"{joints} joints", change, messages)
 
 
-def garbage(rng: np.random.Generator, messages: int) -> Injection:
-    """Replace messages by random bytes, truncate them, or invert the first byte of their type."""
+def malformed_status(rng: np.random.Generator, messages: int) -> Injection:
+    """Return a fault that replaces statuses by random bytes, truncates statuses, or inverts the byte of their type."""
     variant = int(rng.integers(3))
     fraction, noise = float(rng.uniform(0.0, 0.99)), rng.bytes(int(rng.integers(0, 2000)))
 
@@ -166,33 +166,33 @@ def garbage(rng: np.random.Generator, messages: int) -> Injection:
             return message[: int(fraction * len(message))]
         return bytes([message[0] ^ 255]) + message[1:]
 
-    return replaced("status garbage", ("noise", "truncated", "another type")[variant], change, messages)
+    return status_replacement("status garbage", ("noise", "truncated", "another type")[variant], change, messages)
 
 
-def jumped(field: str, joint: int, offset: float, messages: int) -> Injection:
-    """Add an offset to a joint's position [rad] or velocity [rad/s]."""
+def status_jump(field: str, joint: int, offset: float, messages: int) -> Injection:
+    """Return a fault that adds an offset to a joint's position [rad] or velocity [rad/s]."""
 
     def change(message: bytes) -> bytes:
         values = list(getattr(lcmt_iiwa_status.decode(message), field))
         values[joint] += offset
         return with_fields(message, **{field: values})
 
-    return replaced("status jumped", f"{field}[{joint}] by {offset:.2f}", change, messages)
+    return status_replacement("status jumped", f"{field}[{joint}] by {offset:.2f}", change, messages)
 
 
 def external_load(joint: int, torque: float) -> Injection:
-    """Add an external torque above the limit to a joint, in one status."""
+    """Return a fault that adds an external torque above the limit to a joint, in a single status."""
 
     def change(message: bytes) -> bytes:
         values = list(lcmt_iiwa_status.decode(message).joint_torque_external)
         values[joint] += torque
         return with_fields(message, joint_torque_external=values)
 
-    return replaced("external torque", f"{torque:.0f} Nm on joint {joint}", change, 1)
+    return status_replacement("external torque", f"{torque:.0f} Nm on joint {joint}", change, 1)
 
 
 def clock_jump(seconds: float) -> Injection:
-    """Shift the robot's clock by `seconds` [s]; the end of the fault is a second jump, back to the true time."""
+    """Return a fault that shifts the robot's clock by `seconds` [s] and, at its end, shifts the clock back."""
 
     def relay(message: bytes) -> list[bytes]:
         if not message:
@@ -203,8 +203,8 @@ def clock_jump(seconds: float) -> Injection:
     return Injection("clock jump", f"{seconds} s", _set_relay("on_status", relay), _end_relay, 0.3, stops)
 
 
-def controller_paused(seconds: float) -> Injection:
-    """Pause the station for `seconds` [s]."""
+def controller_pause(seconds: float) -> Injection:
+    """Return a fault that pauses the station for `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
@@ -217,8 +217,8 @@ def controller_paused(seconds: float) -> Injection:
     )
 
 
-def controller_killed(seconds: float) -> Injection:
-    """Kill the station, and restart it after `seconds` [s]."""
+def controller_kill(seconds: float) -> Injection:
+    """Return a fault that kills the station and restarts it after `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_controller = False
@@ -226,8 +226,8 @@ def controller_killed(seconds: float) -> Injection:
     return Injection("controller killed", f"restarted after {seconds} s", begin, Bus.start_controller, seconds, True)
 
 
-def robot_killed(seconds: float) -> Injection:
-    """Kill the robot, and restart it after `seconds` [s] with its clock at zero."""
+def robot_kill(seconds: float) -> Injection:
+    """Return a fault that kills the robot and restarts it after `seconds` [s] with its clock at zero."""
 
     def begin(bus: Bus) -> None:
         bus.has_robot = False
@@ -235,8 +235,8 @@ def robot_killed(seconds: float) -> Injection:
     return Injection("robot killed", f"restarted after {seconds} s", begin, Bus.start_robot, seconds, True)
 
 
-def monitor_killed(seconds: float) -> Injection:
-    """Kill the safety monitor, and restart it after `seconds` [s]."""
+def monitor_kill(seconds: float) -> Injection:
+    """Return a fault that kills the safety monitor and restarts it after `seconds` [s]."""
 
     def begin(bus: Bus) -> None:
         bus.has_safety_monitor = False
@@ -257,21 +257,23 @@ def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
         return int(rng.integers(1, 20))
 
     for where in ("on_status", "on_command"):
-        yield lost(where, duration())
-        yield delayed(where, duration(0.2))
-        yield reordered(where, random_count())
-        yield duplicated(where, duration(0.5))
+        yield message_loss(where, duration())
+        yield message_delay(where, duration(0.2))
+        yield message_swap(where, random_count())
+        yield message_duplication(where, duration(0.5))
     joints = sorted(set(rng.integers(0, 7, 3).tolist()))
-    yield not_finite(str(rng.choice(MEASURED)), joints, float(rng.choice([np.nan, np.inf, -np.inf])), random_count())
-    yield resized(int(rng.choice([0, 1, 3, 6, 8, 14])), random_count())
-    yield garbage(rng, random_count())
-    yield jumped(
+    yield non_finite_status(
+        str(rng.choice(MEASURED)), joints, float(rng.choice([np.nan, np.inf, -np.inf])), random_count()
+    )
+    yield resized_status(int(rng.choice([0, 1, 3, 6, 8, 14])), random_count())
+    yield malformed_status(rng, random_count())
+    yield status_jump(
         "joint_position_measured",
         int(rng.integers(7)),
         float(rng.choice([-1, 1]) * rng.uniform(0.1, 3)),
         random_count(),
     )
-    yield jumped(
+    yield status_jump(
         "joint_velocity_estimated",
         int(rng.integers(7)),
         float(rng.choice([-1, 1]) * rng.uniform(1.8, 9)),
@@ -279,7 +281,7 @@ def all_kinds(rng: np.random.Generator) -> Iterator[Injection]:
     )
     yield external_load(int(rng.integers(7)), float(rng.uniform(50.0, 200.0)))
     yield clock_jump(float(rng.choice([-1, 1])) * float(np.exp(rng.uniform(np.log(0.01), np.log(1e5)))))
-    yield controller_paused(duration(2.0))
-    yield controller_killed(duration(1.0) + MIN_STOPPING)
-    yield robot_killed(duration(1.0) + MIN_STOPPING)
-    yield monitor_killed(duration(1.0) + 2.0 * MIN_STOPPING)
+    yield controller_pause(duration(2.0))
+    yield controller_kill(duration(1.0) + MIN_STOPPING)
+    yield robot_kill(duration(1.0) + MIN_STOPPING)
+    yield monitor_kill(duration(1.0) + 2.0 * MIN_STOPPING)

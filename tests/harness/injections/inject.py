@@ -37,12 +37,12 @@ def main() -> int:
                 print(f"FAIL  {injection.kind}, {injection.description}: {failure}", flush=True)
         print(f"round {number}: {num_failed} failed; {total} injections in total", flush=True)
         number += 1
-    failed = table(results)
+    failed = print_table(results)
     print(f"in {time.monotonic() - started:.0f} s")
     return 1 if failed else 0
 
 
-def table(results: dict[str, list[tuple[Injection, Observation]]]) -> int:
+def print_table(results: dict[str, list[tuple[Injection, Observation]]]) -> int:
     """Print a row for each kind; return the number of injections with a failed check."""
     print(f"{'kind':<22}{'injected':>9}{'stopped':>9}{'tolerated':>11}{'failed':>8}   detected after [ms]   faults")
     for kind, rows in results.items():

@@ -107,19 +107,19 @@ class Listener:
         self.is_stopping.clear()
 
 
-def robot(url: str, rate: float) -> subprocess.Popen:
+def start_robot(url: str, rate: float) -> subprocess.Popen:
     """Start a simulated robot with its safety monitor."""
     call = f"from guiderail.tools.cli.main import main; main(['sim-driver', '--url', {url!r}, '--rate', '{rate}'])"
     return subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL)
 
 
-def controller(url: str, rate: float) -> subprocess.Popen:
+def start_controller(url: str, rate: float) -> subprocess.Popen:
     """Start the program that commands the robot."""
     program = str(Path(__file__).with_name("controller.py"))
     return subprocess.Popen([sys.executable, program, url, str(rate)], stderr=subprocess.DEVNULL)
 
 
-def monitor(url: str, rate: float) -> subprocess.Popen:
+def start_monitor(url: str, rate: float) -> subprocess.Popen:
     """Start a second safety monitor."""
     call = f"from guiderail.tools.cli.main import main; main(['safety-monitor', '--url', {url!r}, '--rate', '{rate}'])"
     return subprocess.Popen([sys.executable, "-c", call], stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -158,7 +158,7 @@ def main() -> int:
     rate, url = arguments.rate, f"udpm://239.255.76.67:{20000 + os.getpid() % 20000}?ttl=0"
     listener, rng = Listener(url), np.random.default_rng(0)
     set_realtime_priority()
-    start = {"robot": robot, "controller": controller, "monitor": monitor}
+    start = {"robot": start_robot, "controller": start_controller, "monitor": start_monitor}
     processes = {name: program(url, rate) for name, program in start.items()}
     counts: Counter[tuple[str, str]] = Counter()
     kinds = [f"{name} {action}" for name in ("controller", "robot", "monitor") for action in ("killed", "paused")]

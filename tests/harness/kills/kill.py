@@ -7,8 +7,8 @@ A run is started, killed (SIGKILL) and resumed repeatedly, and finally completed
 instant of an episode, after at least half of the run's episodes are in a checkpoint. The others happen at a random
 instant soon after the start of the process. The folder of the run is compared with the folder of an undisturbed run:
 tables without wall-clock times, the policy's bytes, every array and value of the checkpoint. A study is killed
-repeatedly while its workers run, which must end as well. Finally only one of its workers is killed. The results are
-printed as JSON, and the exit code is 1 if a result differs or a process remains.
+repeatedly while its workers run; the workers must end as well. Finally only one of the workers is killed. The results
+are printed as JSON, and the exit code is 1 if a result differs or a process remains.
 """
 
 from __future__ import annotations

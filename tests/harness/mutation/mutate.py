@@ -7,9 +7,10 @@
 
 The operators in `mutations.py` change comparisons, arithmetic, logic, numbers, branches, statements, calls with a
 counterpart, slices and keyword arguments, and multiply limits and constants by 1.001. A mutant is tested in a fork of a
-process that has collected the tests. The tests that execute its line run until one fails, fast tests and tests that
-have killed many mutants first. A mutant that passes all of them survives. `survivors.yaml` explains why a survivor
-makes no difference. A survivor without an explanation is an error, and so is an explanation without a surviving mutant.
+process that has collected the tests. The tests that execute its line run until the first failure, fast tests and
+tests that have killed many mutants first. A mutant that passes all of them survives. `survivors.yaml` explains why a
+survivor makes no difference. A survivor without an explanation is an error, and so is an explanation without a
+surviving mutant.
 """
 
 from __future__ import annotations
