@@ -1,4 +1,4 @@
-"""Physics of the connector: pushing, turning and pulling."""
+"""Contact physics of the connector on the gantry: pushing, turning and pulling."""
 
 import numpy as np
 import pytest
@@ -6,41 +6,40 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 
-STIFFNESS = 1500.0
+STIFFNESS = 1500.0  # of the station's translations [N/m]
 WORKCELL = BncWorkcell()
-# Heights of the mouth in the locked frame: on top of the lugs,
+# Height of the plug's mouth, relative to the locked pose [mm]: on top of the lugs.
 LUG_TOP = (WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height) / MM
-# and with the lugs at the bottom of the straight entries.
+# The same height with the lugs at the ends of the slots' straight entries [mm].
 ENTRY_BOTTOM = (
     WORKCELL.dimensions.lug_height - WORKCELL.dimensions.entry_height - WORKCELL.dimensions.locked_height
 ) / MM
 
 
-def run(times, z_mm, yaw_deg, *, time_step=0.005, impedance=None, prepare=None):
-    station = GantryStation(WORKCELL, impedance or Impedance(), time_step)
+def drive(times, z_mm, yaw_deg):
+    """Drive a plug along heights [mm] and yaw angles [degrees] at times [s]; return the recorded signals by name."""
     motion = poses(np.array(z_mm) * MM, np.deg2rad(yaw_deg))
-    return drive_along(station, times, motion, prepare)
+    return drive_along(GantryStation(WORKCELL), times, motion)[1].signals
 
 
-def lock_and(times, z_mm, yaw_deg):
-    """Return the recordings until the plug is locked, and along further poses."""
+def lock_and_drive(times, z_mm, yaw_deg):
+    """Lock the plug, then drive it along further poses; return the signals of both motions."""
     lock_times, lock_poses = insert_and_lock()
     t = np.concatenate([lock_times, lock_times[-1] + np.array(times)])
     z = np.concatenate([lock_poses[:, 2] / MM, z_mm])
     yaw = np.concatenate([np.rad2deg(lock_poses[:, 3]), yaw_deg])
-    signals, end = run(t, z, yaw)[1].signals, round(lock_times[-1] / 0.02)
+    signals, end = drive(t, z, yaw), round(lock_times[-1] / 0.02)
     return tuple({name: signal[part] for name, signal in signals.items()} for part in (slice(end), slice(end, None)))
 
 
 @pytest.fixture(scope="module")
 def locked_and_pulled():
-    pull = 40.0 / STIFFNESS / MM + 5.0  # beyond the effort limit
-    return lock_and([0.5, 1.0], [pull, pull], [0, 0])
+    pull = 40.0 / STIFFNESS / MM + 5.0  # 5 mm more than the spring's extension [mm] at the limit of 40 N
+    return lock_and_drive([0.5, 1.0], [pull, pull], [0, 0])
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +56,7 @@ def test_plug_locks_at_the_nominal_pose(locked):
 
 
 def test_wrench_equals_the_force_of_the_impedance(locked):
-    """At rest on the seat, and while turning slowly."""
+    """While the plug turns slowly, from 5.0 s to 6.6 s."""
     turning = slice(250, 330)
     np.testing.assert_allclose(
         np.linalg.norm(locked["wrench"][turning, :3], axis=1), locked["contact_force"][turning, 0], atol=0.6
@@ -65,18 +64,18 @@ def test_wrench_equals_the_force_of_the_impedance(locked):
 
 
 def test_rotation_is_blocked_before_insertion():
-    """Turned by 45°, the mouth's face rests on the lugs, with and without a push of 30 N."""
+    """At a yaw of 45°, the mouth rests on the lugs under a push of 30 N."""
     depth = LUG_TOP - 30.0 / STIFFNESS / MM
-    _, recording = run([0, 1.5, 2.5, 3.5], [CLEAR / MM, LUG_TOP + 1, depth, depth], [45, 45, 45, 45])
+    recording = drive([0, 1.5, 2.5, 3.5], [CLEAR / MM, LUG_TOP + 1, depth, depth], [45, 45, 45, 45])
     assert recording["wrench"][-1, 2] == pytest.approx(30.0, abs=1.5)
     assert recording["pose"][-1, 2] == pytest.approx(LUG_TOP * MM, abs=0.1 * MM)
 
 
 @pytest.mark.parametrize("lug_depth_in_slot", [1.5, 2.4])
 def test_rotation_is_blocked_in_the_entry_slot(lug_depth_in_slot):
-    """With the lugs between the walls of the entry, a commanded quarter turn turns it by a few degrees of play."""
+    """The walls of the entry stop a commanded quarter turn after a few degrees of play."""
     z = WORKCELL.dimensions.lug_height / MM - WORKCELL.dimensions.locked_height / MM - lug_depth_in_slot
-    _, recording = run([0, 1.5, 3.0, 3.5], [CLEAR / MM, z, z, z], [90, 90, 0, 0])
+    recording = drive([0, 1.5, 3.0, 3.5], [CLEAR / MM, z, z, z], [90, 90, 0, 0])
     assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
     assert abs(recording["wrench"][-1, 5]) > 1.0
 
@@ -89,8 +88,8 @@ def test_locked_plug_resists_a_pull(locked_and_pulled):
 
 
 def test_detent_has_a_break_out_torque():
-    """The ramp's apex resists turning back without a push, up to a torque."""
-    _, recording = lock_and([1.5, 1.7], [0, 0], [80, 80])
+    """The apex of the ramp resists turning back by at most 2 Nm."""
+    _, recording = lock_and_drive([1.5, 1.7], [0, 0], [80, 80])
     resistance = np.abs(recording["wrench"][:, 5])
     in_detent = np.rad2deg(recording["pose"][:, 3]) < 8.0
     assert 0.02 < resistance[in_detent].max() < 2.0
@@ -99,19 +98,15 @@ def test_detent_has_a_break_out_torque():
 
 @pytest.mark.parametrize(("z_mm", "yaw_deg"), [(-40.0, 45.0), (-40.0, 90.0)])
 def test_plug_does_not_tunnel_at_the_effort_limit(z_mm, yaw_deg):
-    """On the lugs and on the seat, with the largest force."""
-    _, recording = run([0, 1.0, 2.0, 3.0], [CLEAR / MM, 9.0, z_mm, z_mm], [yaw_deg] * 4)
-    floor = (
-        LUG_TOP
-        if yaw_deg == 45.0
-        else WORKCELL.dimensions.lug_height / MM - 3.4 - WORKCELL.dimensions.locked_height / MM
-    )
+    """At 45° the mouth rests on the lugs, and at 90° the lugs are at the end of their entries."""
+    recording = drive([0, 1.0, 2.0, 3.0], [CLEAR / MM, 9.0, z_mm, z_mm], [yaw_deg] * 4)
+    floor = LUG_TOP if yaw_deg == 45.0 else ENTRY_BOTTOM
     assert recording["wrench"][-1, 2] == pytest.approx(40.0, abs=0.5)
     assert recording["pose"][-1, 2] > (floor - 0.6) * MM
 
 
 def test_lugs_do_not_tunnel_at_the_effort_limit():
-    _, recording = run([0, 1.0, 2.5, 3.5], [CLEAR / MM, 3.0, 3.0, 3.0], [90, 90, -90, -90])
+    recording = drive([0, 1.0, 2.5, 3.5], [CLEAR / MM, 3.0, 3.0, 3.0], [90, 90, -90, -90])
     assert recording["saturation"][-1, 0] == 1.0
     assert np.rad2deg(recording["pose"][-1, 3]) > 80.0
 
@@ -124,8 +119,8 @@ def test_locked_pose_is_insensitive_to_the_time_step(locked):
     assert np.abs(np.rad2deg(difference[3:])).max() < 0.5
 
 
-def test_plug_locks_on_a_jack_moved_in_the_context():
-    X_TTactual = RigidTransform([3.0 * MM, -2.0 * MM, 1.0 * MM])
+def test_plug_locks_when_jack_and_motion_are_moved():
+    X_TTactual = RigidTransform([3.0 * MM, -2.0 * MM, 1.0 * MM])  # nominal to actual target frame
     times, motion = insert_and_lock()
     shifted = motion + np.array([*X_TTactual.translation(), 0, 0, 0])
 
@@ -145,7 +140,7 @@ def test_plug_locks_with_a_grasp_offset():
     def grasp(plant, context):
         WORKCELL.set_grasp_offset(plant, context, RigidTransform(offset))
 
-    # The offset turns with the tool, so the path of the tool center is an arc.
+    # The offset turns with the tool, so the tool center moves along an arc while the plug turns about its axis.
     fine = np.linspace(0.0, times[-1], 401)
     dense = np.stack([np.interp(fine, times, column) for column in motion.T], axis=1)
     dense[:, 0] -= offset[0] * np.cos(dense[:, 3])

@@ -1,4 +1,4 @@
-"""Physics of the hard connector, with a smaller chamfer, also with finer contact."""
+"""Contact physics of the hard connector, at the study's contact settings and at finer settings."""
 
 import numpy as np
 import pytest
@@ -15,12 +15,13 @@ FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
 HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
+# Height of the plug's mouth on top of the lugs, relative to the locked pose [m].
 LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
 
 
-@pytest.fixture(scope="module", params=[{}, FINE], ids=["as studied", "fine"])
+@pytest.fixture(scope="module", params=[{}, FINE], ids=["study", "fine"])
 def build(request):
-    """Return a function that builds the station."""
+    """Return a function that builds a gantry station at one of the contact settings."""
     options = {"difficulty": "hard", **request.param}
     workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
     return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
@@ -28,7 +29,7 @@ def build(request):
 
 @pytest.fixture(scope="module")
 def locked_and_pulled(build):
-    """Lock the plug, then command a pull beyond the effort limit."""
+    """Lock the plug, then command a pull of 45 N, above the limit of 40 N; return the recording."""
     times, motion = insert_and_lock()
     pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
     times = np.concatenate([times, times[-1] + [1.0, 1.5]])

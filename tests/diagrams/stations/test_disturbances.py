@@ -1,4 +1,4 @@
-"""Effects of the disturbances, all of which are off by default."""
+"""Disturbances of a simulated station: defaults, effects and invalid values."""
 
 from dataclasses import replace
 
@@ -12,60 +12,62 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD, Im
 from guiderail.models.common.transforms import MM
 
 DOWN = np.array([0.0, 0.0, -1.0])
-CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # without other random effects
+CLAMP = {"fixture_offset": "none", "action_repeat": 25}  # without a random fixture offset
 
 
-def descended(decisions=3, seed=1, **options):
-    """Return environment and observations of a clamp that is pushed onto the table next to its holes."""
+def descend(num_actions=3, seed=1, **options):
+    """Push the clamp onto the table next to its holes; return environment, observations and the reset's info."""
     env = make_env("GridClamp", **CLAMP, **options)
     observation, info = env.reset(seed=seed, options={"offset": (1.5 * MM, 1.5 * MM)})
-    seen = [observation]
-    for _ in range(decisions):
+    observations = [observation]
+    for _ in range(num_actions):
         observation, _, terminated, truncated, _ = env.step(DOWN)
-        seen.append(observation)
+        observations.append(observation)
         if terminated or truncated:
             break
-    return env, np.array(seen), info
+    return env, np.array(observations), info
 
 
 @pytest.fixture(scope="module")
-def plain():
-    return descended()
+def undisturbed():
+    return descend()
 
 
-def test_station_is_undisturbed_by_default(plain):
-    env, _, info = plain
+def test_station_is_undisturbed_by_default(undisturbed):
+    env, _, info = undisturbed
     assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
     assert "friction_factor" not in info
     assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].is_active
+    assert not Disturbances.model_validate({}).is_active
 
 
-def test_disturbances_depend_on_the_seed(plain):
+def test_disturbances_depend_on_the_seed(undisturbed):
     options = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
-    _, first, info = descended(**options)
-    _, second, _ = descended(**options)
+    _, first, info = descend(**options)
+    _, second, _ = descend(**options)
     np.testing.assert_array_equal(second, first)
-    _, other, changed = descended(seed=2, **options)
-    assert not np.array_equal(other, first)
+    _, other_seed, other_info = descend(seed=2, **options)
+    assert not np.array_equal(other_seed, first)
     assert 0.5 <= info["wrench_scale"] <= 2.0
     assert np.abs(info["wrench_bias"][:3]).max() <= 1.0
-    assert info["wrench_scale"] != changed["wrench_scale"]
-    assert not np.array_equal(first, plain[1])
+    assert info["wrench_scale"] != other_info["wrench_scale"]
+    assert not np.array_equal(first, undisturbed[1])
 
 
-def test_contact_factors_last_until_the_next_reset():
-    env, _, info = descended(1, friction_factor=(0.5, 0.5), modulus_factor=(0.1, 0.1))
+def test_contact_factors_are_applied_at_every_reset():
+    env, _, info = descend(1, friction_factor=(0.5, 0.5), modulus_factor=(0.1, 0.1))
     assert info["friction_factor"] == pytest.approx(0.5)
 
     def surfaces():
+        """Return the proximity properties of the surfaces of clamp and table by name."""
         station = env.task.diagram.GetSubsystemByName("station")
         query = station.scene_graph.get_query_output_port().Eval(
             station.scene_graph.GetMyContextFromRoot(env.simulator.get_context())
         )
         inspector, result = query.inspector(), {}
         for body in ("clamp", "table"):
-            for one in station.plant.GetCollisionGeometriesForBody(station.plant.GetBodyByName(body)):
-                result[inspector.GetName(one).split("::")[-1]] = inspector.GetProximityProperties(one)
+            for geometry in station.plant.GetCollisionGeometriesForBody(station.plant.GetBodyByName(body)):
+                result[inspector.GetName(geometry).split("::")[-1]] = inspector.GetProximityProperties(geometry)
         return result
 
     pad = surfaces()["pad"]
@@ -75,19 +77,20 @@ def test_contact_factors_last_until_the_next_reset():
     assert surfaces()["pad"].GetProperty("hydroelastic", "hydroelastic_modulus") == pytest.approx(1e5)
 
 
-def test_smaller_stiffness_leads_to_a_smaller_force(plain):
-    soft, _, _ = descended(stiffness_factor=0.5)
-    assert max(soft.trace.force) < 0.7 * max(plain[0].trace.force)
+def test_smaller_stiffness_leads_to_a_smaller_force(undisturbed):
+    soft, _, _ = descend(stiffness_factor=0.5)
+    assert max(soft.trace.force) < 0.7 * max(undisturbed[0].trace.force)
 
 
-def test_control_period_is_that_of_the_disturbed_clock():
-    env, _, _ = descended(1, clock_factor=1.5)
+def test_clock_factor_scales_the_control_period():
+    env, _, _ = descend(1, clock_factor=1.5)
     assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
     assert env.task.control_period != CONTROL_PERIOD
 
 
-def test_disturbed_clock_is_a_multiple_of_the_plant_s_own_step():
-    fine = {"impedance_control": "cartesian", "bounded_force": False}  # steps of a quarter of a control period
+def test_disturbed_period_is_a_multiple_of_the_plant_step():
+    # The plant's time step is a quarter of the control period.
+    fine = {"impedance_control": "cartesian", "bounded_force": False}
     env = make_env("GridClamp", clock_factor=1.25, **fine)
     assert env.task.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
     for factor, options in ((1.3, fine), (1.5, {"time_step": CONTROL_PERIOD})):
@@ -95,21 +98,21 @@ def test_disturbed_clock_is_a_multiple_of_the_plant_s_own_step():
             make_env("GridClamp", clock_factor=factor, **options)
 
 
-def test_stiffness_factor_scales_the_builder_s_own_impedance():
-    built, own = [], Impedance(stiffness=(800.0,) * 3 + (20.0,) * 3, damping_ratio=0.7)
+def test_stiffness_factor_scales_the_station_impedance():
+    scaled, default = [], Impedance(stiffness=(800.0,) * 3 + (20.0,) * 3, damping_ratio=0.7)
 
-    def build(impedance=own):
-        built.append(impedance)
+    def build(impedance=default):
+        scaled.append(impedance)
         raise InterruptedError
 
     with pytest.raises(InterruptedError):
         disturbed(build, Disturbances(stiffness_factor=0.5), True, "bench")
-    assert built == [replace(own, stiffness=(400.0,) * 3 + (10.0,) * 3)]
+    assert scaled == [replace(default, stiffness=(400.0,) * 3 + (10.0,) * 3)]
 
 
-def test_lost_and_late_commands_delay_the_tool(plain):
-    late, _, _ = descended(1, late_commands=20)
-    assert late.trace.measured[-1, 2] > plain[0].trace.measured[24, 2] + 1.0 * MM
+def test_late_commands_delay_the_tool(undisturbed):
+    late, _, _ = descend(1, late_commands=20)  # 20 of the 25 control steps of the action
+    assert late.trace.measured[-1, 2] > undisturbed[0].trace.measured[24, 2] + 1.0 * MM
 
 
 def test_lost_commands_are_independent_of_the_noise():
@@ -118,19 +121,19 @@ def test_lost_commands_are_independent_of_the_noise():
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
     env.reset(seed=1)
     root = env.simulator.get_context()
-    lost, of_one_stream = [], []
+    losses, losses_of_noise_seed = [], []
     for _ in range(60):
         env.step(np.zeros(env.action_space.shape))
         count, is_lost = (commands.GetMyContextFromRoot(root).get_discrete_state(i).value()[0] for i in (0, 1))
         seed = wrench.GetMyContextFromRoot(root).get_numeric_parameter(2).value()[0]
         stream = np.random.default_rng([int(seed), int(count)])
-        lost.append(is_lost)
-        of_one_stream.append(stream.uniform() < 0.3)
-    assert 0.1 < np.mean(lost) < 0.5
-    assert np.mean(np.equal(lost, of_one_stream)) < 0.8  # 0.58 for independent ones
+        losses.append(is_lost)
+        losses_of_noise_seed.append(stream.uniform() < 0.3)
+    assert 0.1 < np.mean(losses) < 0.5
+    assert np.mean(np.equal(losses, losses_of_noise_seed)) < 0.8  # 0.3² + 0.7² = 0.58 if independent
 
 
-def test_payload_lowers_the_tool_of_an_arm():
+def test_payload_is_added_to_the_tool_mass_of_an_arm():
     env = make_env("GridClamp", station="arm", payload=0.3)
     env.reset(seed=0)
     arm = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
@@ -159,8 +162,4 @@ def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 
     with pytest.raises(InputError, match="real robot"):
-        make_skill("GridClamp", lambda seen: seen, station="hardware", robot_url="memq://", lost_commands=0.1)
-
-
-def test_every_disturbance_is_off_by_default():
-    assert not Disturbances.model_validate({}).is_active
+        make_skill("GridClamp", lambda o: o, station="hardware", robot_url="memq://", lost_commands=0.1)

@@ -1,4 +1,4 @@
-"""Physics of the grid clamp: pushing, tilting and pulling."""
+"""Contact physics of the grid clamp: pushing, tilting and pulling."""
 
 import numpy as np
 import pytest
@@ -12,25 +12,33 @@ from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 from guiderail.models.common.transforms import MM
 
 WORKCELL = GridClampWorkcell()
-SURFACE = WORKCELL.dimensions.peg_length  # height of the tips on the table, in T
-MAX_OFFSET = 1.0 * MM  # of a tip in its hole from the hole's center
+SURFACE = WORKCELL.dimensions.peg_length  # height of the peg tips on the table, in the target frame [m]
+MAX_OFFSET = 1.0 * MM  # largest distance of a peg tip in a hole from the hole's center [m]
 PUSH_60_N = Impedance(limits=(60.0, 60.0, 60.0, 3.0, 3.0, 3.0))
 
 
 def descend(times, z_mm, *, xy_mm=(0.0, 0.0), tilt_deg=0.0, grasp_mm=None, table_mm=None, station=GantryStation, **kw):
-    """Drive along z at a position and a tilt; return the driven station and the recording."""
+    """Drive along heights at a horizontal position and a tilt about x.
+
+    Args:
+        times: Times [s] of the heights `z_mm` [mm].
+        grasp_mm, table_mm: Horizontal offsets [mm] of the clamp in the gripper and of the table.
+
+    Returns:
+        Driven station and recording.
+    """
     poses = np.zeros((len(times), 6))
     poses[:, :2] = np.array(xy_mm) * MM
     poses[:, 2] = np.array(z_mm) * MM
     poses[:, 5] = np.deg2rad(tilt_deg)
 
-    def offset(plant, context):
+    def set_offsets(plant, context):
         if grasp_mm is not None:
             WORKCELL.set_grasp_offset(plant, context, RigidTransform([*(np.array(grasp_mm) * MM), 0.0]))
         if table_mm is not None:
             WORKCELL.set_fixture_offset(plant, context, RigidTransform([*(np.array(table_mm) * MM), 0.0]))
 
-    return drive_along(station(WORKCELL, **kw), times, poses, offset)
+    return drive_along(station(WORKCELL, **kw), times, poses, set_offsets)
 
 
 @pytest.fixture(scope="module")
@@ -64,8 +72,8 @@ def test_clamp_is_seated_only_near_the_target(position_mm, is_seated):
     assert WORKCELL.is_seated(clamp) is is_seated
 
 
-def test_snap_resists_then_yields(inserted):
-    """The force grows up to the lip, drops behind it, and grows again at the shoulder."""
+def test_snap_force_peaks_at_the_lip(inserted):
+    """The force grows up to the lip, drops past the lip, and grows again at the shoulder."""
     _, recording = inserted
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     at_lip, past_lip = (z > 0.9) & (z < 1.3), (z > 0.1) & (z < 0.5)
@@ -74,17 +82,17 @@ def test_snap_resists_then_yields(inserted):
     assert force[-1] > force[past_lip].max()
 
 
-def test_snap_resists_a_light_pull_and_yields_to_a_strong_one():
+def test_snap_holds_at_a_light_pull_but_not_at_a_strong_pull():
     _, recording = descend([0, 0.9, 1.4, 2.0, 3.5, 4.2], [16, -6, -6, 1, 1, 16])
     z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
-    assert z[170] < 0.6 * MM  # still in, pulled by 1 mm of spring, 1.5 N
+    assert z[170] < 0.6 * MM  # still inserted at a pull of 1.5 N: 1 mm of the station's spring
     assert z[-1] > 10.0 * MM
     assert -12.0 < force.min() < -2.0
 
 
 @pytest.mark.parametrize(("xy_mm", "tilt_deg"), [((2.5, 0.0), 0.0), ((1.5, 1.5), 0.0), ((0.0, 0.0), 6.0), ((0, 3), 4)])
 def test_pegs_do_not_tunnel_through_the_table_at_60_n(xy_mm, tilt_deg):
-    """Next to its hole or tilted, no tip is below the table's surface except in its own hole."""
+    """With the clamp shifted or tilted, no peg tip outside its own hole is below the table's surface."""
     driven, recording = descend(
         [0, 0.5, 1.5, 2.5], [22, 12, -40, -40], xy_mm=xy_mm, tilt_deg=tilt_deg, impedance=PUSH_60_N
     )
@@ -115,31 +123,30 @@ def test_snap_is_insensitive_to_the_time_step(inserted):
     assert fine_peak == pytest.approx(peak, rel=0.15)
 
 
-@pytest.mark.parametrize("moved", ["grasp_mm", "table_mm"])
-def test_clamp_inserts_at_offsets_set_in_the_context(moved):
-    """It is blocked at the nominal pose, and inserts if the command compensates the offset."""
+@pytest.mark.parametrize("part", ["grasp_mm", "table_mm"])
+def test_clamp_inserts_when_the_command_includes_the_offset(part):
+    """The clamp is blocked at the nominal pose, and inserts if the command compensates the offset."""
     offset = np.array([1.8, -1.2])
-    _, blocked = descend([0, 0.88, 1.2], [16, -6, -6], **{moved: offset})
+    _, blocked = descend([0, 0.88, 1.2], [16, -6, -6], **{part: offset})
     assert blocked["pose"][-1, 2] > SURFACE - 0.2 * MM
-    _, result = descend(
-        [0, 0.88, 1.2], [16, -6, -6], **{moved: offset}, xy_mm=-offset if moved == "grasp_mm" else offset
-    )
+    _, result = descend([0, 0.88, 1.2], [16, -6, -6], **{part: offset}, xy_mm=-offset if part == "grasp_mm" else offset)
     assert abs(result["pose"][-1, 2]) < 0.1 * MM
     assert result["contact_force"].max() <= 10.0
 
 
 def test_sticking_contact_does_not_creep():
-    """Next to its holes with 27 N down and 2 N sideways, below the 5.4 N at which it slips, for 3 s."""
-    poses = np.array([[16.0, 2.5], [-6.0, 2.5], [-6.0, 2.5 + 2.0 / 1.5], [-6.0, 2.5 + 2.0 / 1.5]])  # 1.5 N/mm
+    """Next to its holes, the clamp presses with 27 N and is pushed sideways by 2 N for 3 s; it would slip at 5.4 N."""
+    sideways = 2.5 + 2.0 / 1.5  # 2 N at 1.5 N/mm [mm]
+    z_x = np.array([[16.0, 2.5], [-6.0, 2.5], [-6.0, sideways], [-6.0, sideways]])
     _, recording = drive_along(
         GantryStation(WORKCELL),
         [0.0, 0.9, 1.0, 4.5],
-        MM * np.column_stack([poses[:, 1], [1.0] * 4, poses[:, 0], np.zeros((4, 3))]),
+        MM * np.column_stack([z_x[:, 1], [1.0] * 4, z_x[:, 0], np.zeros((4, 3))]),
     )
     assert recording["wrench"][-1, 2] == pytest.approx(27.0, abs=0.2)
     assert recording["wrench"][-1, 0] == pytest.approx(-2.0, abs=0.1)
     x = recording["pose"][:, 0]
-    assert abs(x[-1] - x[-150]) < 0.03 * MM
+    assert abs(x[-1] - x[-150]) < 0.03 * MM  # within 3 s
 
 
 def test_arm_inserts_the_clamp():

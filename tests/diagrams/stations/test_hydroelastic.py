@@ -1,4 +1,4 @@
-"""Insertions have hydroelastic contact only, without a fallback to point contact."""
+"""Insertions have hydroelastic contact only, never Drake's point contact."""
 
 import numpy as np
 import pytest
@@ -6,9 +6,10 @@ import pytest
 from guiderail import make_env
 
 DOWN = np.array([0.0, 0.0, -1.0])
+# Task, options, action, and options of the reset.
 CASES = {
     "connector": ("BncConnector", {"guidance": "kmp", "fixture_offset": "none"}, np.zeros(2), {}),
-    "connector under a controller": (
+    "connector with a Cartesian controller": (
         "BncConnector",
         {"guidance": "kmp", "fixture_offset": "none", "impedance_control": "cartesian"},
         np.zeros(2),
@@ -22,15 +23,15 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_insertion_has_no_point_contact(case):
-    task, options, action, drawn = CASES[case]
+    task, options, action, reset_options = CASES[case]
     env = make_env(task, **options)
-    env.reset(seed=0, options=drawn)
+    env.reset(seed=0, options=reset_options)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
-    surfaces, points, ended = 0, 0, False
-    while not ended:
+    surfaces, points, has_ended = 0, 0, False
+    while not has_ended:
         *_, terminated, truncated, info = env.step(action)
-        ended = terminated or truncated
+        has_ended = terminated or truncated
         results = plant.get_contact_results_output_port().Eval(context)
         surfaces += results.num_hydroelastic_contacts()
         points += results.num_point_pair_contacts()

@@ -1,4 +1,4 @@
-"""Physics of connector and clamp in MuJoCo, with the criteria of those in Drake."""
+"""Contact physics of connector and clamp in MuJoCo, with the criteria of the tests in Drake."""
 
 import sys
 from dataclasses import replace
@@ -21,9 +21,10 @@ import mujoco
 from guiderail.diagrams.stations.mujoco import MujocoContact, MujocoStation, constraint_torques, mujoco_parts
 
 CONNECTOR, CLAMP = BncWorkcell(), GridClampWorkcell()
-STIFFNESS = Impedance().stiffness[2]
+STIFFNESS = Impedance().stiffness[2]  # [N/m]
+# Height of the plug's mouth on top of the lugs, relative to the locked pose [m].
 LUG_TOP = CONNECTOR.dimensions.lug_height + CONNECTOR.dimensions.lug_radius - CONNECTOR.dimensions.locked_height
-LOCKED = round(insert_and_lock()[0][-1] / 0.02)
+LOCKED = round(insert_and_lock()[0][-1] / 0.02)  # control steps until the plug is locked
 
 
 def drive(workcell, times, motion, prepare=None):
@@ -31,21 +32,27 @@ def drive(workcell, times, motion, prepare=None):
 
 
 def descent(z_mm, x_mm=0.0, y_mm=0.0):
+    """Return poses (N, 6) at heights (N,) and horizontal positions [mm]."""
     motion = np.zeros((len(z_mm), 6))
     motion[:, 0], motion[:, 1], motion[:, 2] = np.array(x_mm) * MM, np.array(y_mm) * MM, np.array(z_mm) * MM
     return motion
 
 
 def workpiece_in_fixture(driven, workpiece, fixture):
+    """Return the pose of a workpiece in its fixture; both are names of bodies."""
     station = driven.station
     bodies = station.GetOutputPort("body_poses").Eval(station.GetMyContextFromRoot(driven.context))
-    of = {name: bodies[int(station.plant.GetBodyByName(name).index())] for name in (workpiece, fixture)}
-    return of[fixture].InvertAndCompose(of[workpiece])
+    X_WW, X_WF = (bodies[int(station.plant.GetBodyByName(name).index())] for name in (workpiece, fixture))
+    return X_WF.InvertAndCompose(X_WW)
 
 
 @pytest.fixture(scope="module")
 def locked_and_pulled():
-    """Lock the plug on a moved jack, then command a pull beyond the effort limit."""
+    """Lock the plug on a moved jack, then command a pull of 45 N, above the limit of 40 N.
+
+    Returns:
+        Driven station, recording, and offset of the jack [m].
+    """
     offset = np.array([3.0 * MM, -2.0 * MM, 1.0 * MM])
     times, motion = insert_and_lock()
     pull = np.array([0.0, 0.0, 45.0 / STIFFNESS, 0.0, 0.0, 0.0])
@@ -70,11 +77,11 @@ def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
 def test_wrench_equals_the_force_of_the_impedance(locked_and_pulled):
     turning = slice(250, 315)
     _, recording, _ = locked_and_pulled
-    felt = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
-    # Sliding over facets causes vibrations, so the averages over 0.1 s are compared.
-    over = np.ones(5) / 5
-    pushed = np.convolve(recording["contact_force"][turning, 0], over, "valid")
-    np.testing.assert_allclose(np.convolve(felt, over, "valid"), pushed, atol=0.6)
+    measured = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
+    # Sliding over facets causes vibrations, so averages over five control steps (0.1 s) are compared.
+    window = np.ones(5) / 5
+    expected = np.convolve(recording["contact_force"][turning, 0], window, "valid")
+    np.testing.assert_allclose(np.convolve(measured, window, "valid"), expected, atol=0.6)
 
 
 def test_locked_plug_resists_a_pull(locked_and_pulled):
@@ -97,15 +104,15 @@ def test_rotation_is_blocked_before_insertion():
 def test_static_displacement_equals_compliance_times_wrench(axis):
     """Static displacement is within 2 % of K⁻¹ f for the measured wrench f."""
     stiffness = np.array(Impedance().stiffness)
-    beyond = np.array([3.0 * MM, 3.0 * MM, -3.0 * MM, 0.05, 0.05, 0.05])
+    offset = np.array([3.0 * MM, 3.0 * MM, -3.0 * MM, 0.05, 0.05, 0.05])
     motion = np.tile([0.0, 0.0, 2.0 * MM, np.pi / 2, 0.0, 0.0], (4, 1))
     motion[1:, 2] = -2.0 * MM  # seated, so that the contact resists torques about all axes
-    motion[2:, axis] += beyond[axis]
+    motion[2:, axis] += offset[axis]
     _, recording = drive(CONNECTOR, [0.0, 0.5, 0.7, 1.0], motion)
     f, t = np.split(recording["wrench"][-1], 2)
-    load = np.array([*f, t[2], -t[0], t[1]])  # after a quarter turn the second hinge is −x and the third y
+    load = np.array([*f, t[2], -t[0], t[1]])  # a quarter turn about z rotates the other axes to −x and y
     deflection = recording["pose"][-1] - recording["desired_pose"][-1]
-    assert abs(load[axis]) > 0.3 * abs(stiffness * beyond)[axis]
+    assert abs(load[axis]) > 0.3 * abs(stiffness * offset)[axis]
     assert deflection[axis] == pytest.approx(load[axis] / stiffness[axis], rel=0.02)
 
 
@@ -114,19 +121,19 @@ def inserted():
     return drive(CLAMP, [0.0, 1.6, 1.9], descent([4.0, -6.0, -6.0]))
 
 
-def test_snap_resists_then_yields(inserted):
+def test_snap_force_peaks_at_the_lip(inserted):
     driven, recording = inserted
-    tip = workpiece_in_fixture(driven, "clamp", "table")
-    assert np.abs((CLAMP.X_FT.inverse() @ tip).translation()).max() < 0.1 * MM
+    X_FG = workpiece_in_fixture(driven, "clamp", "table")
+    assert np.abs((CLAMP.X_FT.inverse() @ X_FG).translation()).max() < 0.1 * MM
     assert recording["contact_force"].max() <= 10.0
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
     assert 2.0 < resistance < 8.0
-    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # it jumps in behind the crest
-    assert recording["wrench"][:, 2].max() > resistance  # later, at the shoulder
+    assert z[np.flatnonzero(z < 0.85)[1]] < 0.1  # past the lip, the clamp snaps in within a control step
+    assert recording["wrench"][:, 2].max() > resistance  # at the shoulder
 
 
-def test_snap_resists_a_light_pull_and_yields_to_a_strong_one():
+def test_snap_holds_at_a_light_pull_but_not_at_a_strong_pull():
     _, recording = drive(CLAMP, [0.0, 0.4, 0.6, 0.9, 1.2, 1.5], descent([2.0, -4.0, 1.0, 1.0, 8.0, 16.0]))
     z, force = recording["pose"][:, 2], recording["wrench"][:, 2]
     assert z[44] < 0.6 * MM
@@ -134,8 +141,8 @@ def test_snap_resists_a_light_pull_and_yields_to_a_strong_one():
     assert -12.0 < force.min() < -2.0
 
 
-def test_clamp_next_to_its_holes_does_not_creep():
-    """With 27 N down and 2 N sideways, below the 5.4 N at which it slips."""
+def test_sticking_contact_does_not_creep():
+    """Next to its holes, the clamp presses with 27 N and is pushed sideways by 2 N; it would slip at 5.4 N."""
     sideways = 2.0 + 2.0 / STIFFNESS / MM
     motion = descent([13.0, -6.0, -6.0, -6.0], [2.0, 2.0, sideways, sideways], 1.5)
     _, recording = drive(CLAMP, [0.0, 0.5, 0.6, 1.6], motion)
@@ -144,33 +151,31 @@ def test_clamp_next_to_its_holes_does_not_creep():
     assert abs(recording["pose"][-1, 0] - recording["pose"][-40, 0]) < 0.01 * MM
 
 
-def episode(env, seed):
+def run_episode(env, seed):
+    """Run up to four random actions; return observations and rewards as one vector."""
     observation, _ = env.reset(seed=seed)
-    seen, rng = [observation], np.random.default_rng(seed)
+    outputs, rng = [observation], np.random.default_rng(seed)
     for _ in range(4):
         observation, reward, terminated, truncated, _ = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
-        seen.append(np.append(observation, reward))
+        outputs.append(np.append(observation, reward))
         if terminated or truncated:
             break
-    return np.concatenate(seen)
+    return np.concatenate(outputs)
 
 
-@pytest.mark.parametrize(
-    ("task", "options"),
-    [("BncConnector", {"fixture_offset": "per_episode"}), ("GridClamp", {"fixture_offset": "per_episode"})],
-)
-def test_episode_is_bit_identical_for_the_same_seed(task, options):
-    """With a disturbed episode in between, which leaves no state."""
-    env = make_env(task, station="mujoco", action_repeat=25, **options)
-    first = episode(env, 3)
-    episode(env, 4)
+@pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
+def test_episode_is_bit_identical_for_the_same_seed(task):
+    """An episode and a displacement of the tool in between leave no state."""
+    env = make_env(task, station="mujoco", action_repeat=25, fixture_offset="per_episode")
+    first = run_episode(env, 3)
+    run_episode(env, 4)
     env.push(np.array([1.0 * MM, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_array_equal(episode(env, 3), first)
-    assert not np.array_equal(episode(env, 4), first)
+    np.testing.assert_array_equal(run_episode(env, 3), first)
+    assert not np.array_equal(run_episode(env, 4), first)
 
 
 @pytest.mark.parametrize(
-    ("task", "options", "modulus", "most"),
+    ("task", "options", "modulus_factor", "max_steps"),
     [
         ("BncConnector", {"fixture_offset": "none", "guidance": "kmp"}, 10.0, 400),
         ("GridClamp", {}, 10.0, 100),
@@ -178,33 +183,33 @@ def test_episode_is_bit_identical_for_the_same_seed(task, options):
     ],
     ids=lambda value: None if isinstance(value, dict) else str(value),
 )
-def test_stiff_contact_is_stable(task, options, modulus, most):
-    """Gasket and bead are on stiffer springs, which would be unstable at the nominal time step."""
-    env = make_env(task, station="mujoco", modulus_factor=(modulus, modulus), **options)
+def test_stiff_contact_is_stable(task, options, modulus_factor, max_steps):
+    """With stiffer springs under gasket and bead, contact would be unstable at the nominal time step."""
+    env = make_env(task, station="mujoco", modulus_factor=(modulus_factor, modulus_factor), **options)
     env.reset(seed=2)
-    rng, over = np.random.default_rng(2), False
-    while not over and len(env.trace) < most:
+    rng, has_ended = np.random.default_rng(2), False
+    while not has_ended and len(env.trace) < max_steps:
         _, _, terminated, truncated, info = env.step(rng.uniform(-1.0, 1.0, env.action_space.shape))
-        over = terminated or truncated
-    moved = np.abs(np.diff(env.trace.measured, axis=0))
+        has_ended = terminated or truncated
+    displacements = np.abs(np.diff(env.trace.measured, axis=0))
     assert info["termination"] != "collision"
     assert "simulation_failure" not in info
-    assert np.rad2deg(moved[:, 3:]).max() < 3.0
-    assert moved[:, :3].max() < 3.0 * MM
+    assert np.rad2deg(displacements[:, 3:]).max() < 3.0
+    assert displacements[:, :3].max() < 3.0 * MM
     assert max(env.trace.force) < 20.0
 
 
-def test_divergence_ends_only_the_present_episode(tmp_path, monkeypatch):
-    """MuJoCo itself would continue from zero, where the connector is locked, and write a file."""
+def test_divergence_ends_the_episode_and_leaves_no_state(tmp_path, monkeypatch):
+    """MuJoCo by itself would reset to zero, where the connector is locked, and write a log file."""
     monkeypatch.chdir(tmp_path)
 
-    def generate_assets():
+    def build_env():
         return make_env("BncConnector", station="mujoco", fixture_offset="per_episode", action_repeat=25)
 
-    env = generate_assets()
-    episode(env, 4)
+    env = build_env()
+    run_episode(env, 4)
     env.reset(seed=3)
-    valid, *_ = env.step(np.zeros(2))
+    last_finite, *_ = env.step(np.zeros(2))
     for displacement in (1e11, 1e300):
         env.reset(seed=3)
         env.step(np.zeros(2))
@@ -213,14 +218,14 @@ def test_divergence_ends_only_the_present_episode(tmp_path, monkeypatch):
         assert (terminated, truncated) == (False, True)
         assert "the simulation failed in MuJoCo" in info["simulation_failure"]
         assert not info["is_success"]
-        np.testing.assert_array_equal(observation, valid)
+        np.testing.assert_array_equal(observation, last_finite)
     assert not list(tmp_path.iterdir())
-    np.testing.assert_array_equal(episode(env, 5), episode(generate_assets(), 5))
+    np.testing.assert_array_equal(run_episode(env, 5), run_episode(build_env(), 5))
 
 
 @pytest.mark.parametrize("warning", ["CONTACTFULL", "CNSTRFULL"])
-def test_episode_ends_when_the_engine_runs_out_of_contacts(warning, monkeypatch):
-    """MuJoCo itself would drop the contacts that are too many, and a plug would penetrate a socket."""
+def test_episode_ends_when_the_engine_lacks_contact_memory(warning, monkeypatch):
+    """MuJoCo by itself would drop the excess contacts, and the plug would penetrate the socket."""
     step = mujoco.mj_step
 
     def step_and_warn(model, data):
@@ -235,7 +240,7 @@ def test_episode_ends_when_the_engine_runs_out_of_contacts(warning, monkeypatch)
     assert "the simulation failed in MuJoCo" in info["simulation_failure"]
 
 
-def test_engine_has_the_offsets_of_the_task():
+def test_engine_bodies_have_the_offsets_of_the_reset():
     env = make_env("BncConnector", station="mujoco", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=2)
     station = env.task.diagram.GetSubsystemByName("station")
@@ -257,24 +262,25 @@ SLIDER = """
 """
 
 
-@pytest.mark.parametrize(("applied", "expected"), [(1.0, 0.0), (7.0, -7.0)])
-def test_constraint_torques_leave_joint_friction_out(applied, expected):
+@pytest.mark.parametrize(("applied", "expected"), [(1.0, 0.0), (7.0, -7.0)])  # forces [N]; joint friction of 2 N
+def test_constraint_torques_exclude_joint_friction(applied, expected):
     model = mujoco.MjModel.from_xml_string(SLIDER)
     data = mujoco.MjData(model)
-    data.qpos[:], data.qfrc_applied[:] = 0.1 if expected else 0.0, applied  # in contact, or held by the friction
+    data.qpos[:] = 0.1 if expected else 0.0  # in contact with the box, or at rest by friction
+    data.qfrc_applied[:] = applied
     for _ in range(2000):
         mujoco.mj_step(model, data)
     assert data.qfrc_constraint[0] == pytest.approx(-applied, abs=0.05)
     assert constraint_torques(model, data)[0] == pytest.approx(expected, abs=0.05)
 
 
-class Unknown:
-    """Workcell without contact surfaces."""
+class WorkcellWithoutSurfaces:
+    """Workcell that does not list its contact surfaces."""
 
 
 def test_station_raises_when_surfaces_are_missing():
-    with pytest.raises(InputError, match="which Unknown does not provide"):
-        MujocoStation(Unknown())
+    with pytest.raises(InputError, match="which WorkcellWithoutSurfaces does not provide"):
+        MujocoStation(WorkcellWithoutSurfaces())
 
 
 def test_station_raises_when_mujoco_is_missing(monkeypatch):
@@ -283,7 +289,7 @@ def test_station_raises_when_mujoco_is_missing(monkeypatch):
         MujocoStation(CONNECTOR)
 
 
-def test_part_surfaces_are_refused_when_a_mask_has_too_few_bits():
+def test_parts_with_more_pairs_than_mask_bits_are_refused():
     surface = CONNECTOR.fixture_surfaces()[0]
     fixture = [replace(surface, name=f"surface_{i}", pair=f"pair_{i}") for i in range(31)]
     mujoco_parts(fixture[:30], [], MujocoContact())
@@ -291,6 +297,6 @@ def test_part_surfaces_are_refused_when_a_mask_has_too_few_bits():
         mujoco_parts(fixture, [], MujocoContact())
 
 
-def test_disturbed_clock_is_a_multiple_of_the_station_s_step():
+def test_disturbed_period_is_a_multiple_of_the_engine_step():
     with pytest.raises(InputError, match=r"whole multiple of the plant's time step of 0\.02 s"):
         make_env("GridClamp", station="mujoco", clock_factor=1.5, time_step=0.02)

@@ -1,4 +1,4 @@
-"""Named settings of the sensors: what they add, what replaces them, and that the tare happens in free motion."""
+"""Named settings of the sensors: their errors, their replacement by single options, and the tare in free motion."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ TARE_STEPS = TARE_SKIPPED + TARE_AVERAGED
 
 
 def free_motion(env, steps=45, seed=3):
-    """Return measured and exact wrenches (steps, 6) of a motion without contact, and the reset's info."""
+    """Return measured and exact wrenches (steps, 6) [N, Nm] without contact, and the reset's info."""
     _, info = env.reset(seed=seed)
     station = env.task.diagram.GetSubsystemByName("station")
     exact = []
@@ -32,17 +32,17 @@ def free_motion(env, steps=45, seed=3):
 def test_setting_is_tared_and_seeded_on_every_station(station, sensing):
     env = make_env("BncConnector", station=station, sensing=sensing, **HARD)
     measured, exact, info = free_motion(env)
-    second, _, drawn = free_motion(env)
-    np.testing.assert_array_equal(second, measured)
-    other, _, changed = free_motion(env, seed=4)
-    assert not np.array_equal(other, measured)
+    repeated, _, repeated_info = free_motion(env)
+    np.testing.assert_array_equal(repeated, measured)
+    other_seed, _, other_info = free_motion(env, seed=4)
+    assert not np.array_equal(other_seed, measured)
     delay = info["wrench_delay"]
     assert SENSING[sensing].wrench_delay[0] <= delay <= SENSING[sensing].wrench_delay[1]
-    assert np.array_equal(drawn["calibration_error"], info["calibration_error"])
-    assert not np.array_equal(changed["calibration_error"], info["calibration_error"])
+    assert np.array_equal(repeated_info["calibration_error"], info["calibration_error"])
+    assert not np.array_equal(other_info["calibration_error"], info["calibration_error"])
     assert np.abs(info["calibration_error"][:3]).max() <= 0.15 * MM
     np.testing.assert_array_equal(measured[: TARE_STEPS + delay - 1], 0.0)
-    # Newtons of bias before the tare, and tenths of a newton after it.
+    # The bias is several newtons before the tare, and tenths of a newton after the tare.
     errors = (measured - exact)[TARE_STEPS + delay :]
     assert 1e-4 < np.abs(errors[:, :3]).max() < 0.6
     assert 1e-5 < np.abs(errors[:, 3:]).max() < 0.15
@@ -53,13 +53,13 @@ def test_arm_estimates_the_wrench_from_joint_torques():
     measured, exact, info = free_motion(env)
     assert info["torque_offset"].shape == (7,)
     bias = np.abs((measured - exact)[10:].mean(axis=0))
-    assert 0.3 < bias[:3].max() < 10.0  # as a lab measures without a tare
+    assert 0.3 < bias[:3].max() < 10.0  # newtons, as published for arms with joint torque sensors
     wrist = make_env("BncConnector", station="arm", sensing="wrist", **HARD)
     assert "torque_offset" not in free_motion(wrist, steps=2)[2]
 
 
 def test_payload_is_measured_and_tared():
-    """Half a kilogram that the model does not have: five newtons before the tare, none after it."""
+    """A payload of 0.5 kg that the model lacks weighs 4.9 N before the tare, and nothing after the tare."""
     options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0), "wrench_scale": (1.0, 1.0)}
     untared, _, _ = free_motion(make_env("BncConnector", payload=0.5, tare=False, **options))
     assert untared[12:28, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
@@ -67,21 +67,21 @@ def test_payload_is_measured_and_tared():
     assert abs(tared[12:28, 2].mean()) < 0.3
 
 
-def test_calibration_error_displaces_tool_and_measurement():
+def test_calibration_error_displaces_tool_from_measurement():
     env = make_env("BncConnector", sensing="exact", calibration_error=(1.0 * MM, 0.0), **HARD)
     _, info = env.reset(seed=1)
     for _ in range(30):
         env.step(np.zeros(2))
     station = env.task.diagram.GetSubsystemByName("station")
     inner = station.GetSubsystemByName("station")
-    true = inner.get_pose_output_port().Eval(inner.GetMyContextFromRoot(env.simulator.get_context()))
-    np.testing.assert_allclose(env.trace.measured[-1] - true, info["calibration_error"], atol=1e-9)
-    # The robot tracks what it measures, so that the tool itself is off.
+    true_pose = inner.get_pose_output_port().Eval(inner.GetMyContextFromRoot(env.simulator.get_context()))
+    np.testing.assert_allclose(env.trace.measured[-1] - true_pose, info["calibration_error"], atol=1e-9)
+    # The robot tracks the measured pose, so the true pose of the tool has the error.
     assert np.abs(env.trace.measured[-1] - env.trace.commanded[-1])[:2].max() < 0.1 * MM
     assert np.abs(info["calibration_error"][:2]).max() > 0.15 * MM
 
 
-def test_pose_has_the_resolution_of_encoders():
+def test_measured_pose_has_the_resolution_of_encoders():
     env = make_env("BncConnector", sensing="robot", **HARD)
     free_motion(env, steps=5)
     steps = env.trace.measured / np.repeat(SENSING["robot"].pose_resolution, 3)
@@ -91,7 +91,7 @@ def test_pose_has_the_resolution_of_encoders():
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp"])
 @pytest.mark.parametrize("difficulty", ["standard", "hard"])
 def test_tare_ends_before_the_first_contact(task, difficulty):
-    """Whatever action is taken: the tare would subtract a contact."""
+    """For the smallest, zero and largest action; a tare during contact would subtract the contact force."""
     env = make_env(task, difficulty=difficulty, action_repeat=1)
     for seed, action in enumerate((-1.0, 0.0, 1.0)):
         env.reset(seed=seed)
@@ -100,7 +100,7 @@ def test_tare_ends_before_the_first_contact(task, difficulty):
         assert np.abs(env.trace.signals["wrench"]).max() < 1e-6
 
 
-def test_given_value_replaces_that_of_the_setting():
+def test_single_option_replaces_a_value_of_the_setting():
     def errors(**options):
         return Disturbances(**options).errors
 
@@ -114,27 +114,27 @@ def test_given_value_replaces_that_of_the_setting():
     assert errors(wrench_scale=(0.5, 2.0)).wrench_scale == (0.5, 2.0)
 
 
-def test_setting_can_be_changed_in_a_stored_configuration():
-    """A run's folder stores all options; another setting must not inherit the errors of the stored one."""
+def test_setting_of_a_stored_configuration_can_be_changed():
+    """A run's folder stores all options; another setting must not inherit the errors of the stored setting."""
     stored = EnvConfig.resolve("BncConnector", {"sensing": "robot"}).options
     changed = EnvConfig.resolve("BncConnector", {**stored, "sensing": "exact"})
     assert not changed.parts["disturbances"].is_active
     assert EnvConfig.resolve("BncConnector", stored).options == stored
 
 
-@pytest.mark.parametrize(("sensing", "tares"), [("robot", True), ("exact", False)])
-def test_robot_itself_adds_its_errors_and_is_tared(sensing, tares):
+@pytest.mark.parametrize(("sensing", "is_tared"), [("robot", True), ("exact", False)])
+def test_hardware_station_is_tared_and_adds_no_errors(sensing, is_tared):
     options = {"station": "hardware", "robot_url": "memq://", "sensing": sensing}
     task = EnvConfig.resolve("BncConnector", options).make_task()
     station = make_station(task)
-    for one in (station, station.clone(task.workcell())):
-        assert any(system.get_name() == "tare" for system in one.GetSystems()) == tares
+    for copy in (station, station.clone(task.workcell())):
+        assert any(system.get_name() == "tare" for system in copy.GetSystems()) == is_tared
     noisy = EnvConfig.resolve("BncConnector", {**options, "wrench_noise": (0.1, 0.01)}).make_task()
     with pytest.raises(InputError, match="disturbances of its own"):
         make_station(noisy)
 
 
-def test_exact_setting_adds_nothing():
+def test_exact_setting_adds_no_disturbances():
     env = make_env("BncConnector", sensing="exact", **HARD)
     assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
 

@@ -1,3 +1,5 @@
+"""Arguments that every simulated station refuses."""
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 
-PLACES = [
+STATIONS = [
     ("NarrowPassage", "plane"),
     ("Pouring", "pouring"),
     ("BncConnector", "gantry"),
@@ -18,13 +20,13 @@ PLACES = [
 ]
 
 
-@pytest.mark.parametrize(("task", "place"), PLACES)
-def test_set_pose_raises_when_the_pose_is_not_finite(task, place):
-    station = make_station(EnvConfig.resolve(task, {"station": place}).make_task())
+@pytest.mark.parametrize(("task", "name"), STATIONS)
+def test_set_pose_raises_when_the_pose_is_not_finite(task, name):
+    station = make_station(EnvConfig.resolve(task, {"station": name}).make_task())
     context = station.CreateDefaultContext()
-    whole = np.zeros(station.pose_size)
-    broken = [np.r_[np.nan, whole[1:]], np.r_[whole[1:], -np.inf], whole[1:], [*whole, 0.0], ["a"] * len(whole), None]
-    for pose in broken:
+    zero = np.zeros(station.pose_size)
+    invalid = [np.r_[np.nan, zero[1:]], np.r_[zero[1:], -np.inf], zero[1:], [*zero, 0.0], ["a"] * len(zero), None]
+    for pose in invalid:
         with pytest.raises(InputError, match=f"pose must be {station.pose_size} finite numbers, not"):
             station.set_pose(context, pose)
 
