@@ -11,7 +11,7 @@ def test_open_bus_has_the_given_url(url):
     assert open_bus(url).get_lcm_url() == url
 
 
-def test_open_bus_uses_lcms_default_without_a_url(monkeypatch):
+def test_open_bus_has_the_default_url_when_none_is_given(monkeypatch):
     monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
     assert open_bus("").get_lcm_url().startswith("udpm://")
 

@@ -1,4 +1,4 @@
-"""A driver without messages: a robot in the same process that implements `read` and `write` only."""
+"""Drivers: a user's driver with only `read` and `write`, registration, and refused drivers and robots."""
 
 from dataclasses import replace
 
@@ -28,7 +28,7 @@ def registered():
     DRIVERS._entries.pop("direct_arm")
 
 
-def test_station_moves_a_robot_by_read_and_write():
+def test_station_moves_a_robot_with_only_read_and_write():
     driver = DirectDriver()
     station = HardwareStation(BncWorkcell(), driver)
     simulator = Simulator(station)
@@ -53,9 +53,9 @@ def test_wall_clock_steps_once_per_new_status():
     (station, simulator), clock = start_station(driver), WallClock(driver)
     clock.begin()
     driver.elapse()
-    before = driver.num_statuses
+    num_statuses = driver.num_statuses
     clock.advance(simulator, station, 3)
-    assert driver.num_statuses == before + 1
+    assert driver.num_statuses == num_statuses + 1
     assert simulator.get_context().get_time() == 3 * driver.period
 
 
@@ -80,7 +80,7 @@ def test_driver_is_found_by_name_when_registered(registered):
         ("hold_off", np.nan, "needs a time that is not negative .* as its hold_off"),
     ],
 )
-def test_driver_without_an_attribute_is_refused(attribute, value, message):
+def test_driver_is_refused_when_an_attribute_is_invalid(attribute, value, message):
     class Incomplete(DirectDriver):
         pass
 
@@ -89,7 +89,7 @@ def test_driver_without_an_attribute_is_refused(attribute, value, message):
         HardwareStation(BncWorkcell(), Incomplete())
 
 
-def test_driver_without_the_base_constructor_is_refused():
+def test_driver_is_refused_when_super_init_is_not_called():
     class Incomplete(DirectDriver):
         def __init__(self, url=""):
             pass
@@ -98,30 +98,30 @@ def test_driver_without_the_base_constructor_is_refused():
         HardwareStation(BncWorkcell(), Incomplete())
 
 
-def fails(url):
+def raise_no_port(url):
     raise OSError("no such port")
 
 
 @pytest.mark.parametrize(
     ("factory", "message"),
     [
-        (fails, "the driver refused can't be opened: OSError: no such port"),
+        (raise_no_port, "the driver refused can't be opened: OSError: no such port"),
         (lambda: None, "the driver refused can't be opened: TypeError"),
         (lambda url: url, "the driver refused is no Driver"),
     ],
 )
-def test_driver_that_cannot_be_opened_is_refused(monkeypatch, factory, message):
+def test_driver_is_refused_when_opening_fails(monkeypatch, factory, message):
     monkeypatch.setitem(DRIVERS._entries, "refused", factory)
     with pytest.raises(InputError, match=message):
         HardwareStation(BncWorkcell(), "refused", robot_url="")
 
 
-def test_driver_that_is_not_callable_is_not_registered():
+def test_register_driver_raises_when_the_driver_is_a_number():
     with pytest.raises(InputError, match="'number' is registered with a subclass of Driver, not with 3"):
         register_driver("number", 3)
 
 
-IIWA = replace(find_robot("iiwa14"), name="mine", flange_frame="iiwa_link_7")  # a user's model of the same arm
+USER_MODEL = replace(find_robot("iiwa14"), name="mine", flange_frame="iiwa_link_7")  # a user's model of the same arm
 
 
 @pytest.mark.parametrize(
@@ -133,10 +133,10 @@ IIWA = replace(find_robot("iiwa14"), name="mine", flange_frame="iiwa_link_7")  #
         (FciDriver, "iiwa14", "robot='iiwa14' has other joints, .* than 'panda', the arm of FciDriver"),
         (FciDriver, replace(find_robot("panda"), flange_frame="panda_link7"), "another flange"),
         (FciDriver, replace(find_robot("panda"), name="mine"), None),
-        (IiwaDriver, IIWA, None),
+        (IiwaDriver, USER_MODEL, None),
     ],
 )
-def test_robot_that_does_not_fit_the_driver_is_refused(driver, robot, message):
+def test_robot_is_refused_when_the_driver_moves_another_arm(driver, robot, message):
     connection = {"client": object()} if issubclass(driver, PoseDriver) else {}
     driver = driver("192.0.2.1" if connection else "memq://", **connection)
     if message is None:
@@ -146,7 +146,7 @@ def test_robot_that_does_not_fit_the_driver_is_refused(driver, robot, message):
             HardwareStation(BncWorkcell(), driver, robot=robot)
 
 
-def test_safety_monitor_raises_when_commands_are_not_shown():
+def test_safety_monitor_raises_when_commands_are_not_readable():
     driver = DirectDriver()
     plant = driver.model.plant
     with pytest.raises(InputError, match="cannot be watched"):

@@ -1,15 +1,16 @@
-"""Driver on the Franka Control Interface, with a double of its client; `make fci` tests the real client."""
+"""Driver on the Franka Control Interface, with a double of the client library; `make fci` tests the real library."""
 
 from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from hardware_doubles import failed_checks
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_skill
-from guiderail.diagrams.hardware import fci as fci
+from guiderail.diagrams.hardware import fci
 from guiderail.diagrams.hardware.driver import describe_stop
 from guiderail.diagrams.hardware.fci import (
     FORCE_THRESHOLD_SHARE,
@@ -33,7 +34,7 @@ IMPEDANCE = Impedance().with_max_force(18.0)
 
 
 class FrankyError(Exception):
-    """Base of the client's errors."""
+    """Base class of the client's errors."""
 
 
 class NetworkError(FrankyError):
@@ -41,14 +42,14 @@ class NetworkError(FrankyError):
 
 
 class Affine:
-    """Transformation with the client's attribute `matrix`."""
+    """Double of the client's transform."""
 
     def __init__(self, matrix):
         self.matrix = np.array(matrix)
 
 
 class Robot:
-    """Robot that holds its joints, and records what it is told to do."""
+    """Double of the client's robot: it rests at its joint positions and records calls of its methods."""
 
     def __init__(self, positions):
         self.calls, self.errors, self.is_connected, self.motion_error = [], NO_ERRORS, True, None
@@ -86,7 +87,7 @@ class Robot:
             raise error
 
     def move(self, motion, asynchronous):
-        self.join_motion(None)  # as the client, which raises the error of the last motion when the next one begins
+        self.join_motion(None)  # the client raises the error of a motion when the next motion begins
         self.calls.append(("move", (motion,), {}))
 
     def set_ee(self, matrix):
@@ -102,7 +103,7 @@ class Robot:
 
 
 class Motion(SimpleNamespace):
-    """Motion with the methods of the client's impedance motion."""
+    """Double of the client's impedance motion."""
 
     def set_gains(self, gains):
         self.gains = gains
@@ -112,7 +113,7 @@ class Motion(SimpleNamespace):
 
 
 def client(robot):
-    """Return a double of the module franky with one robot."""
+    """Return a double of the module `franky` that connects to `robot`."""
 
     def connect(url, realtime_config):
         if not robot.is_connected:
@@ -152,39 +153,40 @@ def driver(robot, model):
 
 
 @pytest.mark.parametrize("error", [FrankyError("in motion"), ValueError("mass")])
-def test_configuration_that_the_robot_refuses_is_an_input_error(robot, driver, model, error):
+def test_configure_raises_when_the_robot_refuses(robot, driver, model, error):
     robot.set_collision_behavior = Mock(side_effect=error)
     with pytest.raises(InputError, match="refuses its configuration"):
         driver.configure(make_robot_impedance(model, IMPEDANCE))
 
 
-def test_defect_of_the_program_is_not_reported_as_a_refusal(robot, driver, model):
+def test_configure_reraises_errors_of_the_program(robot, driver, model):
     robot.set_collision_behavior = Mock(side_effect=AttributeError)
     with pytest.raises(AttributeError):
         driver.configure(make_robot_impedance(model, IMPEDANCE))
 
 
 def motions(robot):
+    """Return the motions that the robot was commanded, in order."""
     return [args[0] for name, args, _ in robot.calls if name == "move"]
 
 
-def test_host_is_required():
+def test_driver_raises_without_a_host():
     with pytest.raises(InputError, match="--robot-url"):
         FciDriver()
 
 
-def test_missing_client_is_named(monkeypatch):
+def test_driver_names_the_extra_when_the_client_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "franky", None)
     with pytest.raises(InputError, match=r"guiderail\[fci\]"):
         FciDriver("192.0.2.1")
 
 
-def test_motion_limits_are_within_the_published_ones():
-    ours, published = FciDriver.motion_limits, FRANKA_LIMITS
-    assert (np.array(ours.linear + ours.angular) <= np.array(published.linear + published.angular)).all()
+def test_motion_limits_are_within_the_published_limits():
+    limits, published = FciDriver.motion_limits, FRANKA_LIMITS
+    assert (np.array(limits.linear + limits.angular) <= np.array(published.linear + published.angular)).all()
 
 
-def test_status_has_the_torque_of_the_surroundings(driver, robot):
+def test_status_has_the_opposite_of_the_reported_torque(driver, robot):
     robot.external = np.arange(7.0)
     status = driver.read()
     np.testing.assert_array_equal(status.external_torque, -np.arange(7.0))
@@ -192,7 +194,7 @@ def test_status_has_the_torque_of_the_surroundings(driver, robot):
     assert driver.read().time > status.time
 
 
-def test_no_status_before_the_robot_answers(robot):
+def test_read_returns_none_until_the_robot_answers(robot):
     robot.is_connected = False
     driver = FciDriver("192.0.2.1", client=client(robot))
     assert driver.read() is None
@@ -220,7 +222,7 @@ def test_recover_clears_the_error_or_raises(driver, robot):
     assert driver.read().is_readable
 
 
-def test_recovery_that_the_robot_rejects_is_refused(driver, robot, monkeypatch):
+def test_recover_raises_when_the_robot_rejects_the_command(driver, robot, monkeypatch):
     def reject():
         raise FrankyError("command rejected")
 
@@ -232,7 +234,7 @@ def test_recovery_that_the_robot_rejects_is_refused(driver, robot, monkeypatch):
 def test_motion_continues_after_a_reflex_is_cleared(driver, robot):
     driver.write_pose(RigidTransform(), 0.0)
     robot.motion_error = FrankyError("cartesian_reflex")
-    driver.stop()  # the motion has ended already
+    driver.stop()  # no error, although the reflex has ended the motion
     robot.motion_error = FrankyError("cartesian_reflex")
     driver.recover()
     driver.write_pose(RigidTransform(), 0.0)
@@ -276,14 +278,14 @@ def test_checks_fail_when_the_connection_is_lost(driver, robot, is_noticed):
     assert [(check.name, check.passed) for check in driver.check_setup()] == [("connection", False)]
 
 
-def test_lost_connection_is_no_refusal_of_the_configuration(driver, robot, model):
+def test_configure_raises_nothing_when_the_connection_is_lost(driver, robot, model):
     robot.is_connected = False
     driver.configure(make_robot_impedance(model, IMPEDANCE))
     assert not driver.read().is_readable
 
 
-def test_bayonet_may_be_turned_at_one_radian_per_second():
-    assert FciDriver.motion_limits.angular[0] / np.sqrt(3.0) > 1.02  # the fastest turn of pretrained:connector
+def test_angular_limit_allows_the_turn_of_the_connector():
+    assert FciDriver.motion_limits.angular[0] / np.sqrt(3.0) > 1.02  # fastest turn of pretrained:connector [rad/s]
 
 
 def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
@@ -297,7 +299,7 @@ def test_configuration_sets_tool_payload_and_thresholds(driver, robot, model):
     assert calls["set_collision_behavior"][1] == pytest.approx([force] * 3 + [torque] * 3)
 
 
-def test_collision_thresholds_of_a_small_force_are_above_the_robot_s_error(robot, model):
+def test_collision_thresholds_have_a_minimum_force(robot, model):
     driver = FciDriver("192.0.2.1", client=client(robot))
     assert driver.read() is not None
     driver.configure(make_robot_impedance(model, Impedance().with_max_force(5.0)))
@@ -316,17 +318,13 @@ def test_robot_is_not_configured_during_a_motion(driver, robot, model):
     assert [name for name, *_ in robot.calls[number + 1 :]] == ["set_ee", "set_load", "set_collision_behavior"]
 
 
-def failed(driver):
-    return [check.name for check in driver.check_setup() if check.passed not in (True, None)]
-
-
 def test_configured_robot_passes_the_checks(driver):
-    assert failed(driver) == []
+    assert failed_checks(driver.check_setup()) == []
     assert {"reflex", "motion", "kernel"} < {check.name for check in driver.check_setup()}
 
 
 @pytest.mark.parametrize(
-    ("attribute", "good", "bad", "name"),
+    ("attribute", "valid", "invalid", "check"),
     [
         ("mode", "RobotMode.Idle", "RobotMode.Guiding", "mode"),
         ("mode", "RobotMode.Idle", "RobotMode.UserStopped", "mode"),
@@ -334,14 +332,14 @@ def test_configured_robot_passes_the_checks(driver):
         ("tool", 0.9 * fci.MAX_TOOL_ERROR, 1.1 * fci.MAX_TOOL_ERROR, "tool center"),
     ],
 )
-def test_other_setup_fails_its_check(driver, robot, attribute, good, bad, name):
-    before = getattr(robot, attribute)
-    for value, expected in ((good, []), (bad, [name])):
-        setattr(robot, attribute, value if attribute == "mode" else before + value)
-        assert failed(driver) == expected
+def test_check_fails_when_the_setup_differs(driver, robot, attribute, valid, invalid, check):
+    configured = getattr(robot, attribute)
+    for value, expected in ((valid, []), (invalid, [check])):
+        setattr(robot, attribute, value if attribute == "mode" else configured + value)
+        assert failed_checks(driver.check_setup()) == expected
 
 
-def test_spring_error_is_bounded_by_the_wrench(driver, robot):
+def test_spring_deflection_is_bounded_by_the_wrench_limits(driver, robot):
     driver.write_pose(RigidTransform(), 0.0)
     (motion,) = motions(robot)
     limits = np.array(IMPEDANCE.limits)
@@ -351,7 +349,7 @@ def test_spring_error_is_bounded_by_the_wrench(driver, robot):
     assert (np.linalg.eigvalsh(motion.gains.damping + motion.gains.damping.T) > 0.0).all()
 
 
-def test_poses_update_one_motion_until_the_stop(driver, robot):
+def test_poses_update_a_single_motion_until_the_stop(driver, robot):
     for x in (0.1, 0.2):
         driver.write_pose(RigidTransform([x, 0.0, 0.0]), 0.0)
     (motion,) = motions(robot)
@@ -363,39 +361,39 @@ def test_poses_update_one_motion_until_the_stop(driver, robot):
     assert isinstance(motions(robot)[2], Motion)
 
 
-def test_pose_before_configuration_is_refused(robot):
+def test_write_pose_raises_before_the_configuration(robot):
     driver = FciDriver("192.0.2.1", client=client(robot))
     driver.read()
     with pytest.raises(InputError, match="configured"):
         driver.write_pose(RigidTransform(), 0.0)
 
 
-def test_use_before_the_first_status_is_refused(robot, model):
+def test_methods_raise_before_the_first_status(robot, model):
     driver = FciDriver("192.0.2.1", client=client(robot))
     with pytest.raises(InputError, match="before it is configured"):
         driver.check_setup()
-    for use in (lambda: driver.configure(make_robot_impedance(model, IMPEDANCE)), driver.recover):
+    for call in (lambda: driver.configure(make_robot_impedance(model, IMPEDANCE)), driver.recover):
         with pytest.raises(InputError, match="the driver fci is used before it has read a status"):
-            use()
+            call()
 
 
-def test_torques_are_refused(driver):
+def test_write_refuses_torques(driver):
     with pytest.raises(InputError, match="poses, not torques"):
         driver.write(np.zeros(7), 0.0)
 
 
-def test_impedance_needs_a_target_with_the_axes_of_the_base(model):
-    class Turned(BncWorkcell):
+def test_impedance_raises_when_target_and_base_axes_differ(model):
+    class RotatedWorkcell(BncWorkcell):
         @property
         def X_WT(self):
             return super().X_WT @ RigidTransform(np.diag([-1.0, -1.0, 1.0, 1.0]))
 
     with pytest.raises(InputError, match="axes of its base"):
-        make_robot_impedance(ArmControllerPlant(Turned(), "panda"), IMPEDANCE)
+        make_robot_impedance(ArmControllerPlant(RotatedWorkcell(), "panda"), IMPEDANCE)
 
 
 class Loop:
-    """Hardware station with the driver and the double, advanced by its own period."""
+    """Hardware station on the driver and the double, advanced in steps of its period."""
 
     def __init__(self, robot):
         self.driver = FciDriver("192.0.2.1", client=client(robot))
@@ -409,7 +407,7 @@ class Loop:
     def command(self, pose):
         self.station.get_desired_pose_input_port().FixValue(self.context, pose)
 
-    def go(self, seconds):
+    def advance(self, seconds):
         for _ in range(round(seconds / self.station.period)):
             self.station.receive(self.context)
             self.time += self.station.period
@@ -420,47 +418,47 @@ class Loop:
         return ArmState(int(self.station.get_arm_state_output_port().Eval(self.context)[0]))
 
 
-def test_station_sends_poses_from_the_measured_pose_on(robot):
+def test_station_sends_poses_that_begin_at_the_measured_pose(robot):
     loop = Loop(robot)
-    loop.go(0.1)
-    assert not motions(robot)  # nothing is sent while the status settles
-    loop.go(1.0)
+    loop.advance(0.1)
+    assert not motions(robot)  # nothing is sent during the settling time
+    loop.advance(1.0)
     assert loop.arm_state == ArmState.RUNNING
     (motion,) = motions(robot)
     expected = WORKCELL.X_WT @ RigidTransform([0.0, 0.0, START[2]])
     np.testing.assert_allclose(motion.references[0][:3, 3], expected.translation(), atol=1e-4)
     loop.command(START + [0.01, 0.0, 0.0, 0.0, 0.0, 0.0])
-    loop.go(0.5)
-    moved = np.array([reference[:3, 3] for reference in motion.references])
-    np.testing.assert_allclose(moved[-1] - moved[0], [0.01, 0.0, 0.0], atol=1e-6)
-    speed = np.linalg.norm(np.diff(moved, axis=0), axis=1).max() / loop.station.period
+    loop.advance(0.5)
+    positions = np.array([reference[:3, 3] for reference in motion.references])
+    np.testing.assert_allclose(positions[-1] - positions[0], [0.01, 0.0, 0.0], atol=1e-6)
+    speed = np.linalg.norm(np.diff(positions, axis=0), axis=1).max() / loop.station.period
     assert 0.0 < speed <= FciDriver.motion_limits.linear[0]
 
 
-def test_options_that_change_the_bounded_force_are_refused(robot, monkeypatch):
-    """The robot's own controller has one bound."""
+def test_force_limit_that_an_action_changes_is_refused(robot, monkeypatch):
+    """The bound of the robot's own controller is constant."""
     assert not Loop(robot).station.HasInputPort("max_wrench")
     monkeypatch.setattr(fci, "import_extra", lambda name: client(robot))
-    on_robot = {"station": "hardware", "driver": "fci", "robot": "panda", "robot_url": "192.0.2.1", "guidance": "kgrl"}
+    options = {"station": "hardware", "driver": "fci", "robot": "panda", "robot_url": "192.0.2.1", "guidance": "kgrl"}
     with pytest.raises(InputError, match=r"force_limit_range changes .* not \(8\.0, 25\.0\)"):
-        make_skill("BncConnector", lambda seen: np.zeros(2), force_limit_range=(8.0, 25.0), **on_robot)
-    skill = make_skill("BncConnector", lambda seen: np.zeros(2), force_limit_range=(12.0, 12.0), **on_robot)
+        make_skill("BncConnector", lambda observation: np.zeros(2), force_limit_range=(8.0, 25.0), **options)
+    skill = make_skill("BncConnector", lambda observation: np.zeros(2), force_limit_range=(12.0, 12.0), **options)
     limits = skill.diagram.GetSubsystemByName("station").impedance.limits
     assert limits == Impedance().with_max_force(12.0).limits
 
 
 def test_station_stops_the_robot_after_a_reflex(robot):
     loop = Loop(robot)
-    loop.go(1.0)
+    loop.advance(1.0)
     robot.errors = "cartesian_reflex"
-    loop.go(0.1)
+    loop.advance(0.1)
     assert loop.arm_state == ArmState.DAMPING
     assert motions(robot)[-1][0] == "stop"
     assert Fault(int(loop.station.get_fault_output_port().Eval(loop.context)[0])) == Fault.MALFORMED
 
 
 class LoopClock:
-    """Clock that advances a station by its own period."""
+    """Clock that advances a station in steps of its period, without waiting."""
 
     check_robot = None
 
@@ -473,7 +471,7 @@ class LoopClock:
             simulator.AdvanceTo(simulator.get_context().get_time() + station.period)
 
 
-def test_error_from_before_is_cleared_only_if_the_operator_agrees(robot, monkeypatch):
+def test_existing_error_is_cleared_only_when_confirmed(robot, monkeypatch):
     station = Loop(robot).station
     robot.errors = "cartesian_reflex"
     checks, questions, lines = PreflightChecks(station, LoopClock(), START, 4), [], []
@@ -487,9 +485,9 @@ def test_error_from_before_is_cleared_only_if_the_operator_agrees(robot, monkeyp
     assert not any(line.startswith("NOT") for line in lines)
 
 
-def test_check_compares_the_full_force_with_the_limits_that_stop_the_arm(robot):
+def test_torque_check_compares_the_full_force_with_the_limits(robot):
     loop = Loop(robot)
-    loop.go(1.0)
+    loop.advance(1.0)
     (check,) = (check for check in check_robot(loop.station, loop.context, START, 0) if check.name == "torques")
     torques = loop.station.max_torque_shares(robot.positions) * loop.station.limits.torque
     share = (torques / loop.station.limits.external_torque).max()

@@ -1,10 +1,11 @@
-"""Lockstep of a station with a simulated Franka, whose end is a thread here; `make fci` tests the whole robot."""
+"""Lockstep of a station with a simulated Franka; a thread stands in for the robot, and `make fci` runs the robot."""
 
 import socket
 import threading
 from contextlib import closing, contextmanager, suppress
 
 import pytest
+from hardware_doubles import ClockRecorder
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.primitives import ConstantVectorSource
 
@@ -12,14 +13,6 @@ from guiderail.diagrams.hardware import fci_lockstep
 from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock, LockstepServer
 
 HOST, PERIOD = "127.0.0.1", 0.005
-
-
-class ClockRecorder:
-    def __init__(self):
-        self.clocks = []
-
-    def receive(self, context, clock=None):
-        self.clocks.append(clock)
 
 
 @pytest.fixture(autouse=True)
@@ -30,7 +23,7 @@ def _free_port(monkeypatch):
 
 @contextmanager
 def robot(lead=0.0):
-    """Run a robot whose clock advances more than requested; yield the requests that it receives."""
+    """Run a robot whose clock advances by `lead` [s] more than requested; yield the list of received requests."""
     requests, ended, time = [], threading.Event(), 7.0
     with closing(LockstepServer(HOST)) as server:
 
@@ -51,7 +44,7 @@ def robot(lead=0.0):
             thread.join()
 
 
-def test_time_base_of_the_station_is_the_clock_of_the_robot():
+def test_station_receives_the_clock_of_the_robot():
     simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
     with robot(lead=0.001) as requests:
         clock = FciLockstepClock(HOST, 5.0, PERIOD)
@@ -62,7 +55,7 @@ def test_time_base_of_the_station_is_the_clock_of_the_robot():
     assert [request["advance"] for request in requests] == [0.0, PERIOD, PERIOD, PERIOD]
 
 
-def test_offsets_of_parts_arrive_at_the_robot():
+def test_move_parts_sends_the_offsets_to_the_robot():
     with robot() as requests:
         FciLockstepClock(HOST, 5.0, PERIOD).move_parts([[1e-3, 2e-3], [0.0, 0.0]])
     assert requests == [{"parts": [[1e-3, 2e-3], [0.0, 0.0]]}]
@@ -71,7 +64,7 @@ def test_offsets_of_parts_arrive_at_the_robot():
 @pytest.mark.parametrize(
     "line", [b"{", b"[1]", b"\xff", 5000 * b"[", b'{"advance": "1"}', b'{"advance": NaN}', b'{"parts": [[0.1, 0.0]]}']
 )
-def test_station_with_a_malformed_request_is_disconnected(line, caplog):
+def test_robot_disconnects_a_station_with_a_malformed_request(line, caplog):
     with robot() as requests:
         with socket.create_connection((HOST, fci_lockstep.LOCKSTEP_PORT), 5.0) as station:
             station.sendall(line + b"\n")
@@ -81,19 +74,19 @@ def test_station_with_a_malformed_request_is_disconnected(line, caplog):
     assert len(requests) == len(caplog.records) == 1
 
 
-def test_time_base_advances_without_a_robot_and_follows_a_new_one():
+def test_clock_advances_without_a_robot_and_follows_the_next():
     simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
     clock = FciLockstepClock(HOST, 5.0, PERIOD)
     clock.begin()
     clock.advance(simulator, recorder, 2)
-    for _ in range(2):  # the clock of the second robot begins again
+    for _ in range(2):  # the second robot's clock starts from its own initial time
         with robot(lead=0.001):
             clock.begin()
             clock.advance(simulator, recorder, 2)
     assert recorder.clocks == pytest.approx([0.005, 0.01, 0.016, 0.022, 0.027, 0.033])
 
 
-def test_silent_robot_is_waited_for_once():
+def test_clock_waits_only_once_for_a_silent_robot():
     simulator, recorder = Simulator(ConstantVectorSource([0.0])), ClockRecorder()
     with closing(LockstepServer(HOST)):
         clock = FciLockstepClock(HOST, 0.01, PERIOD)
@@ -101,7 +94,7 @@ def test_silent_robot_is_waited_for_once():
     assert recorder.clocks == pytest.approx([PERIOD, 2 * PERIOD, 3 * PERIOD])
 
 
-def test_full_timeout_of_a_connection_passes_only_once(monkeypatch):
+def test_connection_is_retried_with_a_short_timeout(monkeypatch):
     timeouts = []
 
     def connect(address, timeout):

@@ -1,4 +1,4 @@
-"""Reflexes of the simulated Franka."""
+"""Reflexes of the simulated Franka: limits whose violation stops the arm."""
 
 import numpy as np
 import pytest
@@ -17,6 +17,7 @@ def detector():
 
 
 def detect(detector, **changes):
+    """Return the reflex of a robot at rest without loads, except for entries of arguments: (index, value) by name."""
     arguments = {
         "command": np.zeros(7),
         "position": np.zeros(7),
@@ -51,11 +52,11 @@ def test_no_reflex_within_the_limits(detector):
         ("command", 1, np.nan, Reflex.CONTROLLER_TORQUE_DISCONTINUITY),
     ],
 )
-def test_reflex_beyond_a_limit(detector, name, index, value, reflex):
+def test_reflex_is_detected_beyond_a_limit(detector, name, index, value, reflex):
     assert detect(detector, **{name: (index, value)}) == reflex
 
 
-def test_torque_is_compared_with_the_last_one_of_the_motion(detector):
+def test_torque_jump_is_not_compared_across_motions(detector):
     for torque in (1.0, 2.0, 1.0):
         assert detect(detector, command=(0, torque)) is None
     detector.begin()

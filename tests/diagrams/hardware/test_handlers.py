@@ -1,3 +1,5 @@
+"""Clocks and servers refuse to run where message handlers would be called without the interpreter's lock."""
+
 import pytest
 from pydrake.lcm import DrakeLcm
 
@@ -12,11 +14,11 @@ def test_clocks_raise_when_message_handlers_are_unsafe(monkeypatch):
     monkeypatch.setattr(lcm_driver, "handlers_are_safe", lambda: False)
     lcm = DrakeLcm("memq://")
     driver = IiwaDriver(lcm)
-    for begin in (
+    for start in (
         lambda: WallClock(driver),
         lambda: LockstepClock(driver, 0.01),
         lambda: serve_in_real_time(None, 0.0, lambda: None),
         lambda: serve_in_lockstep(None, lcm, lcm, 0.0, 0.0),
     ):
         with pytest.raises(InputError, match="interpreter's lock"):
-            begin()
+            start()

@@ -40,7 +40,7 @@ def bus():
 
 
 @pytest.mark.parametrize("injection", INJECTIONS, ids=lambda injection: f"{injection.kind}, {injection.description}")
-def test_station_stops_in_time_and_resumes(bus, injection):
+def test_station_stops_and_resumes_as_required(bus, injection):
     observation = injection.inject(bus)
     assert observation.failures == []
 

@@ -1,4 +1,4 @@
-"""Driver on LCM: which messages contradict others."""
+"""Driver on LCM: commands of other programs, contradicting statuses, and heartbeats."""
 
 import numpy as np
 import pytest
@@ -8,17 +8,18 @@ from pydrake.lcm import DrakeLcm
 from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, MAX_HEARTBEATS_MISSED, IiwaDriver
 from guiderail.models.control.joint_status import Heartbeat
 
-OWN, OTHER = np.full(7, 0.5), np.full(7, -0.5)
+OWN, FOREIGN = np.full(7, 0.5), np.full(7, -0.5)
 
 
-class Pair:
-    """This program's driver and another one on the same bus."""
+class TwoPrograms:
+    """Drivers of two programs on the same bus; `driver` is under test."""
 
     def __init__(self):
         lcm = DrakeLcm("memq://")
         self.driver, self.other, self.step = IiwaDriver(lcm), IiwaDriver(lcm), 0
 
-    def status(self, time=None, position=0.0):
+    def send_status(self, time=None, position=0.0):
+        """Send a status at `time` [s], by default a period later, and read it."""
         self.step += 1
         message = lcmt_iiwa_status()
         message.utime, message.num_joints = round((self.step * 0.005 if time is None else time) * 1e6), 7
@@ -29,70 +30,71 @@ class Pair:
         return self.read()
 
     def read(self):
+        """Handle all messages and return the newest status."""
         while self.driver.lcm.HandleSubscriptions(0):
             pass
         return self.driver.read()
 
 
 def test_own_commands_are_not_foreign():
-    pair = Pair()
-    pair.driver.write(OWN, 1.0)
-    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == 0
+    programs = TwoPrograms()
+    programs.driver.write(OWN, 1.0)
+    assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands == 0
 
 
-def test_foreign_commands_contradict_once_this_program_commands():
-    pair = Pair()
-    pair.other.write(OTHER, 1.0)
-    assert pair.status().foreign_commands == 0
-    assert pair.driver.num_foreign_commands == 1
-    pair.driver.write(OWN, 1.0)
-    assert pair.read().foreign_commands == 0
-    pair.other.write(OTHER, 1.0)
-    assert pair.read().foreign_commands == 1  # without a new status
-    pair.other.write(OTHER, 1.005)
-    assert pair.status().foreign_commands == pair.driver.num_foreign_commands - 1 == 2
+def test_foreign_commands_count_after_the_first_own_command():
+    programs = TwoPrograms()
+    programs.other.write(FOREIGN, 1.0)
+    assert programs.send_status().foreign_commands == 0
+    assert programs.driver.num_foreign_commands == 1
+    programs.driver.write(OWN, 1.0)
+    assert programs.read().foreign_commands == 0
+    programs.other.write(FOREIGN, 1.0)
+    assert programs.read().foreign_commands == 1  # without a new status
+    programs.other.write(FOREIGN, 1.005)
+    assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands - 1 == 2
 
 
 @pytest.mark.parametrize("is_stopping", [False, True])
 def test_commands_of_a_safety_monitor_are_not_foreign(is_stopping):
-    pair = Pair()
-    pair.driver.write(OWN, 1.0)
-    pair.other.write_heartbeat(Heartbeat(1, False, 5))
-    pair.other.write_heartbeat(Heartbeat(1, is_stopping, 4))
-    pair.other.write(OTHER, 1.0)
-    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == (not is_stopping)
-    pair.other.write_heartbeat(Heartbeat(2, False, 4))
-    pair.other.write(OTHER, 1.005)
-    assert pair.read().foreign_commands == 1 + (not is_stopping)
+    programs = TwoPrograms()
+    programs.driver.write(OWN, 1.0)
+    programs.other.write_heartbeat(Heartbeat(1, False, 5))
+    programs.other.write_heartbeat(Heartbeat(1, is_stopping, 4))
+    programs.other.write(FOREIGN, 1.0)
+    assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands == (not is_stopping)
+    programs.other.write_heartbeat(Heartbeat(2, False, 4))
+    programs.other.write(FOREIGN, 1.005)
+    assert programs.read().foreign_commands == 1 + (not is_stopping)
 
 
-def test_monitor_that_ended_during_a_stop_excuses_no_commands():
-    pair = Pair()
-    pair.driver.write(OWN, 1.0)
-    pair.other.write_heartbeat(Heartbeat(7, True, 4))
+def test_commands_are_foreign_after_a_stopping_monitor_ended():
+    programs = TwoPrograms()
+    programs.driver.write(OWN, 1.0)
+    programs.other.write_heartbeat(Heartbeat(7, True, 4))
     for sequence in range(MAX_HEARTBEATS_MISSED + 1):
-        pair.other.write(OTHER, sequence * 0.005)
-        assert pair.read() is None
-        assert pair.driver.num_foreign_commands == 0
-        pair.other.write_heartbeat(Heartbeat(sequence, False, 5))  # of the monitor that replaces it
-    pair.read()
-    assert {heartbeat.sender for heartbeat in pair.driver.read_heartbeats()} == {5}
-    pair.other.write(OTHER, 9.0)
-    assert pair.status().foreign_commands == pair.driver.num_foreign_commands == 1
+        programs.other.write(FOREIGN, sequence * 0.005)
+        assert programs.read() is None
+        assert programs.driver.num_foreign_commands == 0
+        programs.other.write_heartbeat(Heartbeat(sequence, False, 5))  # of the monitor that replaces the ended monitor
+    programs.read()
+    assert {heartbeat.sender for heartbeat in programs.driver.read_heartbeats()} == {5}
+    programs.other.write(FOREIGN, 9.0)
+    assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands == 1
 
 
-def test_every_status_is_compared_also_if_it_is_not_read():
-    pair = Pair()
-    assert pair.status().conflicts == 0
-    pair.status(time=0.006, position=0.1)
-    assert pair.status(time=0.006, position=0.2).conflicts == 1
-    assert pair.status(time=0.006, position=0.2).conflicts == 1
-    pair.status(time=0.009, position=0.4)
-    assert pair.status(time=0.012, position=0.2).conflicts == 2
-    np.testing.assert_array_equal(pair.read().positions, 0.2)
+def test_conflicts_are_counted_in_statuses_that_are_not_read():
+    programs = TwoPrograms()
+    assert programs.send_status().conflicts == 0
+    programs.send_status(time=0.006, position=0.1)
+    assert programs.send_status(time=0.006, position=0.2).conflicts == 1
+    assert programs.send_status(time=0.006, position=0.2).conflicts == 1
+    programs.send_status(time=0.009, position=0.4)
+    assert programs.send_status(time=0.012, position=0.2).conflicts == 2
+    np.testing.assert_array_equal(programs.read().positions, 0.2)
 
 
-def test_command_is_decoded_with_its_time():
+def test_decode_command_returns_torque_and_time():
     torque, time = IiwaDriver.decode_command(IiwaDriver.encode(OWN, 2.5))
     np.testing.assert_array_equal(torque, OWN)
     assert time == 2.5
@@ -100,7 +102,7 @@ def test_command_is_decoded_with_its_time():
 
 
 class UdpBus:
-    """Bus that keeps one unread message of a channel for each program, as `DrakeLcm` does on UDP."""
+    """Bus that keeps the oldest unread message of each channel for each program, as `DrakeLcm` does on UDP."""
 
     def __init__(self, programs):
         self.programs, self.handlers, self.unread = programs, {}, {}
@@ -130,20 +132,20 @@ def test_heartbeats_of_two_monitors_do_not_displace_each_other():
     assert {heartbeat.sender: heartbeat.sequence for heartbeat in station.read_heartbeats()} == {0: 59, 1: 59}
 
 
-def test_older_heartbeat_of_another_channel_does_not_replace_a_newer_one():
-    pair = Pair()
+def test_older_heartbeat_does_not_replace_a_newer_heartbeat():
+    programs = TwoPrograms()
     for number, sequence in ((1, 5), (0, 4)):
-        pair.other.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
-        pair.read()
-    assert pair.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
+        programs.other.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
+        programs.read()
+    assert programs.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
 
 
 @pytest.mark.parametrize("timeout", [3e6, np.inf])
-def test_a_wait_beyond_the_range_of_lcm_ends_with_the_first_message(timeout):
-    pair = Pair()
-    pair.status(0.005)
+def test_receive_with_a_huge_timeout_ends_with_a_message(timeout):
+    programs = TwoPrograms()
+    programs.send_status(0.005)
     message = lcmt_iiwa_status()
     message.utime = 10_000
-    pair.driver.lcm.Publish("IIWA_STATUS", message.encode())
-    pair.driver.receive(timeout)
-    assert pair.driver.lcm.HandleSubscriptions(0) == 0
+    programs.driver.lcm.Publish("IIWA_STATUS", message.encode())
+    programs.driver.receive(timeout)
+    assert programs.driver.lcm.HandleSubscriptions(0) == 0

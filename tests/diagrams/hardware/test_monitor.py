@@ -1,10 +1,11 @@
-"""Safety monitor on a bus in memory, by a clock of the test."""
+"""Safety monitor on a bus in memory, with a simulated clock."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from drake import lcmt_iiwa_status
+from hardware_doubles import unplugged
 from pydrake.lcm import DrakeLcm
 
 from guiderail.diagrams.hardware.driver import safety_limits, torque_tolerance
@@ -18,9 +19,9 @@ from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
 PERIOD = IiwaDriver.period
-MOVING = np.array([0.3, -0.2, 0.1, 0.2, 0.05, 0.1, -0.1])
-PUSH = np.array([0.5, 0.4, 0.5, 0.3, 0.1, 0.1, 0.1])
-NAMES = lcmt_iiwa_status.__slots__[2:]
+VELOCITY = np.array([0.3, -0.2, 0.1, 0.2, 0.05, 0.1, -0.1])  # joint velocities at the start [rad/s]
+PUSH = np.array([0.5, 0.4, 0.5, 0.3, 0.1, 0.1, 0.1])  # commanded torques [Nm]
+JOINT_FIELDS = lcmt_iiwa_status.__slots__[2:]
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def arm():
 class Bus:
     """Bus with a simulated robot, a safety monitor, and records of the monitor's commands and heartbeats."""
 
-    def __init__(self, arm, velocity=MOVING):
+    def __init__(self, arm, velocity=VELOCITY):
         self.lcm, self.step, self.commands, self.heartbeats = DrakeLcm("memq://"), 0, [], []
         self.plant, self.dynamics = arm.plant, JointDynamics(arm.plant)
         self.context = self.plant.CreateDefaultContext()
@@ -56,8 +57,15 @@ class Bus:
             self.torque = command[0]
             self.commands.append(self.torque)
 
-    def go(self, steps=1, status=True, command=False, **changed):
-        """Advance the robot, send its status (or another message, or none), and possibly a command."""
+    def advance(self, steps=1, status=True, command=False, **changed):
+        """Advance the robot, and send its status and a command after each step.
+
+        Args:
+            steps: Number of status periods.
+            status: True to send the status, False to send nothing, or bytes to send instead.
+            command: True to send the torques `PUSH`.
+            **changed: Values of fields of the status that replace the robot's.
+        """
         for _ in range(steps):
             self.step += 1
             self.plant.SetPositionsAndVelocities(self.context, [*self.positions, *self.velocities])
@@ -66,7 +74,7 @@ class Bus:
             self.positions = self.positions + PERIOD * self.velocities
             message = lcmt_iiwa_status()
             message.utime, message.num_joints = round((100.0 + self.step * PERIOD) * 1e6), 7
-            for name in NAMES:
+            for name in JOINT_FIELDS:
                 setattr(message, name, [0.0] * 7)
             message.joint_position_measured = self.positions.tolist()
             message.joint_velocity_estimated = self.velocities.tolist()
@@ -80,15 +88,16 @@ class Bus:
             self.settle()
 
     def settle(self):
+        """Handle messages until none is left."""
         for _ in range(100):
             if not self.lcm.HandleSubscriptions(0):
                 return
-        raise AssertionError("messages answer each other without end")
+        raise AssertionError("the bus has messages after 100 rounds")
 
-    def watch(self):
-        """Command the arm until the monitor accepts its statuses."""
-        self.go(100)
-        self.go(10, command=True)
+    def start_watching(self):
+        """Command the arm until the monitor accepts its statuses; return the bus."""
+        self.advance(100)
+        self.advance(10, command=True)
         assert (self.monitor.state, self.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
         assert not self.is_stopping
         self.commands.clear()
@@ -99,59 +108,60 @@ class Bus:
         return np.abs(self.velocities).max()
 
 
-def test_monitor_damps_then_rests_when_commands_stop(arm):
-    bus = Bus(arm).watch()
-    bus.go(MAX_MISSED_MESSAGES)
+def test_monitor_damps_then_commands_zero_when_commands_stop(arm):
+    bus = Bus(arm).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES)
     assert bus.commands == []
-    moving = bus.speed
-    bus.go(1)
+    initial_speed = bus.speed
+    bus.advance(1)
     assert (bus.monitor.state, bus.is_stopping) == (MonitorState.DAMPING, True)
-    bus.go(20)
-    assert bus.speed < 0.02 * moving
-    bus.go(round(bus.limits.damping_time / PERIOD) - 20)
+    bus.advance(20)
+    assert bus.speed < 0.02 * initial_speed
+    bus.advance(round(bus.limits.damping_time / PERIOD) - 20)
     assert bus.monitor.state == MonitorState.RESTING
     np.testing.assert_array_equal(bus.commands[-1], 0.0)
-    bus.go(round(ZERO_TORQUE_TIME / PERIOD) - 1)
+    bus.advance(round(ZERO_TORQUE_TIME / PERIOD) - 1)
     assert bus.monitor.state == MonitorState.RESTING
-    bus.go(2)
+    bus.advance(2)
     assert (bus.monitor.state, bus.is_stopping) == (MonitorState.IDLE, False)
     count = len(bus.commands)
-    bus.go(20)
+    bus.advance(20)
     assert len(bus.commands) == count
 
 
 def test_damping_torque_is_clipped_to_its_limits(arm):
-    bus = Bus(arm, velocity=5.0 * MOVING).watch()
-    bus.go(MAX_MISSED_MESSAGES + 1)
+    bus = Bus(arm, velocity=5.0 * VELOCITY).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES + 1)
     assert (np.abs(bus.commands[-1]) <= np.array(bus.limits.torque)).all()
     assert np.isclose(np.abs(bus.commands[-1]), bus.limits.torque).any()
 
 
 def test_monitor_finishes_damping_when_commands_return(arm):
-    bus = Bus(arm).watch()
-    bus.go(MAX_MISSED_MESSAGES + 1)
-    bus.go(5, command=True)
+    bus = Bus(arm).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES + 1)
+    bus.advance(5, command=True)
     assert (bus.monitor.state, bus.is_stopping) == (MonitorState.DAMPING, True)
 
 
-def test_monitor_is_idle_without_a_torque_to_stop(arm):
+def test_monitor_is_idle_when_no_torque_is_commanded(arm):
     bus = Bus(arm)
-    bus.go(50)
+    bus.advance(50)
     assert bus.monitor.state == MonitorState.IDLE
     bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.zeros(7), 0.0))
     bus.settle()
     bus.commands.clear()
     assert bus.monitor.state == MonitorState.WATCHING
-    bus.go(1, joint_velocity_estimated=[np.nan] * 7)
+    bus.advance(1, joint_velocity_estimated=[np.nan] * 7)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NOT_FINITE)
-    bus.go(50)
+    bus.advance(50)
     assert (bus.monitor.state, bus.commands) == (MonitorState.IDLE, [])
 
 
+# Changed fields of a status, and the expected faults.
 FAULTY = {
     "NaN in a velocity": ({"joint_velocity_estimated": [np.nan] * 7}, Fault.NOT_FINITE),
     "NaN in an external torque": ({"joint_torque_external": [np.nan, *[0.0] * 6]}, Fault.NOT_FINITE),
-    "wrong joint count": ({"num_joints": 3} | {name: [0.0] * 3 for name in NAMES}, Fault.WRONG_SIZE),
+    "wrong joint count": ({"num_joints": 3} | {name: [0.0] * 3 for name in JOINT_FIELDS}, Fault.WRONG_SIZE),
     "position jump": ({"joint_position_measured": [1.0] * 7}, Fault.POSITION_JUMP),
     "velocity jump": ({"joint_velocity_estimated": [2.0] * 7}, Fault.VELOCITY_JUMP),
     "frozen time stamp": ({"utime": 100_500_000}, Fault.OUT_OF_ORDER),
@@ -162,57 +172,57 @@ FAULTY = {
 
 @pytest.mark.parametrize("name", FAULTY)
 def test_monitor_stops_the_arm_when_a_status_is_wrong(arm, name):
-    """And while it stays wrong, although the commanding program goes on, it never repeats a torque."""
-    bus, (changed, fault) = Bus(arm).watch(), FAULTY[name]
-    moving = bus.speed
-    bus.go(1, command=True, **changed)
+    """The arm is damped to rest although the following statuses are wrong as well."""
+    bus, (changed, fault) = Bus(arm).start_watching(), FAULTY[name]
+    initial_speed = bus.speed
+    bus.advance(1, command=True, **changed)
     assert (bus.monitor.state, bus.monitor.fault, bus.is_stopping) == (MonitorState.DAMPING, fault, True)
     for _ in range(20):
-        bus.go(1, **changed)
-        assert bus.speed < 1.1 * moving
+        bus.advance(1, **changed)
+        assert bus.speed < 1.1 * initial_speed
     assert bus.speed < 0.15
-    bus.go(round(bus.limits.damping_time / PERIOD) + 1, **changed)
+    bus.advance(round(bus.limits.damping_time / PERIOD) + 1, **changed)
     np.testing.assert_array_equal(bus.commands[-1], 0.0)
     assert bus.speed < 0.15
 
 
 @pytest.mark.parametrize("message", [bytes(range(100)), b"\x00"])
 def test_monitor_stops_the_arm_when_a_status_cannot_be_decoded(arm, message):
-    bus = Bus(arm).watch()
-    bus.go(1, status=message)
+    bus = Bus(arm).start_watching()
+    bus.advance(1, status=message)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.MALFORMED)
 
 
 def test_monitor_stops_the_arm_when_statuses_stop(arm):
-    """By its own clock; torques are sent without any status, and become zero."""
-    bus = Bus(arm).watch()
-    bus.go(MAX_MISSED_MESSAGES + 1, status=False, command=True)
+    """The monitor detects this by its own clock; it sends damping torques without statuses, and then zero torque."""
+    bus = Bus(arm).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES + 1, status=False, command=True)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.STALE)
-    bus.go(round(bus.limits.damping_time / PERIOD) + 1, status=False)
+    bus.advance(round(bus.limits.damping_time / PERIOD) + 1, status=False)
     np.testing.assert_array_equal(bus.commands[-1], 0.0)
     assert bus.speed < 0.15
 
 
-def test_monitor_ignores_commands_of_another_size(arm):
-    bus = Bus(arm).watch()
+def test_monitor_ignores_commands_of_a_wrong_size(arm):
+    bus = Bus(arm).start_watching()
     for _ in range(MAX_MISSED_MESSAGES + 1):
         bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.ones(3), bus.now))
         bus.lcm.Publish("IIWA_COMMAND", bytes(range(60)))
-        bus.go(1)
+        bus.advance(1)
     assert bus.monitor.state == MonitorState.DAMPING
 
 
 def test_monitor_drops_reordered_statuses(arm):
-    bus = Bus(arm).watch()
+    bus = Bus(arm).start_watching()
     old = round((100.0 + (bus.step - 1) * PERIOD) * 1e6)
-    bus.go(1, command=True, utime=old)
+    bus.advance(1, command=True, utime=old)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
 
 
 def contend(bus, steps, torque, clock=0.0):
-    """Let a second program send torques after each command of the first; return what the robot did in between."""
+    """Send torques of a second program after each command of the first; `clock` [s] is the offset of their times."""
     for _ in range(steps):
-        bus.go(1, command=True)
+        bus.advance(1, command=True)
         bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(torque, bus.now + clock))
         bus.settle()
 
@@ -220,70 +230,66 @@ def contend(bus, steps, torque, clock=0.0):
 @pytest.mark.parametrize("torque", [0.001 * PUSH, -PUSH], ids=["small", "negated"])
 @pytest.mark.parametrize("clock", [0.0, -5.0, 300.0])
 def test_monitor_stops_the_arm_when_two_programs_command(arm, torque, clock):
-    bus = Bus(arm).watch()
+    bus = Bus(arm).start_watching()
     contend(bus, 3, torque, clock)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.DAMPING, Fault.SECOND_COMMANDER)
     contend(bus, 20, torque, clock)
     assert bus.speed < 0.02
-    contend(bus, 100, torque, clock)  # the robot obeys the monitor's zero torque as long as both command
+    contend(bus, 100, torque, clock)  # the monitor's zero torque is the last command of each step
     assert (bus.monitor.state, bus.is_stopping) == (MonitorState.RESTING, True)
     np.testing.assert_array_equal(bus.torque, 0.0)
-    bus.go(round(IiwaDriver.hold_off / PERIOD) + 3, command=True)
+    bus.advance(round(IiwaDriver.hold_off / PERIOD) + 3, command=True)
     assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.WATCHING, Fault.NONE)
 
 
 def test_monitor_repeats_its_torque_twice_between_checks(arm):
-    bus = Bus(arm).watch()
-    bus.go(MAX_MISSED_MESSAGES + 1)
+    bus = Bus(arm).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES + 1)
     bus.commands.clear()
     for torque in (1.0, 2.0, 3.0, 4.0):
         bus.lcm.Publish("IIWA_COMMAND", IiwaDriver.encode(np.full(7, torque), bus.now))
         bus.settle()
-    assert len(bus.commands) == 4 + 2
+    assert len(bus.commands) == 4 + 2  # foreign commands and repeats of the monitor
 
 
-def test_two_monitors_stop_the_arm_and_go_on(arm):
-    """Each one repeats its torque after a command, but not after the other one's without end."""
+def test_two_monitors_stop_the_arm_and_resume(arm):
+    """A monitor repeats its torque after a foreign command, at most `MAX_REPEATS` times per period."""
     bus = Bus(arm)
-    other = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: bus.now)
+    second = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: bus.now)
 
-    def go(steps, command=True, **changed):
+    def advance(steps, command=True, **changed):
         for _ in range(steps):
-            bus.go(1, command=command, **changed)
-            other.receive()
+            bus.advance(1, command=command, **changed)
+            second.receive()
             bus.settle()
-        return [(monitor.state, monitor.fault) for monitor in (bus.monitor, other)]
+        return [(monitor.state, monitor.fault) for monitor in (bus.monitor, second)]
 
-    go(100, command=False)
-    assert go(10) == [(MonitorState.WATCHING, Fault.NONE)] * 2
+    advance(100, command=False)
+    assert advance(10) == [(MonitorState.WATCHING, Fault.NONE)] * 2
     bus.commands.clear()
-    assert go(1, joint_velocity_estimated=[np.nan] * 7) == [(MonitorState.DAMPING, Fault.NOT_FINITE)] * 2
-    go(20)
+    assert advance(1, joint_velocity_estimated=[np.nan] * 7) == [(MonitorState.DAMPING, Fault.NOT_FINITE)] * 2
+    advance(20)
     assert len(bus.commands) <= 21 * (1 + 2 * (1 + MAX_REPEATS))
     assert bus.speed < 0.02
-    assert go(200) == [(MonitorState.WATCHING, Fault.NONE)] * 2
+    assert advance(200) == [(MonitorState.WATCHING, Fault.NONE)] * 2
 
 
-def test_monitor_announces_its_commands_by_a_heartbeat(arm):
-    bus, order = Bus(arm).watch(), []
+def test_monitor_sends_a_heartbeat_before_a_command(arm):
+    bus, order = Bus(arm).start_watching(), []
     bus.lcm.Subscribe("IIWA_COMMAND", lambda message: order.append("command"))
     bus.lcm.Subscribe(IiwaDriver.heartbeat_channel(), lambda message: order.append(bus.is_stopping))
-    bus.go(MAX_MISSED_MESSAGES + 1)
+    bus.advance(MAX_MISSED_MESSAGES + 1)
     assert order[-2:] == [True, "command"]
 
 
-def test_monitors_heartbeats_have_its_number(arm):
+def test_heartbeats_have_sequence_and_sender_numbers(arm):
     first, second = Bus(arm), Bus(arm)
-    first.go(3)
-    second.go(1)
+    first.advance(3)
+    second.advance(1)
     sent = [HEARTBEAT_FORMAT.unpack(message) for message in first.heartbeats]
     assert [sequence for sequence, _, _ in sent] == [1, 2, 3]
     assert len({sender for _, _, sender in sent}) == 1
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
-
-
-def unplugged(*arguments):
-    raise OSError("cable unplugged")
 
 
 @pytest.mark.parametrize(
@@ -296,69 +302,69 @@ def unplugged(*arguments):
     ],
 )
 def test_monitor_damps_when_the_driver_fails(arm, method, replacement):
-    bus = Bus(arm).watch()
+    bus = Bus(arm).start_watching()
     setattr(bus.monitor._driver, method, replacement)
-    moving = bus.speed
-    bus.go(1)
+    initial_speed = bus.speed
+    bus.advance(1)
     assert (bus.monitor.state, bus.monitor.fault, bus.is_stopping) == (MonitorState.DAMPING, Fault.MALFORMED, True)
-    bus.go(20)
-    assert bus.speed < 0.2 * moving
+    bus.advance(20)
+    assert bus.speed < 0.2 * initial_speed
 
 
 @pytest.mark.parametrize("failures", [1, 20, 60])
-def test_monitor_damps_when_its_commands_have_failed(arm, failures):
-    """The robot executes the last torque meanwhile."""
-    bus = Bus(arm).watch()
+def test_monitor_damps_the_arm_after_failed_commands(arm, failures):
+    """While commands fail, the robot executes the last torque."""
+    bus = Bus(arm).start_watching()
     bus.monitor._driver.write = unplugged
-    bus.go(MAX_MISSED_MESSAGES + failures)
+    bus.advance(MAX_MISSED_MESSAGES + failures)
     assert (bus.monitor.state, bus.is_stopping, bus.commands) == (MonitorState.DAMPING, True, [])
     del bus.monitor._driver.write
     speed = bus.speed
-    bus.go(1)
+    bus.advance(1)
     for _ in range(30):
-        bus.go(1)
+        bus.advance(1)
         assert bus.speed < 1.05 * speed
     assert bus.speed < 0.1 * speed
-    bus.go(60)
+    bus.advance(60)
     assert bus.monitor.state == MonitorState.IDLE
 
 
 @pytest.mark.parametrize("method", ["write_heartbeat", "read_heartbeats"])
 def test_monitor_continues_when_heartbeats_fail(arm, method):
-    bus = Bus(arm).watch()
+    bus = Bus(arm).start_watching()
     setattr(bus.monitor._driver, method, unplugged)
-    bus.go(MAX_MISSED_MESSAGES + 10)
+    bus.advance(MAX_MISSED_MESSAGES + 10)
     assert bus.monitor.state == MonitorState.DAMPING
     assert bus.commands
 
 
-def test_monitor_sends_torques_when_the_driver_fails_to_hold(arm):
-    bus = Bus(arm).watch()
+def test_monitor_sends_torques_when_hold_raises(arm):
+    bus = Bus(arm).start_watching()
     bus.monitor._driver.can_hold, bus.monitor._driver.hold = True, unplugged
-    moving = bus.speed
-    bus.go(20, status=b"text")
+    initial_speed = bus.speed
+    bus.advance(20, status=b"text")
     assert bus.monitor.state == MonitorState.DAMPING
-    assert bus.speed < 0.2 * moving
+    assert bus.speed < 0.2 * initial_speed
 
 
 def test_monitor_sends_heartbeats_before_the_first_status(arm):
     bus = Bus(arm)
-    bus.go(1, status=False)
+    bus.advance(1, status=False)
     assert (len(bus.heartbeats), bus.monitor.fault, bus.commands) == (1, Fault.NO_STATUS, [])
 
 
-def test_monitor_checks_once_per_period_without_a_new_status(arm):
+def test_monitor_checks_once_per_period_without_statuses(arm):
     bus = Bus(arm)
-    bus.go(1)
+    bus.advance(1)
     bus.monitor.receive()
     bus.settle()
     assert len(bus.heartbeats) == 1
-    bus.go(1, status=False)
+    bus.advance(1, status=False)
     assert len(bus.heartbeats) == 2
 
 
-class Clocked:
-    """Monitor without a robot, by a clock that a test sets, after a command that turns one joint."""
+class ClockedMonitor:
+    """Monitor without a robot, with a clock that tests set; one command at `commanded_at` [s] turns joint 4."""
 
     def __init__(self, arm, commanded_at):
         self.now, self.lcm = commanded_at, DrakeLcm("memq://")
@@ -373,23 +379,23 @@ class Clocked:
         return self.monitor.state
 
 
-@pytest.mark.parametrize(("share", "state"), [(1.0, MonitorState.WATCHING), (1.0005, MonitorState.DAMPING)])
-def test_commands_may_be_silent_for_their_time(arm, share, state):
-    assert Clocked(arm, 0.0).state_at(share * MAX_MISSED_MESSAGES * PERIOD) == state
+@pytest.mark.parametrize(("timeouts", "state"), [(1.0, MonitorState.WATCHING), (1.0005, MonitorState.DAMPING)])
+def test_monitor_damps_after_the_command_timeout(arm, timeouts, state):
+    assert ClockedMonitor(arm, 0.0).state_at(timeouts * MAX_MISSED_MESSAGES * PERIOD) == state
 
 
 @pytest.mark.parametrize(("seconds", "state"), [(0.05, MonitorState.RESTING), (0.05002, MonitorState.IDLE)])
-def test_states_of_a_stop_last_for_their_times(arm, seconds, state):
-    clocked = Clocked(arm, -0.5)
-    assert clocked.state_at(-0.25) == MonitorState.DAMPING
-    assert clocked.state_at(-0.005) == MonitorState.DAMPING
-    assert clocked.state_at(0.0) == MonitorState.RESTING
-    assert clocked.state_at(seconds) == state
+def test_damping_and_resting_last_for_their_durations(arm, seconds, state):
+    monitor = ClockedMonitor(arm, -0.5)
+    assert monitor.state_at(-0.25) == MonitorState.DAMPING
+    assert monitor.state_at(-0.005) == MonitorState.DAMPING
+    assert monitor.state_at(0.0) == MonitorState.RESTING
+    assert monitor.state_at(seconds) == state
 
 
 @pytest.mark.parametrize(("gap", "is_due"), [(0.9895, False), (0.99, True), (1.0, True)])
 def test_check_without_a_status_is_due_after_a_period(arm, gap, is_due):
-    """The tolerance is for the rounding of a clock."""
+    """A tolerance of 1 % of a period allows for rounding of the clock."""
     bus, times = Bus(arm), [0.0]
     bus.monitor = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: times[-1])
     bus.monitor.receive()
@@ -399,76 +405,76 @@ def test_check_without_a_status_is_due_after_a_period(arm, gap, is_due):
     assert len(bus.heartbeats) == 1 + is_due
 
 
-def test_new_status_is_checked_at_once(arm):
+def test_new_status_is_checked_immediately(arm):
     bus = Bus(arm)
-    bus.go(1)
+    bus.advance(1)
     now = bus.now
     bus.monitor = SafetyMonitor(IiwaDriver(bus.lcm), arm.plant, bus.limits, clock=lambda: now)
     bus.heartbeats.clear()
-    bus.go(3)
+    bus.advance(3)
     assert len(bus.heartbeats) == 3
 
 
 @pytest.mark.parametrize(("timeout", "expected"), [((), 0.0), ((0.25,), 0.25)])
-def test_monitor_waits_for_messages_only_when_asked(arm, timeout, expected):
+def test_receive_passes_its_timeout_to_the_driver(arm, timeout, expected):
     timeouts = []
 
-    class Recording(IiwaDriver):
+    class RecordingDriver(IiwaDriver):
         def receive(self, timeout):
             timeouts.append(timeout)
 
-    monitor = SafetyMonitor(Recording(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, Recording))
+    monitor = SafetyMonitor(RecordingDriver(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, RecordingDriver))
     monitor.receive(*timeout)
     assert timeouts == [expected]
 
 
-def test_damping_is_that_of_the_arm_in_its_posture(arm):
-    bus = Bus(arm).watch()
-    bus.go(MAX_MISSED_MESSAGES)
+def test_damping_torque_has_the_mass_matrix_of_the_posture(arm):
+    bus = Bus(arm).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES)
     bus.plant.SetPositions(bus.context, bus.positions)
-    bus.go(1)
+    bus.advance(1)
     M, limits = bus.plant.CalcMassMatrix(bus.context), np.array(bus.limits.torque)
     expected = damping_torque(M, bus.velocities, bus.limits.decay_time, period=PERIOD)
     np.testing.assert_allclose(bus.commands[-1], np.clip(expected, -limits, limits), rtol=1e-5)
 
 
-def test_velocity_is_predicted_by_the_model_of_the_arm(arm):
-    bus = Bus(arm, velocity=5.0 * MOVING).watch()
-    bus.go(MAX_MISSED_MESSAGES, status=False)
+def test_velocity_is_predicted_while_statuses_are_missing(arm):
+    bus = Bus(arm, velocity=5.0 * VELOCITY).start_watching()
+    bus.advance(MAX_MISSED_MESSAGES, status=False)
     assert bus.monitor.fault == Fault.NONE
     np.testing.assert_allclose(bus.monitor._estimated.velocity, bus.velocities, atol=4e-3)
 
 
-def test_monitor_asks_the_driver_to_hold_after_a_status_fault(arm):
-    held = []
+def test_monitor_calls_hold_after_a_status_fault(arm):
+    holds = []
 
-    class Holding(IiwaDriver):
+    class HoldingDriver(IiwaDriver):
         can_hold = True
 
         def hold(self):
-            held.append(True)
+            holds.append(True)
 
     bus = Bus(arm)
-    bus.monitor = SafetyMonitor(Holding(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
-    bus.watch()
-    bus.go(2, joint_velocity_estimated=[np.nan] * 7)
+    bus.monitor = SafetyMonitor(HoldingDriver(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
+    bus.start_watching()
+    bus.advance(2, joint_velocity_estimated=[np.nan] * 7)
     assert bus.commands == []
-    bus.go(1, command=True, joint_velocity_estimated=[np.nan] * 7)
-    assert (len(held), bus.monitor.state) == (3, MonitorState.DAMPING)
-    bus.go(100)
-    bus.go(10, command=True)
+    bus.advance(1, command=True, joint_velocity_estimated=[np.nan] * 7)
+    assert (len(holds), bus.monitor.state) == (3, MonitorState.DAMPING)
+    bus.advance(100)
+    bus.advance(10, command=True)
     bus.commands.clear()
-    bus.go(MAX_MISSED_MESSAGES + 2)  # no fault of the status: damped
-    assert (len(held) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
+    bus.advance(MAX_MISSED_MESSAGES + 2)  # a missing command is no status fault, so the arm is damped
+    assert (len(holds) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
 
 
-def test_monitor_refuses_a_driver_that_is_not_usable(arm):
-    class Unusable(IiwaDriver):
+def test_monitor_raises_when_the_driver_is_not_usable(arm):
+    class UnusableDriver(IiwaDriver):
         def check_usable(self):
             raise InputError("not usable")
 
     with pytest.raises(InputError, match="not usable"):
-        SafetyMonitor(Unusable(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, Unusable))
+        SafetyMonitor(UnusableDriver(DrakeLcm("memq://")), arm.plant, safety_limits(arm.plant, UnusableDriver))
 
 
 def test_torque_tolerances_are_a_share_of_the_limits(arm):

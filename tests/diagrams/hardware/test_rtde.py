@@ -1,4 +1,4 @@
-"""Driver on Universal Robots' RTDE: the real client against a double of the robot's controller (`rtde_server`)."""
+"""Driver on Universal Robots' RTDE, with a double of the robot's controller (`rtde_server`)."""
 
 import os
 import time
@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hardware_doubles import failed_checks
 from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from rtde_server import END_FORCE_MODE, FORCE_MODE, ZERO_SENSOR, DirectClient, RtdeProcess, RtdeServer
@@ -23,11 +24,11 @@ from guiderail.tools.hardware.sim_driver import START
 
 WORKCELL = BncWorkcell()
 IMPEDANCE = Impedance().with_max_force(18.0)
-TIMEOUT = 60.0  # of the wall clock [s]
+TIMEOUT = 60.0  # longest wall-clock time to wait for messages [s]
 
 
 def wait_until(condition):
-    """Wait until messages have made a condition true."""
+    """Wait until a condition, a function without arguments, returns True."""
     end = time.monotonic() + TIMEOUT
     while not condition():
         assert time.monotonic() < end
@@ -58,17 +59,18 @@ def driver(robot, impedance):
 
 
 def model_pose(model, driver):
+    """Return the tool's pose in the base frame by the model, at the measured joint positions."""
     context = model.plant.CreateDefaultContext()
     model.plant.SetPositions(context, driver.read().positions)
     return model.tool_center.CalcPoseInWorld(context)
 
 
-def test_host_is_required():
+def test_driver_raises_without_a_host():
     with pytest.raises(InputError, match="--robot-url"):
         RtdeDriver()
 
 
-def test_missing_client_is_named(monkeypatch):
+def test_driver_names_the_extra_when_the_client_is_missing(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rtde_control", None)
     with pytest.raises(InputError, match=r"guiderail\[rtde\]"):
         RtdeDriver("192.0.2.1")
@@ -83,7 +85,7 @@ def test_configuration_sets_tool_and_payload(robot, driver, impedance):
 
 
 @pytest.mark.parametrize(("share", "is_refused"), [(0.95, False), (1.05, True), (np.nan, True)])
-def test_loaded_tool_is_refused_before_zeroing(robot, impedance, share, is_refused):
+def test_configure_refuses_to_zero_a_loaded_sensor(robot, impedance, share, is_refused):
     robot.bias = np.array([0.0, 0.0, share * rtde.MAX_ZEROED_FORCE, 0.0, 0.0, 0.0])
     driver = RtdeDriver(robot.host, client=DirectClient(robot))
     driver.read()
@@ -95,11 +97,11 @@ def test_loaded_tool_is_refused_before_zeroing(robot, impedance, share, is_refus
         np.testing.assert_array_equal(robot.bias, np.zeros(6))
 
 
-def test_status_has_the_torque_of_the_surroundings(robot, driver, model):
+def test_status_has_the_joint_torques_of_the_tool_force(robot, driver, model):
     force = np.array([3.0, -5.0, 7.0, 0.2, 0.3, -0.4])
     robot.bias = force
     robot.advance(0.01)
-    status, work = driver.read(), []
+    status, torques = driver.read(), []
     before = model_pose(model, driver)
     for joint in range(6):
         q = status.positions.copy()
@@ -107,13 +109,14 @@ def test_status_has_the_torque_of_the_surroundings(robot, driver, model):
         context = model.plant.CreateDefaultContext()
         model.plant.SetPositions(context, q)
         after = model.tool_center.CalcPoseInWorld(context)
-        turn = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
-        moved = np.concatenate([after.translation() - before.translation(), turn.angle() * turn.axis()]) / 1e-6
-        work.append(np.array([-1, -1, 1, -1, -1, 1]) * force @ moved)  # the controller's base is turned by half a turn
-    np.testing.assert_allclose(status.external_torque, work, atol=1e-4)
+        rotation = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
+        displacement = np.concatenate([after.translation() - before.translation(), rotation.angle() * rotation.axis()])
+        # Virtual work per joint displacement; the controller's base frame is rotated by half a turn about z.
+        torques.append(np.array([-1, -1, 1, -1, -1, 1]) * force @ displacement / 1e-6)
+    np.testing.assert_allclose(status.external_torque, torques, atol=1e-4)
 
 
-def test_wrench_is_that_of_the_spring_and_bounded(robot, driver, model, impedance):
+def test_commanded_wrench_equals_the_bounded_spring_force(robot, driver, model, impedance):
     actual = model_pose(model, driver)
     error = np.array([0.004, -0.003, 0.002])
     driver.write_pose(RigidTransform(actual.rotation(), actual.translation() + error), 0.0)
@@ -126,7 +129,7 @@ def test_wrench_is_that_of_the_spring_and_bounded(robot, driver, model, impedanc
     assert (np.abs(robot.wrench) <= impedance.max_wrench + 1e-12).all()
 
 
-def test_sensor_is_not_zeroed_again_by_a_resume_in_contact(robot, driver, model, impedance):
+def test_sensor_is_not_zeroed_when_resuming_in_contact(robot, driver, model, impedance):
     robot.plane = robot.pose()[2] - 0.001
     below = RigidTransform([0.0, 0.0, -0.05]) @ model_pose(model, driver)
     for _ in range(2):
@@ -142,10 +145,10 @@ def test_sensor_is_not_zeroed_again_by_a_resume_in_contact(robot, driver, model,
     assert robot.commands.count(ZERO_SENSOR) == 1
 
 
-@pytest.mark.parametrize(("share", "is_alive"), [(0.9, True), (1.2, False)])
-def test_program_ends_when_commands_stop(robot, driver, model, share, is_alive):
+@pytest.mark.parametrize(("timeouts", "is_alive"), [(0.9, True), (1.2, False)])
+def test_program_ends_after_the_watchdog_timeout(robot, driver, model, timeouts, is_alive):
     driver.write_pose(model_pose(model, driver), 0.0)
-    robot.advance(share / rtde.WATCHDOG_FREQUENCY)
+    robot.advance(timeouts / rtde.WATCHDOG_FREQUENCY)
     assert robot.is_running == is_alive
     if not is_alive:
         assert not driver.read().is_readable
@@ -153,7 +156,7 @@ def test_program_ends_when_commands_stop(robot, driver, model, share, is_alive):
         assert driver.read().is_readable
 
 
-def test_robot_is_kept_alive_while_it_holds(robot, driver, model):
+def test_watchdog_is_reset_by_reads_while_the_robot_holds(robot, driver, model):
     driver.write_pose(model_pose(model, driver), 0.0)
     driver.stop()
     driver.stop()
@@ -177,7 +180,7 @@ def fail():
 
 
 @pytest.mark.parametrize("stop", [refuse, fail])
-def test_watchdog_ends_a_program_that_does_not_stop(robot, driver, model, monkeypatch, stop):
+def test_watchdog_ends_the_program_when_stopping_fails(robot, driver, model, monkeypatch, stop):
     driver.write_pose(model_pose(model, driver), 0.0)
     with monkeypatch.context() as patch:
         patch.setattr(driver._control, "forceModeStop", stop, raising=False)
@@ -199,7 +202,7 @@ def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
     robot.safety_bits = 1 + 4
     assert not driver.read().is_readable
     assert driver.error == "protective stop"
-    assert [check.name for check in driver.check_setup() if check.passed not in (True, None)] == ["state"]
+    assert failed_checks(driver.check_setup()) == ["state"]
     driver.recover()
     assert driver.read().is_readable
     robot.safety_bits = 128
@@ -208,7 +211,7 @@ def test_protective_stop_is_a_fault_until_recovery(robot, driver, monkeypatch):
         driver.recover()
 
 
-def test_recovery_that_the_robot_does_not_answer_is_refused(robot, driver, monkeypatch):
+def test_recover_raises_when_the_robot_does_not_answer(robot, driver, monkeypatch):
     robot.safety_bits = 1 + 4
     monkeypatch.setattr(driver._client, "DashboardClient", lambda url: SimpleNamespace(connect=fail), raising=False)
     with pytest.raises(InputError, match="cannot recover: connection lost"):
@@ -217,11 +220,10 @@ def test_recovery_that_the_robot_does_not_answer_is_refused(robot, driver, monke
 
 
 @pytest.mark.parametrize(("share", "is_refused"), [(0.9, False), (1.1, True), (np.nan, True)])
-def test_other_kinematics_are_refused(robot, driver, model, share, is_refused):
+def test_write_pose_raises_when_the_kinematics_differ(robot, driver, model, share, is_refused):
     robot.calibration = np.array([0.0, share * rtde.MAX_POSE_DIFFERENCE, 0.0])
     driver.read()
-    failed = [check.name for check in driver.check_setup() if check.passed not in (True, None)]
-    assert failed == ["kinematics"] * is_refused
+    assert failed_checks(driver.check_setup()) == ["kinematics"] * is_refused
     if is_refused:
         with pytest.raises(InputError, match="another robot, or another tool"):
             driver.write_pose(model_pose(model, driver), 0.0)
@@ -230,19 +232,19 @@ def test_other_kinematics_are_refused(robot, driver, model, share, is_refused):
         driver.write_pose(model_pose(model, driver), 0.0)
 
 
-def test_pose_before_configuration_is_refused():
+def test_write_pose_raises_before_the_configuration():
     with pytest.raises(InputError, match="configured"):
         RtdeDriver("192.0.2.1", client=SimpleNamespace()).write_pose(RigidTransform(), 0.0)
 
 
-def test_use_before_the_first_status_is_refused(impedance):
+def test_methods_raise_before_the_first_status(impedance):
     driver = RtdeDriver("192.0.2.1", client=SimpleNamespace())
-    for use in (lambda: driver.configure(impedance), driver.check_setup, driver.recover):
+    for call in (lambda: driver.configure(impedance), driver.check_setup, driver.recover):
         with pytest.raises(InputError, match="the driver rtde is used before it has read a status"):
-            use()
+            call()
 
 
-def test_check_names_a_stop_from_before_the_first_status(robot, monkeypatch):
+def test_check_names_a_stop_that_exists_at_the_connection(robot, monkeypatch):
     driver = RtdeDriver(robot.host, client=DirectClient(robot))
     monkeypatch.setattr(RtdeDriver, "error", "protective stop")
     assert not driver.read().is_readable
@@ -259,29 +261,29 @@ def test_station_presses_with_the_bounded_force_and_stops(robot):
     height = robot.pose()[2]
     robot.plane = height - 0.003
 
-    def go(seconds):
+    def advance(seconds):
         for step in range(round(seconds / station.period)):
-            robot.advance(0.006 if step % 2 else 0.004)  # the robot's cycle is 2 ms, the station's period 5 ms
+            robot.advance(0.006 if step % 2 else 0.004)  # 2 ms cycles of the robot, on average 5 ms per station step
             station.receive(context)
             simulator.AdvanceTo(context.get_time() + station.period)
 
     def state():
         return ArmState(int(station.get_arm_state_output_port().Eval(context)[0]))
 
-    go(0.8)
+    advance(0.8)
     assert state() == ArmState.RUNNING
     assert abs(robot.pose()[2] - height) < 5e-4
     station.get_desired_pose_input_port().FixValue(context, START - [0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
-    go(0.4)
+    advance(0.4)
     assert state() == ArmState.RUNNING, Fault(int(station.get_fault_output_port().Eval(context)[0])).description
     force = station.get_wrench_output_port().Eval(context)[2]
     assert force == pytest.approx(IMPEDANCE.limits[2], rel=0.05)
     robot.safety_bits = 1 + 4
-    go(0.02)
+    advance(0.02)
     assert state() == ArmState.DAMPING
 
 
-def test_lost_connection_is_a_fault(robot, driver):
+def test_lost_connection_is_a_fault_until_a_restart(robot, driver):
     driver._client.is_connected = False
     assert not driver.read().is_readable
     driver._client.is_connected = True
@@ -290,7 +292,7 @@ def test_lost_connection_is_a_fault(robot, driver):
         driver.recover()
 
 
-def test_real_client_has_the_protocol_of_the_double(model, impedance, forkserver):
+def test_driver_with_the_real_client_controls_the_double(model, impedance, forkserver):
     pytest.importorskip("rtde_control", reason="ur-rtde has no wheel for this Python")
     host = f"127.42.{os.getpid() // 250 % 250}.{os.getpid() % 250 + 1}"
     robot = RtdeProcess(host, model.solve(START, model.posture))
@@ -301,8 +303,8 @@ def test_real_client_has_the_protocol_of_the_double(model, impedance, forkserver
     np.testing.assert_allclose(robot.payload[:4], [impedance.mass, *impedance.center_of_mass], atol=1e-9)
     robot.bias = np.array([0.0, 0.0, 4.0, 0.0, 0.0, 0.0])
     robot.advance(0.01)
-    end = robot.time
-    wait_until(lambda: driver.read().time == end)
+    time_of_force = robot.time
+    wait_until(lambda: driver.read().time == time_of_force)
     assert driver.read().external_torque @ driver.read().external_torque > 1.0
     np.testing.assert_allclose(driver.read().positions, robot.positions)
     X = RigidTransform([0.0, 0.0, 0.005]) @ model_pose(model, driver)
