@@ -1,4 +1,4 @@
-"""Executor of a skill and its robot, with both sides of the bus in one process."""
+"""Executor of a skill with a simulated robot, both in one process."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ OPTIONS = {"station": "hardware", "guidance": "kmp", "fixture_offset": "none"}
 
 @pytest.fixture
 def make_executor(monkeypatch):
-    """Return a function from a start pose and a policy to an executor and its robot's clock."""
+    """Return a function that builds an executor, with the clock that steps its simulated robot."""
 
     def make_executor(
         start=START,
@@ -27,7 +27,7 @@ def make_executor(monkeypatch):
     ):
         lcm = DrakeLcm("memq://")
         with monkeypatch.context() as patch:
-            # The skill's station opens its bus by URL, and each bus in memory is another one.
+            # The skill's station would open another bus in memory by its URL.
             patch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS, **options)
         task = EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()

@@ -1,4 +1,4 @@
-"""The simulated driver imports the modules of the run."""
+"""Connection to a simulated driver: options, addresses, imported modules, and the end of its process."""
 
 import os
 import signal
@@ -34,21 +34,21 @@ from guiderail.tools.hardware.connection import (
 from guiderail.tools.hardware.executor import recordings_folder
 from guiderail.tools.hardware.preflight import start_simulator
 
-MINE = """
+USER_MODULE = """
 from guiderail.diagrams.tasks.bnc_connector.task import BncConnector
 from guiderail.diagrams.tasks.registry import register_task
 
 
-@register_task("mine/Connector")
-class Mine(BncConnector):
+@register_task("user/Connector")
+class UserConnector(BncConnector):
     pass
 """
 
 
-def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
-    file, codes, served = tmp_path / "mine.py", [], []
-    TASKS.get("BncConnector")  # loaded before the registry's entries are copied below
-    file.write_text(MINE)
+def test_sim_driver_and_monitor_import_the_modules_of_the_run(tmp_path, monkeypatch):
+    file, codes, tasks = tmp_path / "user_module.py", [], []
+    TASKS.get("BncConnector")  # registers the package's tasks before their entries are copied below
+    file.write_text(USER_MODULE)
 
     @contextmanager
     def subprocess_tied_to_parent(code):
@@ -56,7 +56,7 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
         yield
 
     def run_sim_driver(url, seconds, command_timeout, task, **options):
-        served.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
+        tasks.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
         return True
 
     def run_safety_monitor(url, robot, task, rate, log):
@@ -65,26 +65,26 @@ def test_sim_driver_imports_what_the_run_imports(tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.tools.hardware.connection.subprocess_tied_to_parent", subprocess_tied_to_parent)
     monkeypatch.setattr("guiderail.tools.hardware.sim_driver.run_sim_driver", run_sim_driver)
     monkeypatch.setattr("guiderail.tools.hardware.sim_driver.run_safety_monitor", run_safety_monitor)
-    with RobotConnection(sim=True).simulated_driver("mine/Connector", "memq://", [str(file)]):
+    with RobotConnection(sim=True).simulated_driver("user/Connector", "memq://", [str(file)]):
         pass
     try:
         for command in (["sim-driver"], ["safety-monitor"], None):
             monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries})
             monkeypatch.setattr("guiderail.tools.imports._IMPORTED_FILES", {})
-            TASKS._entries.pop("mine/Connector", None)  # as in another process
+            TASKS._entries.pop("user/Connector", None)  # the module is not imported yet, as in a new process
             if command is None:
                 exec(codes[0], {})
                 continue
             with pytest.raises(SystemExit) as end:
-                main([*command, "--task", "mine/Connector", "--import", str(file)])
+                main([*command, "--task", "user/Connector", "--import", str(file)])
             assert end.value.code == 0
     finally:
-        gymnasium.registry.pop(environment_id("mine/Connector"), None)
-        TASKS._entries.pop("mine/Connector", None)
-    assert served == ["Mine", "Mine", "Mine"]
+        gymnasium.registry.pop(environment_id("user/Connector"), None)
+        TASKS._entries.pop("user/Connector", None)
+    assert tasks == ["UserConnector"] * 3
 
 
-def test_simulated_franka_is_in_lockstep():
+def test_driver_selects_robot_and_lockstep():
     assert RobotConnection(sim=True, robot="panda", driver="fci").synchronous
     expected = {"fci": "panda", "rtde": "ur5e", "iiwa14": "iiwa14", "": "iiwa14"}
     assert {driver: RobotConnection(driver=driver, robot_url="192.0.2.1").robot for driver in expected} == expected
@@ -93,7 +93,7 @@ def test_simulated_franka_is_in_lockstep():
 
 
 @pytest.mark.parametrize(
-    ("options", "words"),
+    ("options", "message"),
     [
         ({"driver": "fci", "scenario": Path("connector.scenario.yaml")}, "has only the task's surroundings"),
         ({"driver": "fci", "joint_friction": -0.1}, "joint_friction must be at least 0 and finite, not -0.1"),
@@ -101,8 +101,8 @@ def test_simulated_franka_is_in_lockstep():
         ({"rate": "0.2"}, "the rate .* is from 0.001 to 1, not '0.2'"),
     ],
 )
-def test_connection_refuses_what_the_simulated_driver_would_refuse(options, words):
-    with pytest.raises(InputError, match=words):
+def test_connection_raises_when_simulation_options_are_invalid(options, message):
+    with pytest.raises(InputError, match=message):
         RobotConnection(sim=True, **options)
 
 
@@ -125,7 +125,7 @@ def test_clock_raises_when_the_simulated_driver_has_ended():
             clock.advance(Simulator(ConstantVectorSource([0.0])), SimpleNamespace(), 1)
 
 
-def test_simulated_driver_that_ends_before_its_first_status_is_not_waited_for():
+def test_start_raises_when_the_driver_ends_before_a_status():
     station = HardwareStation(BncWorkcell(), IiwaDriver("memq://"), robot_timeout=60.0)
     clock, start = WallClock(station.driver), time.monotonic()
     with subprocess_tied_to_parent("raise SystemExit(3)") as process:
@@ -135,7 +135,7 @@ def test_simulated_driver_that_ends_before_its_first_status_is_not_waited_for():
     assert time.monotonic() - start < 30.0
 
 
-def test_unusable_surroundings_are_refused_before_the_driver_starts(tmp_path, monkeypatch):
+def test_invalid_scenario_is_refused_before_the_driver_starts(tmp_path, monkeypatch):
     monkeypatch.setattr("guiderail.tools.hardware.connection.subprocess_tied_to_parent", None)
     file = tmp_path / "a.yaml"
     text = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only}}\n"
@@ -145,50 +145,49 @@ def test_unusable_surroundings_are_refused_before_the_driver_starts(tmp_path, mo
         pass
 
 
-def test_processes_have_different_addresses():
-    numbers = [*range(1, 2000), 2**22 - 255, 2**22 - 1, 2**22]
-    addresses = {_loopback_address(pid) for pid in numbers}
-    assert len(addresses) == len(numbers)
+def test_loopback_addresses_of_processes_differ():
+    pids = [*range(1, 2000), 2**22 - 255, 2**22 - 1, 2**22]  # Linux's largest process number is 2**22
+    addresses = {_loopback_address(pid) for pid in pids}
+    assert len(addresses) == len(pids)
     assert all(ip_address(address).is_loopback for address in addresses)
 
 
-SLEEPS = """
+# Code of a parent process: `context` starts a child that sleeps, or a simulated driver.
+SLEEPING_CHILD = """
 from guiderail.tools.hardware.connection import subprocess_tied_to_parent
 
-started = subprocess_tied_to_parent("import time; time.sleep(60)")
+context = subprocess_tied_to_parent("import time; time.sleep(60)")
 """
 
-
-SERVES = """
+SIMULATED_DRIVER = """
 from guiderail.tools.hardware.connection import RobotConnection
 
-started = RobotConnection(sim=True, synchronous=True).simulated_driver("BncConnector", "memq://")
+context = RobotConnection(sim=True, synchronous=True).simulated_driver("BncConnector", "memq://")
 """
 
-
-WAITS = """
-with started:
+WAIT_FOR_INPUT = """
+with context:
     print("started", flush=True)
     input()
 """
 
 
 @pytest.mark.parametrize(
-    ("starts", "ends"),
-    [(SLEEPS, signal.SIGTERM), (SLEEPS, signal.SIGINT), (SERVES, signal.SIGKILL)],
+    ("code", "end_signal"),
+    [(SLEEPING_CHILD, signal.SIGTERM), (SLEEPING_CHILD, signal.SIGINT), (SIMULATED_DRIVER, signal.SIGKILL)],
     ids=["terminated", "interrupted", "killed"],
 )
-def test_child_exits_when_its_parent_ends(starts, ends):
-    with subprocess.Popen(
-        [sys.executable, "-c", starts + WAITS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as parent:
+def test_child_exits_when_the_parent_ends(code, end_signal):
+    command = [sys.executable, "-c", code + WAIT_FOR_INPUT]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    with subprocess.Popen(command, **pipes) as parent:
         assert parent.stdout.readline() == b"started\n"
-        parent.send_signal(ends)
-        # Both processes write there, so it is closed when neither is left.
+        parent.send_signal(end_signal)
+        # Parent and child have the same standard output, which is closed when both have ended.
         assert parent.communicate(timeout=50)[0] == b""
 
 
-def test_pipe_to_the_child_is_closed():
+def test_child_is_ended_and_its_pipe_closed_after_the_block():
     with subprocess_tied_to_parent("import time; time.sleep(60)") as process:
         assert process.poll() is None
     assert process.poll() is not None

@@ -1,7 +1,8 @@
-"""Drivers that fail while a skill is executed: the arm rests, and the outcome names the exception."""
+"""Drivers that fail while a skill is executed: the arm is brought to rest, and the outcome names the exception."""
 
 import numpy as np
 import pytest
+from hardware_doubles import max_joint_speed, unplugged
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.joint_status import Fault, JointStatus
@@ -9,20 +10,11 @@ from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.hardware import preflight
 
 
-def unplugged(*arguments):
-    raise OSError("cable unplugged")
-
-
 def scalar_status():
     return JointStatus(1.0, 0.0, 0.0, 0.0)
 
 
-def speed_of(clock):
-    context = clock.simulator.get_context()
-    return np.abs(clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(context))).max()
-
-
-@pytest.mark.parametrize("step", [200, 370])  # in the approach, in the skill
+@pytest.mark.parametrize("step", [200, 370])  # during the approach, and during the skill
 @pytest.mark.parametrize(
     ("method", "replacement", "fault", "reason"),
     [
@@ -39,31 +31,30 @@ def test_arm_rests_when_the_driver_fails(make_executor, step, method, replacemen
     assert (outcome.fault, outcome.exit_code) == (fault, 1)
     assert reason in outcome.description
     assert (outcome.steps > 0) == (step == 370)
-    assert speed_of(clock) < 0.02
-    assert clock.step >= step + 60  # the station damps until the arm is at rest
+    assert max_joint_speed(clock) < 0.02
+    assert clock.step >= step + 60  # the station continues until the arm is at rest
 
 
 @pytest.mark.parametrize("method", ["read", "receive"])
 def test_arm_rests_when_driver_and_policy_fail(make_executor, method):
-    """The station takes control back from the failed skill without waiting for the driver."""
-    executor, clock = make_executor(policy=lambda observation: executor.driver_fails())
-    driver, requests = executor._station.driver, []
+    """After the skill has failed, the executor's station takes over without waiting for the driver."""
+    requests = []
 
-    def driver_fails():
+    def act(observation):
         requests.append(clock.step)
         if len(requests) < 3:
             return np.zeros(2)
-        setattr(driver, method, unplugged if method == "receive" else lambda: None)
+        setattr(executor._station.driver, method, unplugged if method == "receive" else lambda: None)
         return np.full(2, np.nan)
 
-    executor.driver_fails = driver_fails
+    executor, clock = make_executor(policy=act)
     with pytest.raises(PolicyError):
         executor.run(print)
     assert clock.step >= requests[-1] + 60
-    assert speed_of(clock) < 0.02
+    assert max_joint_speed(clock) < 0.02
 
 
-def test_skill_takes_over_when_the_driver_fails(make_executor, monkeypatch):
+def test_skill_ends_when_the_driver_fails_at_its_start(make_executor, monkeypatch):
     executor, clock = make_executor()
     driver, execute = executor._station.driver, executor._execute
 
@@ -74,15 +65,15 @@ def test_skill_takes_over_when_the_driver_fails(make_executor, monkeypatch):
     monkeypatch.setattr(executor, "_execute", execute_without_statuses)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.NO_STATUS, 1, 1)
-    assert speed_of(clock) < 0.02
+    assert max_joint_speed(clock) < 0.02
 
 
-def test_failed_commands_are_reported_and_tried_again(make_executor):
+def test_failed_commands_are_reported_and_retried(make_executor):
     executor, clock = make_executor()
-    driver, tries = executor._station.driver, []
+    driver, attempts = executor._station.driver, []
 
     def write(torque, time):
-        tries.append(clock.step)
+        attempts.append(clock.step)
         unplugged()
 
     clock.happens[200] = lambda: setattr(driver, "write", write)
@@ -92,17 +83,17 @@ def test_failed_commands_are_reported_and_tried_again(make_executor):
         "a command could not be sent to the robot (write raised OSError: cable unplug"
     )
     assert "commands that bring the arm to rest could not be sent" in outcome.description
-    assert len(tries) > 100
+    assert len(attempts) > 100
 
 
 @pytest.mark.parametrize("failures", [1, 60])
-def test_completed_skill_is_a_failure_when_it_cannot_be_stopped(make_executor, monkeypatch, failures):
+def test_completed_skill_fails_when_the_arm_cannot_be_stopped(make_executor, monkeypatch, failures):
     executor, clock = make_executor()
-    driver, rest, tries = executor._station.driver, executor._rest, []
+    driver, rest, attempts = executor._station.driver, executor._rest, []
 
     def write(torque, time):
-        tries.append(time)
-        if len(tries) == failures:
+        attempts.append(time)
+        if len(attempts) == failures:
             del driver.write
         unplugged()
 
@@ -113,12 +104,12 @@ def test_completed_skill_is_a_failure_when_it_cannot_be_stopped(make_executor, m
     monkeypatch.setattr(executor, "_rest", rest_without_commands)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.COMMAND_FAILED, 1, 20)
-    number = f"{failures} commands that bring the arm to rest could not be sent: write raised OSError: cable unplugged"
-    assert outcome.description == f"executed to its end; {number}"
-    assert speed_of(clock) < 0.01
+    failure = f"{failures} commands that bring the arm to rest could not be sent: write raised OSError: cable unplugged"
+    assert outcome.description == f"executed to its end; {failure}"
+    assert max_joint_speed(clock) < 0.01
 
 
-def test_exception_is_not_hidden_when_commands_fail(make_executor):
+def test_first_exception_is_raised_when_commands_fail_as_well(make_executor):
     executor, clock = make_executor()
     messages = []
 
@@ -142,7 +133,7 @@ def test_exception_is_not_hidden_when_commands_fail(make_executor):
         ("check_setup", unplugged, "the driver iiwa failed: check_setup raised OSError: cable unplugged"),
     ],
 )
-def test_checks_refuse_a_driver_that_fails(make_executor, method, replacement, message):
+def test_checks_raise_when_the_driver_fails(make_executor, method, replacement, message):
     executor, _ = make_executor()
     driver, commands = executor._station.driver, []
     driver.write = lambda *command: commands.append(command)
@@ -152,7 +143,7 @@ def test_checks_refuse_a_driver_that_fails(make_executor, method, replacement, m
     assert commands == []
 
 
-def test_checks_refuse_statuses_that_become_malformed(make_executor, monkeypatch):
+def test_checks_raise_when_statuses_become_malformed(make_executor, monkeypatch):
     executor, clock = make_executor()
     driver, advance = executor._station.driver, clock.advance
 

@@ -1,4 +1,4 @@
-"""Execution of a policy, with both sides of the bus in one process, independent of the wall clock."""
+"""Execution of a skill on a simulated robot in the same process, independent of the wall clock."""
 
 import json
 from contextlib import contextmanager
@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from drake import lcmt_iiwa_command
+from hardware_doubles import failed_checks, max_joint_speed
 from injections.stepped_robot import SteppedRobotClock
 from pydrake.lcm import DrakeLcm
 
@@ -27,20 +28,17 @@ from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
 
 
-def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path):
+def test_executor_approaches_executes_rests_and_records(make_executor, tmp_path):
     executor, clock = make_executor(START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
     checks = executor.preflight.run()
-    assert all(check.passed in (True, None) for check in checks)
+    assert failed_checks(checks) == []
     assert checks[0].description.startswith("iiwa14, 7 joints")
     messages = []
     outcome = executor.run(messages.append)
     assert (outcome.description, outcome.steps, outcome.exit_code) == ("executed to its end", 20, 0)
-    begin = executor._start
-    np.testing.assert_allclose(executor.trace.measured[0][:3], begin[:3], atol=3e-3)
+    np.testing.assert_allclose(executor.trace.measured[0][:3], executor._start[:3], atol=3e-3)
     assert (executor.trace.signals["arm_state"] == 2).all()
-    context = clock.simulator.get_context()
-    velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(context))
-    assert np.abs(velocities).max() < 0.01
+    assert max_joint_speed(clock) < 0.01
     metadata = {"outcome": outcome.description, "statuses": {"99 %": np.nan, "longest": np.inf}}
     path = executor.write(tmp_path, metadata)[0]
     step_log = pd.read_parquet(path)
@@ -51,7 +49,7 @@ def test_executor_approaches_executes_records_and_rests(make_executor, tmp_path)
 
 
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
-    lcm, requests, imported, messages = DrakeLcm("memq://"), [], [], []
+    lcm, requests, imported_modules, messages = DrakeLcm("memq://"), [], [], []
     task = EnvConfig.resolve("BncConnector", {}).make_task()
     clock = SteppedRobotClock(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
@@ -61,7 +59,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
 
     @contextmanager
     def simulated_driver(connection, task, url, imports):
-        imported.extend(imports)
+        imported_modules.extend(imports)
         yield
 
     monkeypatch.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
@@ -73,7 +71,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     monkeypatch.setattr(RobotConnection, "timing", lambda connection, station, clock: {})
     options = {"guidance": "kmp", "fixture_offset": "none"}
     RunFolder(tmp_path).write_config(configure("BncConnector", options, imports=["json"], episodes=1))
-    existing = tmp_path / "hardware" / "episode-000004.json"  # the only one left of five recordings
+    existing = tmp_path / "hardware" / "episode-000004.json"  # the remaining file of five recordings
     existing.parent.mkdir()
     existing.write_text("{}")
     with pytest.raises(PolicyError):
@@ -82,7 +80,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     assert float(force.partition(", ")[2].split(" N")[0]) <= 12.0
     with pytest.raises(InputError, match="force limit of 35 N: give a lower one"):
         executing.deploy(tmp_path, RobotConnection(), assume_yes=True, force_limit=36.0)
-    assert imported == ["json"]
+    assert imported_modules == ["json"]
     assert existing.read_text() == "{}"
     metadata = json.loads((tmp_path / "hardware" / "episode-000005.json").read_text())
     step_log = pd.read_parquet(tmp_path / "hardware" / "episode-000005.parquet")
@@ -90,7 +88,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     assert metadata["steps"] == len(step_log) > 0
 
 
-def test_recording_is_in_another_folder_when_its_own_is_full(make_executor, monkeypatch, tmp_path):
+def test_recording_is_in_a_temporary_folder_when_out_is_full(make_executor, monkeypatch, tmp_path):
     executor, _ = make_executor()
     executor.run(print)
     write, messages = executing.write_step_log, []
@@ -110,24 +108,29 @@ def test_recording_is_in_another_folder_when_its_own_is_full(make_executor, monk
     assert messages[-1].endswith(f"cannot be written, so the record is in {file}")
 
 
-@pytest.mark.parametrize("valid", [0, 2])  # valid actions; the first call is the warm-up
-def test_arm_rests_when_the_policy_returns_no_action(make_executor, valid):
+def record_torques(executor):
+    """Return a list to which the torques of every command are added."""
+    torques = []
+    executor._station.driver.lcm.Subscribe(
+        "IIWA_COMMAND", lambda message: torques.append(lcmt_iiwa_command.decode(message).joint_torque)
+    )
+    return torques
+
+
+@pytest.mark.parametrize("num_valid", [0, 2])  # number of valid actions; the first call is the warm-up
+def test_arm_rests_when_the_policy_returns_nan(make_executor, num_valid):
     requests = []
 
     def policy(observation):
         requests.append(observation)
-        return np.full(2, 0.0 if len(requests) <= valid else np.nan)
+        return np.full(2, 0.0 if len(requests) <= num_valid else np.nan)
 
     executor, clock = make_executor(policy=policy)
-    commands = []
-    executor._station.driver.lcm.Subscribe(
-        "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
-    )
+    torques = record_torques(executor)
     with pytest.raises(PolicyError):
         executor.run(print)
-    assert commands[-1:] == ([(0.0,) * 7] if valid else [])
-    velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
-    assert np.abs(velocities).max() < 0.01
+    assert torques[-1:] == ([(0.0,) * 7] if num_valid else [])
+    assert max_joint_speed(clock) < 0.01
 
 
 def test_arm_rests_when_a_step_of_the_approach_raises(make_executor):
@@ -136,41 +139,36 @@ def test_arm_rests_when_a_step_of_the_approach_raises(make_executor):
 
     executor, clock = make_executor()
     clock.happens[200] = lambda: executor._simulator.set_monitor(interrupt)
-    commands = []
-    executor._station.driver.lcm.Subscribe(
-        "IIWA_COMMAND", lambda message: commands.append(lcmt_iiwa_command.decode(message).joint_torque)
-    )
+    torques = record_torques(executor)
     with pytest.raises(KeyboardInterrupt):
         executor.run(print)
     assert len(executor.trace) == 0
-    assert commands[-1] == (0.0,) * 7
-    velocities = clock.robot.plant.GetVelocities(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
-    assert np.abs(velocities).max() < 0.01
+    assert torques[-1] == (0.0,) * 7
+    assert max_joint_speed(clock) < 0.01
 
 
-def test_single_wrong_status_at_the_take_over_moves_nothing(make_executor, monkeypatch):
+def test_arm_rests_when_one_status_at_the_take_over_is_wrong(make_executor, monkeypatch):
     executor, clock = make_executor()
-    places, receive, turn = [], clock.receive, np.array([0.15, 0, 0, 0, 0, 0, 0])
+    positions, receive, error = [], clock.receive, np.array([0.15, 0, 0, 0, 0, 0, 0])  # error of the status [rad]
 
     def start_simulator(station, *arguments):
         with monkeypatch.context() as patch:
             status = station.driver.read()
-            patch.setattr(station.driver, "read", lambda: replace(status, positions=status.positions + turn))
+            patch.setattr(station.driver, "read", lambda: replace(status, positions=status.positions + error))
             return preflight.start_simulator(station, *arguments)
 
-    def watch():
-        places.append(
-            clock.robot.plant.GetPositions(clock.robot.plant.GetMyContextFromRoot(clock.simulator.get_context()))
-        )
+    def record_and_receive():
+        plant = clock.robot.plant
+        positions.append(plant.GetPositions(plant.GetMyContextFromRoot(clock.simulator.get_context())))
         receive()
 
     monkeypatch.setattr(executing, "start_simulator", start_simulator)
-    monkeypatch.setattr(clock, "receive", watch)
+    monkeypatch.setattr(clock, "receive", record_and_receive)
     assert executor.run(print).exit_code == 0
-    assert np.abs(np.array(places)[:, 0] - places[0][0]).max() < 0.1 * turn[0]
+    assert np.abs(np.array(positions)[:, 0] - positions[0][0]).max() < 0.1 * error[0]
 
 
-def test_approach_has_the_bound_of_the_skill(make_executor):
+def test_approach_has_the_force_limit_of_the_skill(make_executor):
     executor, clock = make_executor(force_limit_range=(8.0, 25.0))
     executor.preflight.repeat()
 
@@ -193,7 +191,7 @@ def test_execution_ends_when_statuses_stop(make_executor):
     assert (outcome.fault, outcome.exit_code) == (Fault.STALE, 1)
 
 
-def test_arm_is_not_waited_for_when_its_simulation_has_ended(make_executor):
+def test_executor_does_not_wait_when_the_simulation_has_ended(make_executor):
     def end():
         clock.is_silent = True
         clock.happens = dict.fromkeys(range(clock.step, clock.step + 1000), end)
@@ -206,7 +204,7 @@ def test_arm_is_not_waited_for_when_its_simulation_has_ended(make_executor):
     assert clock.step < 210
 
 
-def test_silent_driver_is_not_reported_as_a_missing_monitor(make_executor):
+def test_checks_name_the_statuses_when_the_driver_is_silent(make_executor):
     executor, clock = make_executor()
     clock.is_silent = True
     with pytest.raises(InputError, match="statuses stopped arriving on LCM"):
@@ -214,24 +212,24 @@ def test_silent_driver_is_not_reported_as_a_missing_monitor(make_executor):
 
 
 def test_execution_ends_when_the_operator_stops(make_executor):
-    pressed = []
-    executor, clock = make_executor(is_stop_requested=lambda: bool(pressed))
-    clock.happens[200] = lambda: pressed.append(1)
+    stops = []
+    executor, clock = make_executor(is_stop_requested=lambda: bool(stops))
+    clock.happens[200] = lambda: stops.append(True)
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code, outcome.steps) == (Fault.USER_STOP, 1, 0)
 
 
 @pytest.mark.parametrize("num_steps", [1, 5])
 def test_outcome_counts_the_step_in_which_the_operator_stops(make_executor, tmp_path, num_steps):
-    """The recording, its metadata and the message have the same number of control steps."""
-    messages, executors = [], []
+    """Recording, metadata and message have the same number of control steps."""
+    messages, executor = [], None
 
     def is_stop_requested():
-        # The trace is one step behind while a step is executed.
-        return any(one._simulator.get_system() is one._diagram and len(one.trace) >= num_steps - 1 for one in executors)
+        # While a step is executed, the trace does not contain this step.
+        is_skill = executor is not None and executor._simulator.get_system() is executor._diagram
+        return is_skill and len(executor.trace) >= num_steps - 1
 
     executor, _ = make_executor(is_stop_requested=is_stop_requested)
-    executors.append(executor)
     outcome = executor.run(messages.append)
     assert (outcome.fault, outcome.steps, len(executor.trace)) == (Fault.USER_STOP, num_steps, num_steps)
     executor.save(tmp_path, outcome, {}, messages.append)
@@ -241,8 +239,8 @@ def test_outcome_counts_the_step_in_which_the_operator_stops(make_executor, tmp_
     assert f"after {num_steps} control steps" in messages[-1]
 
 
-def test_execution_ends_when_the_force_exceeds_the_tasks(make_executor):
-    """The limit is below the force of the impedance during the approach."""
+def test_execution_ends_above_the_force_limit_of_the_task(make_executor):
+    """The limit of 0.01 N is below the force of the impedance during the approach."""
     executor, _ = make_executor()
     executor._task.collision = type(executor._task.collision)("contact_force", 0.01)
     outcome = executor.run(print)
@@ -252,21 +250,20 @@ def test_execution_ends_when_the_force_exceeds_the_tasks(make_executor):
 
 def test_start_check_fails_when_the_arm_is_far_away(make_executor):
     executor, _ = make_executor(START + [0.0, 0.0, 0.16, 0.0, 0.0, 0.0])
-    (failed,) = [check for check in executor.preflight.run() if check.passed not in (True, None)]
-    assert failed.name == "start"
+    assert failed_checks(executor.preflight.run()) == ["start"]
 
 
-def test_hardware_environment_drops_options_of_the_training(monkeypatch):
+def test_hardware_environment_drops_simulation_options(monkeypatch):
     with pytest.raises(InputError, match="is a simulation"):
         executing.hardware_environment("BncConnector", {}, "gantry")
     environment = EnvConfig.resolve("BncConnector", {"station": "arm", "robot": "panda"}).options
     assert "end_effector" not in executing.hardware_environment("BncConnector", environment, "hardware")
 
 
-@pytest.mark.parametrize(("reward", "replaced"), [("aligned", "sparse"), ("shaped", "shaped")])
-def test_hardware_environment_replaces_a_reward_of_simulation(reward, replaced):
+@pytest.mark.parametrize(("reward", "on_hardware"), [("aligned", "sparse"), ("shaped", "shaped")])
+def test_hardware_environment_replaces_a_privileged_reward(reward, on_hardware):
     environment = EnvConfig.resolve("BncConnector", {"station": "arm", "reward": reward}).options
-    assert executing.hardware_environment("BncConnector", environment, "hardware")["reward"] == replaced
+    assert executing.hardware_environment("BncConnector", environment, "hardware")["reward"] == on_hardware
 
 
 def test_deploy_exits_with_2_when_there_is_no_run(capsys, tmp_path):
@@ -298,11 +295,11 @@ def test_confirm_checks_raises_when_a_check_fails():
     assert messages == ["NOT   load        9 N"]
 
 
-def test_confirm_checks_repeats_them_after_the_question(make_executor, monkeypatch):
+def test_confirm_checks_repeats_the_checks_after_the_question(make_executor, monkeypatch):
     executor, clock = make_executor()
-    aside = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
+    displaced = START + [0.16, 0.0, 0.05, 0.0, 0.0, 0.0]
     monkeypatch.setattr(
-        preflight, "confirm", lambda question: clock.robot.set_pose(clock.simulator.get_mutable_context(), aside)
+        preflight, "confirm", lambda question: clock.robot.set_pose(clock.simulator.get_mutable_context(), displaced)
     )
     with pytest.raises(InputError, match="stays where it is: start"):
         preflight.confirm_checks(executor.preflight, print, assume_yes=False)
@@ -315,7 +312,7 @@ def test_force_check_shows_the_largest_commanded_force(make_executor):
     assert f"{max(limits):.0f} N commanded along an axis, {np.linalg.norm(limits):.0f} N in all three" in force
 
 
-def test_deploy_raises_first_when_out_is_not_writable(monkeypatch, tmp_path):
+def test_deploy_raises_before_the_bus_opens_when_out_is_full(monkeypatch, tmp_path):
     def open_bus(url):
         raise AssertionError("the bus was opened")
 
@@ -332,12 +329,11 @@ def test_deploy_raises_first_when_out_is_not_writable(monkeypatch, tmp_path):
 
 def test_monitor_check_fails_without_a_heartbeat(make_executor):
     executor, _ = make_executor(has_monitor=False)
-    (failed,) = [check for check in executor.preflight.run() if check.passed not in (True, None)]
-    assert failed.name == "monitor"
+    assert failed_checks(executor.preflight.run()) == ["monitor"]
 
 
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("options", "message"),
     [
         ({"synchronous": True}, "does not wait"),
         ({"sim": True, "robot": "panda"}, "have a simulated robot"),
@@ -349,17 +345,17 @@ def test_monitor_check_fails_without_a_heartbeat(make_executor):
         ({"rate": 0.5, "sim": True, "driver": "fci"}, "leave --rate out"),
     ],
 )
-def test_connection_raises_when_options_contradict(wrong, message):
+def test_connection_raises_when_options_contradict(options, message):
     with pytest.raises(InputError, match=message):
-        RobotConnection(**wrong)
+        RobotConnection(**options)
 
 
-def test_clone_has_the_same_limits_and_driver():
-    slow = StatusLimits((1.0,) * 7, max_age=0.1)
-    options = {"period": 0.002, "wrench_time_constant": 0.05, "robot_url": "memq://x", "status_limits": slow}
+def test_clone_has_the_same_parameters_and_driver():
+    limits = StatusLimits((1.0,) * 7, max_age=0.1)
+    options = {"period": 0.002, "wrench_time_constant": 0.05, "robot_url": "memq://x", "status_limits": limits}
     station = HardwareStation(EnvConfig.resolve("BncConnector", {}).make_task().workcell(), robot="panda", **options)
     clone = station.clone(EnvConfig.resolve("BncConnector", {}).make_task().workcell())
     assert (clone.limits, clone.impedance, clone.driver) == (station.limits, station.impedance, station.driver)
     assert clone.driver is station.driver
-    assert (clone.period, clone.driver.url, clone.status_limits) == (0.002, "memq://x", slow)
-    assert len({one.GetSubsystemByName("wrench")._decay for one in (station, clone)}) == 1
+    assert (clone.period, clone.driver.url, clone.status_limits) == (0.002, "memq://x", limits)
+    assert clone.GetSubsystemByName("wrench")._decay == station.GetSubsystemByName("wrench")._decay

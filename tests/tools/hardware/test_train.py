@@ -1,4 +1,4 @@
-"""Episodes and training on a robot, with both sides of the bus in one process."""
+"""Episodes, evaluation and training on a simulated robot in the same process."""
 
 from contextlib import contextmanager
 from dataclasses import replace
@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
+from hardware_doubles import failed_checks, max_joint_speed, unplugged
 from injections.stepped_robot import SteppedRobotClock
 from pydrake.lcm import DrakeLcm
 
@@ -41,27 +42,31 @@ from guiderail.tools.learning.train import configure
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", "reward": "shaped", "action_repeat": 5}
 
 
-def make(patch, start, **options):
-    """Return an environment; `env.clock` has its robot, `env.asked` the reasons that were to be confirmed."""
-    lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
-    patch.setattr(declared, "num_steps", 10)
+def make_robot_env(patch, start, **options):
+    """Return an environment whose robot is at a pose.
+
+    Its additional attributes are `clock` and `keys`, `questions` (the reasons of all confirmations that it requested)
+    and `begin` (the start pose of the episodes).
+    """
+    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
+    patch.setattr(declaration, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail.diagrams.hardware.lcm.open_bus", lambda url: lcm)
-        station = make_station(declared)
-    task = build_task_diagram(declared, station, make_guidance(declared, station))
-    clock, keys, requests = SteppedRobotClock(declared.workcell(), lcm, start), OperatorKeys(), []
-    begin = declared.start_pose(np.random.default_rng(0))
+        station = make_station(declaration)
+    task = build_task_diagram(declaration, station, make_guidance(declaration, station))
+    clock, keys, questions = SteppedRobotClock(declaration.workcell(), lcm, start), OperatorKeys(), []
+    begin = declaration.start_pose(np.random.default_rng(0))
     env = RobotEnv(
         task,
         station,
         clock,
         action_repeat=5,
         keys=keys,
-        confirm_resume=requests.append,
-        free_workpiece=requests.append,
+        confirm_resume=questions.append,
+        free_workpiece=questions.append,
         log=lambda text: None,
     )
-    env.clock, env.keys, env.asked, env.begin = clock, keys, requests, begin
+    env.clock, env.keys, env.questions, env.begin = clock, keys, questions, begin
     return env
 
 
@@ -69,27 +74,27 @@ def make(patch, start, **options):
 def shared():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("guiderail.tools.hardware.preflight.SETTLING_TIME", 0.1)
-        env = make(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
+        env = make_robot_env(patch, START + [0.002, 0.0, 0.0, 0.0, 0.0, 0.0])
         yield env
 
 
 @pytest.fixture
 def env(shared):
-    shared._retry_until_ok(lambda: None)  # the test before may have left the arm at rest
-    shared.asked.clear()
+    shared._retry_until_ok(lambda: None)  # an earlier test may have stopped the arm
+    shared.questions.clear()
     shared.keys.clear_stop()
     return shared
 
 
-def still(observation):
+def act_zero(observation):
     return np.zeros(2)
 
 
 def test_reset_moves_to_the_start_and_an_episode_ends(env):
-    assert all(check.passed in (True, None) for check in env.preflight.run())
+    assert failed_checks(env.preflight.run()) == []
     for index in range(2):
-        row = rollout(env, still, index=index)
-        assert (row["termination"], row["steps"], env.asked) == ("time_limit", 10, [])
+        row = rollout(env, act_zero, index=index)
+        assert (row["termination"], row["steps"], env.questions) == ("time_limit", 10, [])
         np.testing.assert_allclose(env.trace.measured[0][:3], env.begin[:3], atol=2e-3)
         assert (env.trace.signals["command_timed_out"] == 0.0).all()
         env.idle()
@@ -98,9 +103,9 @@ def test_reset_moves_to_the_start_and_an_episode_ends(env):
 
 
 def test_reset_randomizes_parts_with_its_seed_and_options(env, monkeypatch):
-    monkeypatch.setattr(env, "_randomize_parts", lambda rng, options: {"drawn": (float(rng.random()), options)})
+    monkeypatch.setattr(env, "_randomize_parts", lambda rng, options: {"offset": (float(rng.random()), options)})
     _, info = env.reset(seed=3, options={"held_out": True})
-    assert info["drawn"] == (float(np.random.default_rng(3).random()), {"held_out": True})
+    assert info["offset"] == (float(np.random.default_rng(3).random()), {"held_out": True})
 
 
 def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
@@ -110,54 +115,54 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
         yield env, dict
 
     monkeypatch.setattr("guiderail.tools.hardware.evaluate.robot_session", fake_session)
-    learned_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
-    RunFolder(tmp_path).write_config(configure("BncConnector", learned_on, seed=0, episodes=1))
+    trained_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
+    RunFolder(tmp_path).write_config(configure("BncConnector", trained_on, seed=0, episodes=1))
     env.keys.is_pause_requested = True
     result = evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero")
     assert (result["episodes"], result["success_rate"]) == (2, 0.0)
-    assert (env.asked, env.keys.is_pause_requested) == (
-        ["stop requested by the user"],
-        False,
-    )  # after the first, and once
+    # The pause is confirmed once, after the first episode.
+    assert (env.questions, env.keys.is_pause_requested) == (["stop requested by the user"], False)
     rows = pd.read_csv(tmp_path / "hardware" / "episodes-zero.csv")
     assert rows["termination"].tolist() == ["time_limit"] * 2
     with pytest.raises(InputError, match="already exists"):
         evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero")
     with pytest.raises(InputError, match="at least one"):
         evaluate_on_robot(tmp_path, RobotConnection(), 0)
-    # Two evaluations at once, neither of which has a row yet, do not overwrite each other's file.
-    elsewhere = tmp_path / "elsewhere"
-    with RunFolder(elsewhere).locked(), pytest.raises(InputError, match="another process"):
-        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", out=elsewhere)
-    assert not list(elsewhere.glob("*.csv"))
+    # An evaluation that has no row yet does not overwrite the file of a simultaneous evaluation.
+    out = tmp_path / "out"
+    with RunFolder(out).locked(), pytest.raises(InputError, match="another process"):
+        evaluate_on_robot(tmp_path, RobotConnection(), 2, policy="zero", out=out)
+    assert not list(out.glob("*.csv"))
 
 
 def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path, forkserver):
     small = {"net_arch": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_freq": 1}
     arguments = {"algorithm": "sac", "episodes": 5, "settings": small}
     config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **arguments)
-    folder, idle, before = RunFolder(tmp_path), env.idle, []
+    folder, idle, files = RunFolder(tmp_path), env.idle, []  # the files at each call of `idle`
 
     def refuse():
-        before.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
+        files.append([file.name for file in tmp_path.rglob("*") if file.is_file()])
         idle()
-        if len(before) == 6:  # the first call of the second episode
+        if len(files) == 6:  # the first call after the second episode
             raise InputError("not confirmed: nothing moves")
 
     receive = PipelinedLearner.receive_learned
-    # The first episode is being learned until the exception.
+    # Training on the first episode lasts until the exception.
     monkeypatch.setattr(
-        PipelinedLearner, "receive_learned", lambda one: (not one.submitted or len(before) > 6) and receive(one)
+        PipelinedLearner,
+        "receive_learned",
+        lambda learner: (not learner.submitted or len(files) > 6) and receive(learner),
     )
     monkeypatch.setattr(env, "idle", refuse)
     with pytest.raises(InputError, match="not confirmed"):
         _train(folder, config, env, waits=True, report=lambda row: None)
-    assert "policy.json" not in before[-1]
+    assert "policy.json" not in files[-1]
     assert folder.episodes()["termination"].tolist() == ["time_limit"] * 2
     assert len(read_step_log(folder.steps)) == 20
     assert np.isfinite(Policy.load(tmp_path)(np.zeros(env.observation_space.shape, np.float32))).all()
-    assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # at rest
-    assert env.asked == []
+    assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP  # `rest` was called
+    assert env.questions == []
 
     monkeypatch.undo()
     first = folder.episodes()
@@ -175,33 +180,30 @@ def test_operator_stop_truncates_and_reset_resumes(env):
     env.keys.request_stop()
     _, _, _, truncated, info = env.step(np.zeros(2))
     assert (truncated, info["termination"], info["stopped"]) == (True, "stopped", "stop requested by the user")
-    velocities = env.clock.robot.plant.GetVelocities(
-        env.clock.robot.plant.GetMyContextFromRoot(env.clock.simulator.get_context())
-    )
-    assert np.abs(velocities).max() < 0.01
-    assert env.asked == []
+    assert max_joint_speed(env.clock) < 0.01
+    assert env.questions == []
     env.reset()
-    assert env.asked == ["stop requested by the user"]
+    assert env.questions == ["stop requested by the user"]
 
 
-def test_stop_requested_while_statuses_settle_is_asked_about_again(env, monkeypatch):
+def test_stop_during_the_settling_time_is_confirmed_again(env, monkeypatch):
     env.reset()
     env.keys.request_stop()
     env.step(np.zeros(2))
     messages = []
 
     def confirm(reason):
-        env.asked.append(reason)
-        if len(env.asked) == 1:
+        env.questions.append(reason)
+        if len(env.questions) == 1:
             env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
 
     monkeypatch.setattr(env, "_confirm_resume", confirm)
     monkeypatch.setattr(env, "_log", messages.append)
     env.reset()
-    assert (len(env.asked), messages) == (2, ["resuming from here"])
+    assert (len(env.questions), messages) == (2, ["resuming from here"])
 
 
-def test_single_wrong_status_before_control_is_taken_moves_nothing(monkeypatch):
+def test_arm_rests_when_one_status_before_control_is_wrong(monkeypatch):
     start = preflight.start_simulator
 
     def start_simulator(station, *arguments):
@@ -213,14 +215,10 @@ def test_single_wrong_status_before_control_is_taken_moves_nothing(monkeypatch):
             return start(station, *arguments)
 
     monkeypatch.setattr(preflight, "start_simulator", start_simulator)
-    env = make(monkeypatch, START)
+    env = make_robot_env(monkeypatch, START)
     assert np.linalg.norm((env.pose - START)[:3]) > 0.05
     env._take_control()
     np.testing.assert_allclose(env.pose, START, atol=1e-3)
-
-
-def unplugged(*arguments):
-    raise OSError("cable unplugged")
 
 
 @pytest.mark.parametrize(
@@ -242,14 +240,14 @@ def test_episode_is_truncated_when_the_driver_fails(env, monkeypatch, method, re
         *_, truncated, info = env.step(np.zeros(2))
         assert (truncated, info["termination"], env.fault) == (True, "stopped", fault)
         env.rest()
-        env._switch_to_new_transfer()  # neither waits nor raises
+        env._switch_to_new_transfer()  # does not wait for the driver and raises no error
     assert any("could not be sent: write raised OSError" in message for message in messages) == (method == "write")
-    env.reset()  # asks, and resumes
-    assert len(env.asked) == 1
-    assert ("raised OSError: cable unplugged" in env.asked[0]) == (replacement is unplugged)
+    env.reset()  # requests a confirmation and resumes
+    assert len(env.questions) == 1
+    assert ("raised OSError: cable unplugged" in env.questions[0]) == (replacement is unplugged)
 
 
-def test_arm_does_not_resume_when_the_recovery_raises(env, monkeypatch):
+def test_arm_does_not_resume_when_recover_raises(env, monkeypatch):
     env.reset()
     env.keys.request_stop()
     env.step(np.zeros(2))
@@ -259,8 +257,8 @@ def test_arm_does_not_resume_when_the_recovery_raises(env, monkeypatch):
             env.reset()
 
 
-def test_motions_between_episodes_have_the_bound_of_the_episode(monkeypatch):
-    env = make(monkeypatch, START, force_limit_range=(8.0, 25.0))
+def test_force_limit_remains_between_episodes(monkeypatch):
+    env = make_robot_env(monkeypatch, START, force_limit_range=(8.0, 25.0))
     np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
     env.preflight.repeat()
     np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
@@ -275,15 +273,14 @@ def test_motions_between_episodes_have_the_bound_of_the_episode(monkeypatch):
 
 def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
     monkeypatch.setattr("guiderail.tools.hardware.preflight.SETTLING_TIME", 0.1)
-    env = make(monkeypatch, START, guidance="residual", bound=0.0005)
+    env = make_robot_env(monkeypatch, START, guidance="residual", bound=0.0005)
     observations = []
 
     def act(observation):
         observations.append(observation)
         if len(observations) == 2:
-            env.clock.happens = {
-                env.clock.step + 16: env.keys.request_stop
-            }  # in the fourth of five control steps of the action
+            # Within the fourth of the action's five control steps, which last four status periods each.
+            env.clock.happens = {env.clock.step + 16: env.keys.request_stop}
         return np.full(2, len(observations) - 1.0)
 
     infos = []
@@ -295,17 +292,17 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
         ("max_commanded_violation", "constraint_violation", "commanded_violation"),
         ("max_measured_violation", "measured_violation", "measured_violation"),
     ):
-        seen = env.trace.signals[signal]
-        assert row[column] == seen.max() > seen[:5].max()
-        assert infos[-1][-1][key] == seen[5:].max()
+        violations = env.trace.signals[signal]
+        assert row[column] == violations.max() > violations[:5].max()
+        assert infos[-1][-1][key] == violations[5:].max()
     assert infos[-1][-1]["contact_force"] == env.trace.force[5:].max()
 
 
 @pytest.fixture
-def ready(monkeypatch):
-    """Return clock of a waiting arm, list of the questions, and function that starts a `robot_session`."""
-    lcm, declared = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
-    clock, requests = SteppedRobotClock(declared.workcell(), lcm, START), []
+def session(monkeypatch):
+    """Return clock of an arm at rest, list of requested confirmations, and function that starts a `robot_session`."""
+    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
+    clock, questions = SteppedRobotClock(declaration.workcell(), lcm, START), []
 
     @contextmanager
     def no_process(connection, *arguments):
@@ -315,18 +312,18 @@ def ready(monkeypatch):
     monkeypatch.setattr(RobotConnection, "simulated_driver", no_process)
     monkeypatch.setattr(RobotConnection, "clocks", lambda connection, station: (clock, None))
     monkeypatch.setattr("guiderail.tools.hardware.session.set_realtime_priority", lambda: True)
-    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", requests.append)
+    monkeypatch.setattr("guiderail.tools.hardware.preflight.confirm", questions.append)
     config = configure("BncConnector", OPTIONS, seed=0, episodes=1)
 
     def begin(*, sim=False, assume_yes=False):
         return robot_session(config, RobotConnection(sim=sim), assume_yes=assume_yes, log=lambda text: None)
 
-    return clock, requests, begin
+    return clock, questions, begin
 
 
 @pytest.mark.parametrize("name", ["start", "monitor", "commands"])
-def test_session_raises_when_a_check_fails_after_the_question(ready, monkeypatch, name):
-    clock, _, begin = ready
+def test_session_raises_when_a_check_fails_after_the_question(session, monkeypatch, name):
+    clock, _, begin = session
     driver = clock.monitor._driver
 
     def change(question):
@@ -343,22 +340,22 @@ def test_session_raises_when_a_check_fails_after_the_question(ready, monkeypatch
         pass
 
 
-def test_clock_begins_again_before_control_is_taken(ready, monkeypatch):
-    """Time for the question and for building the learner is no gap between statuses."""
-    clock, requests, begin = ready
+def test_clock_begins_again_before_control_is_taken(session, monkeypatch):
+    """The time for the question and for building the learner does not count as a gap between statuses."""
+    clock, questions, begin = session
     commands = []
     clock.monitor._driver.lcm.Subscribe(IiwaDriver.command_channel, commands.append)
     with begin() as (env, _):
-        assert (len(requests), commands) == (1, [])  # nothing was sent yet
-        begun, step = [], clock.step
-        monkeypatch.setattr(clock, "begin", lambda: begun.append(clock.step))
+        assert (len(questions), commands) == (1, [])
+        begin_steps, step = [], clock.step
+        monkeypatch.setattr(clock, "begin", lambda: begin_steps.append(clock.step))
         env._take_control()
-        assert begun == [step]
+        assert begin_steps == [step]
 
 
 @pytest.mark.parametrize(("sim", "assume_yes"), [(False, False), (False, True), (True, False), (True, True)])
-def test_resuming_is_confirmed_and_releasing_unless_simulated(ready, monkeypatch, sim, assume_yes):
-    _, _, begin = ready
+def test_resuming_and_releasing_a_real_part_are_confirmed(session, monkeypatch, sim, assume_yes):
+    _, _, begin = session
     questions, offsets = [], []
     monkeypatch.setattr(
         "guiderail.tools.hardware.session.confirm", lambda question, has_yes: questions.append(question)
@@ -373,8 +370,8 @@ def test_resuming_is_confirmed_and_releasing_unless_simulated(ready, monkeypatch
     assert offsets == [[[1.0, 0.0], [0.0, 0.0]]] * sim
 
 
-def test_arm_does_not_resume_after_a_signal_that_ends_the_program(ready):
-    begin = ready[2]
+def test_arm_does_not_resume_after_a_termination_signal(session):
+    _, _, begin = session
     with begin(sim=True, assume_yes=True) as (env, _):
         raise_signal(SIGTERM)
         with pytest.raises(InputError, match="stopped by a signal"):
@@ -382,53 +379,50 @@ def test_arm_does_not_resume_after_a_signal_that_ends_the_program(ready):
 
 
 def test_commands_check_fails_when_another_program_commands(monkeypatch):
-    env = make(monkeypatch, START)
+    env = make_robot_env(monkeypatch, START)
 
-    def check():
-        return {one.name: one.passed for one in env.preflight.run()}["commands"]
-
-    assert check()
+    assert "commands" not in failed_checks(env.preflight.run())
     IiwaDriver(env._transfer_station.driver.lcm).write(np.zeros(7), 1.0)
     env._advance_statuses(1)
-    assert not check()
+    assert "commands" in failed_checks(env.preflight.run())
 
 
 def test_resume_works_a_minute_after_the_stop(monkeypatch):
-    """Neither the status from before the question nor the gap since then is a fault."""
-    env = make(monkeypatch, START)
+    """Neither the status before the question nor the gap of 60 s without statuses is a fault."""
+    env = make_robot_env(monkeypatch, START)
     env.clock.clock = 100.0
 
-    def think(message):
-        env.asked.append(message)
+    def confirm_after_a_minute(reason):
+        env.questions.append(reason)
         env.clock.clock += 60.0
 
-    env._confirm_resume = think
+    env._confirm_resume = confirm_after_a_minute
     env.reset()
     env.keys.request_stop()
     env.step(np.zeros(2))
     env.reset()
-    assert env.asked == ["stop requested by the user"]
+    assert env.questions == ["stop requested by the user"]
     assert env._station.get_arm_state_output_port().Eval(env._context)[0] == ArmState.RUNNING
 
 
 def test_arm_moved_by_hand_returns_slowly_to_its_path(monkeypatch):
-    """The speed is that of a slow approach, and not the largest of a command."""
-    env = make(monkeypatch, START)
+    """The speed is the speed of an approach, not the largest speed of a command."""
+    env = make_robot_env(monkeypatch, START)
     env.reset()
     env.step(np.zeros(2))
     env.keys.request_stop()
     env.step(np.zeros(2))
     context = env.clock.simulator.get_mutable_context()
     env.clock.robot.set_pose(context, env.pose + [0.0, 0.0, 0.03, 0.0, 0.0, 0.0])
-    places, advance = [], env._advance
+    positions, advance = [], env._advance
 
-    def watched():
+    def advance_and_record():
         advance()
-        places.append(env.pose[:3])
+        positions.append(env.pose[:3])
 
-    monkeypatch.setattr(env, "_advance", watched)
+    monkeypatch.setattr(env, "_advance", advance_and_record)
     env.reset()
-    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / env.task.control_period
+    speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1) / env.task.control_period
     assert speeds.max() < 2.0 * SPEED
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
@@ -444,9 +438,7 @@ def test_rest_works_after_an_exception_within_a_step(env):
         env.step(np.ones(2))
     env.rest()
     assert env._station.get_fault_output_port().Eval(env._context)[0] == Fault.USER_STOP
-    plant = env.clock.robot.plant
-    velocities = plant.GetVelocities(plant.GetMyContextFromRoot(env.clock.simulator.get_context()))
-    assert np.abs(velocities).max() < 0.01
+    assert max_joint_speed(env.clock) < 0.01
 
 
 def test_fault_truncates_and_the_next_reset_resumes(env):
@@ -463,12 +455,12 @@ def test_fault_truncates_and_the_next_reset_resumes(env):
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step(np.zeros(2))
     env.reset()
-    assert len(env.asked) == 1
-    row = rollout(env, still)
+    assert len(env.questions) == 1
+    row = rollout(env, act_zero)
     assert row["termination"] == "time_limit"
 
 
-def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatch):
+def test_reset_repeats_the_path_once_if_off_the_start(env, monkeypatch):
     env.reset()
     env.step(np.zeros(2))
     env._extend_return_path()
@@ -482,25 +474,25 @@ def test_reset_repeats_its_path_once_if_the_start_is_not_reached(env, monkeypatc
     at_start = iter([False])
     monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start, True))
     env.reset()
-    back = [tuple(pose) for pose in path[::-1]]
+    backwards = [tuple(pose) for pose in path[::-1]]
     commanded = [tuple(pose) for pose in commanded]
-    there_and_back = back[::-1] + back
-    first = range(commanded.index(back[-1]) + 1, len(commanded))  # the path's end may be commanded twice in a row
-    assert sum(commanded[step : step + len(there_and_back)] == there_and_back for step in first) == 1
+    repetition = backwards[::-1] + backwards
+    begins = range(commanded.index(backwards[-1]) + 1, len(commanded))  # the path's end may be commanded twice in a row
+    assert sum(commanded[step : step + len(repetition)] == repetition for step in begins) == 1
 
 
-def test_reset_has_the_workpiece_released_by_hand_if_the_start_is_not_reached(env, monkeypatch):
+def test_reset_requests_a_release_if_still_off_the_start(env, monkeypatch):
     env.reset()
     env.step(np.zeros(2))
     env._extend_return_path()
     at_start = iter([False, False])
     monkeypatch.setattr(env, "_is_at_start", lambda: next(at_start, True))
     env.reset()
-    assert len(env.asked) == 1
-    assert env.asked[0].startswith("the arm did not reach the start")
+    assert len(env.questions) == 1
+    assert env.questions[0].startswith("the arm did not reach the start")
 
 
-def test_reset_raises_if_the_start_is_not_reached_after_the_release(env, monkeypatch):
+def test_reset_raises_if_off_the_start_after_the_release(env, monkeypatch):
     env.reset()
     env.step(np.zeros(2))
     env._extend_return_path()
@@ -508,11 +500,11 @@ def test_reset_raises_if_the_start_is_not_reached_after_the_release(env, monkeyp
         patch.setattr(env, "_is_at_start", lambda: False)
         with pytest.raises(InputError, match="did not reach the start"):
             env.reset()
-    assert len(env.asked) == 1
+    assert len(env.questions) == 1
 
 
 @pytest.mark.parametrize("snaps_in", [False, True])
-def test_workpiece_that_snapped_in_is_released_by_hand(env, monkeypatch, snaps_in):
+def test_release_is_requested_after_a_success_with_a_snap(env, monkeypatch, snaps_in):
     monkeypatch.setattr(env, "_snaps_in", snaps_in)
     monkeypatch.setattr(env, "_holds", lambda: True)
     env.reset()
@@ -526,66 +518,62 @@ def test_workpiece_that_snapped_in_is_released_by_hand(env, monkeypatch, snaps_i
         patch.setattr(DiagramEnv, "step", succeed)
         env.step(np.zeros(2))
     env.reset()
-    assert env.asked == ["the workpiece has snapped in"] * snaps_in
+    assert env.questions == ["the workpiece has snapped in"] * snaps_in
     env.reset()
-    assert len(env.asked) == snaps_in
+    assert len(env.questions) == snaps_in
 
 
 def test_reset_completes_after_a_stop(env):
     env.clock.happens = {env.clock.step + 20: env.keys.request_stop}
     env.reset()
-    assert env.asked == ["stop requested by the user"]
+    assert env.questions == ["stop requested by the user"]
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 
 
 @pytest.mark.parametrize("direction", [(0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
-def test_push_tells_an_inserted_workpiece_from_a_loose_one(env, monkeypatch, direction):
+def test_push_distinguishes_inserted_and_loose_workpieces(env, monkeypatch, direction):
     test = HoldTest(tuple(HOLD_DISTANCE * np.array(direction)), MAX_HOLD_MOTION)
-    for one, holds in ((env, False), (make(monkeypatch, np.zeros(6)), True)):
-        monkeypatch.setattr(one, "_hold_tests", lambda pose: [test])
-        one._retry_until_ok(one._take_control)
-        before = one.pose
-        assert one._holds() == holds
-        np.testing.assert_allclose(one.pose[:3], before[:3], atol=1.5e-3)  # it returns
+    inserted = make_robot_env(monkeypatch, np.zeros(6))
+    for robot_env, holds in ((env, False), (inserted, True)):
+        monkeypatch.setattr(robot_env, "_hold_tests", lambda pose: [test])
+        robot_env._retry_until_ok(robot_env._take_control)
+        before = robot_env.pose
+        assert robot_env._holds() == holds
+        np.testing.assert_allclose(robot_env.pose[:3], before[:3], atol=1.5e-3)  # back at the pose before the push
 
 
-def test_success_needs_every_push_to_be_resisted(env, monkeypatch):
+def test_success_requires_resistance_to_every_push(env, monkeypatch):
     results = iter([True, False])
     monkeypatch.setattr(env, "_hold_tests", lambda pose: [HoldTest((0.0, 0.0, 1e-3), 1e-3)] * 2)
     monkeypatch.setattr(env, "_resists", lambda test, before: next(results))
     assert not env._holds()
 
 
+@pytest.mark.parametrize("task", ["GridClamp", "BncConnector"])
+def test_train_raises_when_the_reward_is_privileged(task, tmp_path):
+    environment = {"station": "hardware", "reward": "aligned"}
+    with pytest.raises(InputError, match="needs simulation state"):
+        train_on_robot(task, tmp_path / "run", RobotConnection(sim=True), environment=environment, given={})
+
+
 @pytest.mark.parametrize(
-    ("task", "options", "message"),
-    [
-        ("GridClamp", {"reward": "aligned"}, "needs simulation state"),
-        ("BncConnector", {"reward": "aligned"}, "needs simulation state"),
-    ],
+    ("sim", "message"), [(True, "a simulated driver: give --sim"), (False, "a robot: leave --sim")]
 )
-def test_train_raises_when_success_is_not_observable(task, options, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        train_on_robot(
-            task, tmp_path / "run", RobotConnection(sim=True), environment={"station": "hardware"} | options, given={}
-        )
-
-
-@pytest.mark.parametrize(("sim", "words"), [(True, "a simulated driver: give --sim"), (False, "a robot: leave --sim")])
-def test_run_is_resumed_with_the_kind_of_driver_that_it_began_with(sim, words, tmp_path):
+def test_resume_raises_when_real_and_simulated_robot_differ(sim, first, tmp_path):
     """The address of a simulated driver differs between processes."""
-    begun, other = (
+    begun, continued = (
         configure("BncConnector", OPTIONS | {"robot_url": f"udpm://239.255.76.67:{port}"}, seed=0, episodes=1)
         for port in (20001, 20002)
     )
-    assert begun.identity == other.identity
+    assert begun.identity == continued.identity
     RunFolder(tmp_path).write_config(replace(begun, simulated_driver=sim))
     connection = RobotConnection(sim=not sim)
-    with pytest.raises(InputError, match=f"was trained with {words}"):
+    with pytest.raises(InputError, match=f"was trained with {first}"):
         train_on_robot(None, tmp_path, connection, environment={"station": "hardware"}, given={}, resume=True)
 
 
 @pytest.mark.parametrize("setting", ["demonstration_episodes", "stop_after_successes"])
-def test_settings_without_meaning_on_a_robot_are_refused(setting, tmp_path):
+def test_train_raises_when_a_setting_needs_a_simulation(setting, tmp_path):
     with pytest.raises(InputError, match=f"leave the setting {setting} out"):
         train_on_robot(
             "BncConnector",
@@ -598,7 +586,7 @@ def test_settings_without_meaning_on_a_robot_are_refused(setting, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_folder_without_room_for_the_step_log_is_refused(tmp_path, monkeypatch):
+def test_train_raises_when_the_folder_lacks_space(tmp_path, monkeypatch):
     monkeypatch.setattr("shutil.disk_usage", lambda path: SimpleNamespace(free=9))
     environment = {"station": "hardware", "guidance": "kgrl"}
     with pytest.raises(InputError, match="has room for 9 bytes"):
