@@ -559,7 +559,7 @@ def test_train_raises_when_the_reward_is_privileged(task, tmp_path):
 @pytest.mark.parametrize(
     ("sim", "message"), [(True, "a simulated driver: give --sim"), (False, "a robot: leave --sim")]
 )
-def test_resume_raises_when_real_and_simulated_robot_differ(sim, first, tmp_path):
+def test_resume_raises_when_real_and_simulated_robot_differ(sim, message, tmp_path):
     """The address of a simulated driver differs between processes."""
     begun, continued = (
         configure("BncConnector", OPTIONS | {"robot_url": f"udpm://239.255.76.67:{port}"}, seed=0, episodes=1)
@@ -568,7 +568,7 @@ def test_resume_raises_when_real_and_simulated_robot_differ(sim, first, tmp_path
     assert begun.identity == continued.identity
     RunFolder(tmp_path).write_config(replace(begun, simulated_driver=sim))
     connection = RobotConnection(sim=not sim)
-    with pytest.raises(InputError, match=f"was trained with {first}"):
+    with pytest.raises(InputError, match=f"was trained with {message}"):
         train_on_robot(None, tmp_path, connection, environment={"station": "hardware"}, given={}, resume=True)
 
 

@@ -1,9 +1,10 @@
-"""Supervisor at a page: sliders correct the policy, clicks label an episode."""
+"""Supervisor on a Meshcat page: sliders correct the policy, and clicks label an episode."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from page_double import PageDouble
 from pydrake.geometry import Meshcat
 
 from guiderail.tools.environments import make_environment
@@ -11,27 +12,12 @@ from guiderail.tools.teleop import teleoperator as supervising
 from guiderail.tools.teleop.teleoperator import KEY_PAIRS, LABEL_KEYS, LABELS, LIMIT, RELEASE, MeshcatSupervisor
 
 
-class Page:
-    """Meshcat with the methods that a supervisor needs: sliders keep their values, buttons count their clicks."""
+class Page(PageDouble):
+    """Double of a page that checks the limits of its sliders."""
 
-    def __init__(self):
-        self.sliders, self.clicks = {}, {}
-
-    def AddSlider(self, name, low, high, step, value, lower, higher):
+    def AddSlider(self, name, low, high, *arguments):
         assert (low, high) == (-LIMIT, LIMIT)
-        self.sliders[name] = value
-
-    def AddButton(self, name, key):
-        self.clicks[name] = 0
-
-    def SetSliderValue(self, name, value):
-        self.sliders[name] = value
-
-    def GetSliderValue(self, name):
-        return self.sliders[name]
-
-    def GetButtonClicks(self, name):
-        return self.clicks[name]
+        super().AddSlider(name, low, high, *arguments)
 
 
 @pytest.fixture
@@ -41,16 +27,24 @@ def env():
     env.close()
 
 
-def add_sliders(supervisor, env):
-    # Without `View`, which needs a real Meshcat.
+@pytest.fixture
+def page(monkeypatch):
+    """Return the double of a page; camera and view, which need a Meshcat page, are replaced."""
+    monkeypatch.setattr(supervising, "set_camera", lambda page, declaration: None)
+    monkeypatch.setattr(supervising, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
+    return Page()
+
+
+def make_supervisor(page, env):
+    """Return a supervisor with sliders for the actions of an environment."""
+    supervisor = MeshcatSupervisor(print, page)
     supervisor._add_sliders(env.unwrapped)
     supervisor.panel.reset()
     return supervisor
 
 
-def test_correction_follows_the_sliders_until_released(env):
-    page = Page()
-    supervisor = add_sliders(MeshcatSupervisor(print, page), env)
+def test_correction_equals_the_sliders_until_the_release(env, page):
+    supervisor = make_supervisor(page, env)
     assert supervisor.correction(None) is None
     page.sliders["push 2"] = -2.5
     np.testing.assert_array_equal(supervisor.correction(None), [0.0, -2.5])
@@ -59,9 +53,8 @@ def test_correction_follows_the_sliders_until_released(env):
     assert page.sliders == {"push 1": 0.0, "push 2": 0.0}
 
 
-def test_label_is_returned_once_per_click(env):
-    page = Page()
-    supervisor = add_sliders(MeshcatSupervisor(print, page), env)
+def test_label_is_returned_once_after_several_clicks(env, page):
+    supervisor = make_supervisor(page, env)
     assert supervisor.label() is None
     for name, label in LABELS.items():
         page.clicks[name] += 2
@@ -69,11 +62,8 @@ def test_label_is_returned_once_per_click(env):
         assert supervisor.label() is None
 
 
-def test_only_a_stop_outlasts_the_start_of_an_episode(env, monkeypatch):
-    page = Page()
+def test_episode_start_clears_all_labels_except_a_stop(env, page):
     supervisor = MeshcatSupervisor(print, page)
-    monkeypatch.setattr(supervising, "set_camera", lambda page, declaration: None)
-    monkeypatch.setattr(supervising, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
     for name, label in LABELS.items():
         page.clicks[name] += 1
         supervisor.on_episode_start(env)
@@ -81,11 +71,8 @@ def test_only_a_stop_outlasts_the_start_of_an_episode(env, monkeypatch):
         assert supervisor.label() is None
 
 
-def test_pending_stop_outlasts_other_labels(env, monkeypatch):
-    page = Page()
+def test_pending_stop_has_priority_over_other_labels(env, page):
     supervisor = MeshcatSupervisor(print, page)
-    monkeypatch.setattr(supervising, "set_camera", lambda page, declaration: None)
-    monkeypatch.setattr(supervising, "View", lambda query, page: SimpleNamespace(follow=lambda context: None))
     page.clicks["stop (Escape)"] += 1
     supervisor.on_episode_start(env)
     page.clicks["success (Enter)"] += 1
@@ -105,9 +92,8 @@ def test_episode_is_shown_on_a_meshcat_page(env):
     supervisor.on_episode_start(env)
     assert supervisor.correction(None) is None
     env.step(np.zeros(2))
-    assert supervisor.panel.meshcat.HasPath("/drake/visualizer") or supervisor.panel.meshcat.HasPath(
-        "/drake/illustration"
-    )
-    supervisor.panel.meshcat.SetSliderValue("push 1", 1.0)
+    meshcat = supervisor.panel.meshcat
+    assert meshcat.HasPath("/drake/visualizer") or meshcat.HasPath("/drake/illustration")
+    meshcat.SetSliderValue("push 1", 1.0)
     supervisor.on_episode_start(env)
-    assert supervisor.correction(None) is None  # released at the start of an episode
+    assert supervisor.correction(None) is None  # the start of an episode releases the sliders
