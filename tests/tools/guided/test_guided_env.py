@@ -1,4 +1,4 @@
-"""Guidance around an environment of another origin: constraints, frames, segments, observations and refusals."""
+"""Guidance around any Gymnasium environment: constraints, frames, segments, observations and refused arguments."""
 
 from contextlib import nullcontext
 from dataclasses import replace
@@ -23,20 +23,20 @@ from guiderail.tools.guided import guide
 
 TOLERANCE = 1e-9
 ENFORCED = ("kgrl", "skgrl", "clipped_residual")
-SHOWN = demonstrations()
-LIMIT = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
+RECORDED = demonstrations()
+BOX = LinearConstraints.box([-np.inf, -0.13, -np.inf], [np.inf, 0.01, np.inf])
 
 
 @pytest.fixture(autouse=True, scope="module")
-def fits_of_equal_demonstrations():
-    """Fit equal demonstrations once: fits take most of the time of these tests, and depend on nothing else."""
-    original, known = guide.fit, {}
+def cached_fits():
+    """Fit equal demonstrations only once, because fits take most of the time of these tests."""
+    original, cache = guide.fit, {}
 
     def fit(recorded, **options):
         key = (*(array.tobytes() for array in (*recorded.times, *recorded.outputs)), repr(options))
-        if key not in known:
-            known[key] = original(recorded, **options)
-        return known[key]
+        if key not in cache:
+            cache[key] = original(recorded, **options)
+        return cache[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(guide, "fit", fit)
@@ -44,18 +44,21 @@ def fits_of_equal_demonstrations():
 
 
 def at_target(env, observation):
+    """Return the origin of a segment's frame: the target of the environment."""
     return env.unwrapped.target
 
 
-def guided(guidance="kgrl", kind="box", **keywords):
+def make_guided(guidance="kgrl", kind="box", **keywords):
+    """Return a guided point environment; `kind` is its observation space, and `keywords` replace arguments."""
     arguments = {
-        "demonstrations": SHOWN, "frame": at_target, "constraints": LIMIT, "pose": pose, "to_action": to_action,
+        "demonstrations": RECORDED, "frame": at_target, "constraints": BOX, "pose": pose, "to_action": to_action,
         "guidance": guidance, "period": PERIOD, "action_repeat": 3,
     }  # fmt: skip
     return GuidedEnv(PointEnv(kind), **(arguments | keywords))
 
 
-def episode(env, policy, seed=0, options=None):
+def run_episode(env, policy, seed=0, options=None):
+    """Run an episode with a policy from the index of an action to an action; return the infos of reset and steps."""
     observation, info = env.reset(seed=seed, options=options)
     infos, done, k = [info], False, 0
     while not done:
@@ -67,17 +70,17 @@ def episode(env, policy, seed=0, options=None):
 
 @pytest.mark.parametrize("guidance", [*ENFORCED, "kmp"])
 def test_motion_without_actions_ends_at_the_target(guidance):
-    env = guided(guidance, constraints=None)
-    last = episode(env, lambda k: np.zeros(3))[-1]
+    env = make_guided(guidance, constraints=None)
+    last = run_episode(env, lambda k: np.zeros(3))[-1]
     assert last["phase"] == 1.0
     assert np.linalg.norm(env.unwrapped.p - env.unwrapped.target) < 0.02
-    assert last["truncated"] and not last["terminated"]  # noqa: PT018
+    assert (last["truncated"], last["terminated"]) == (True, False)
 
 
 @pytest.mark.parametrize("guidance", ENFORCED)
 @pytest.mark.parametrize("seed", range(3))
-def test_every_command_satisfies_the_constraints_for_any_actions(guidance, seed):
-    env, rng = guided(guidance, action_scale=20.0), np.random.default_rng(seed)
+def test_commands_satisfy_the_constraints_for_any_actions(guidance, seed):
+    env, rng = make_guided(guidance, action_scale=20.0), np.random.default_rng(seed)
     policies = [
         lambda k: rng.uniform(-1, 1, 3),
         lambda k: rng.choice([-1.0, 1.0], 3),
@@ -86,38 +89,39 @@ def test_every_command_satisfies_the_constraints_for_any_actions(guidance, seed)
     ]
     for policy in policies:
         env.unwrapped.commands.clear()
-        infos = episode(env, policy, seed)
+        infos = run_episode(env, policy, seed)
         local = np.array(env.unwrapped.commands) - env.unwrapped.target
-        assert max(LIMIT.violation(y) for y in local) <= TOLERANCE
+        assert max(BOX.violation(y) for y in local) <= TOLERANCE
         assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
         assert sum(info["fallback"] for info in infos[1:]) == 0
     assert np.abs(local[:, 1] + 0.13).min() < 1e-6  # the last policy reaches the bound
 
 
 @pytest.mark.parametrize("number", [0, 1])
-def test_violation_of_an_action_is_nan_if_that_of_one_command_is(number, monkeypatch):
-    env = guided()
+def test_violation_of_an_action_is_nan_if_a_command_has_nan(number, monkeypatch):
+    env = make_guided()
     finish, violations = env.guide.finish, iter([np.nan if k == number else -1.0 for k in range(3)])
     monkeypatch.setattr(env.guide, "finish", lambda output: replace(finish(output), violation=next(violations)))
     env.reset(seed=0)
     assert np.isnan(env.step(np.zeros(3))[-1]["constraint_violation"])
 
 
-def test_residual_leaves_the_constraints_and_reports_it():
-    infos = episode(guided("residual", action_scale=5.0), lambda k: np.array([0.0, 1.0, 0.0]))
+def test_residual_reports_its_constraint_violation():
+    infos = run_episode(make_guided("residual", action_scale=5.0), lambda k: np.array([0.0, 1.0, 0.0]))
     assert max(info["constraint_violation"] for info in infos[1:]) > 0.02
 
 
-def test_action_of_one_dimension_equals_that_entry_of_a_full_action():
-    env = guided(action_dims=[1])
+def test_action_dims_select_entries_of_a_full_action():
+    env = make_guided(action_dims=[1])
     assert env.action_space.shape == (1,)
-    one, full = episode(env, lambda k: np.ones(1)), episode(guided(), lambda k: np.array([0.0, 1.0, 0.0]))
-    for a, b in zip(one[1:], full[1:], strict=True):
+    selected = run_episode(env, lambda k: np.ones(1))
+    full = run_episode(make_guided(), lambda k: np.array([0.0, 1.0, 0.0]))
+    for a, b in zip(selected[1:], full[1:], strict=True):
         np.testing.assert_allclose(a["command"], b["command"], atol=1e-12)
 
 
 def test_info_and_observation_have_phase_and_command():
-    env = guided(history=4)
+    env = make_guided(history=4)
     assert env.observation_space.shape == (6 + 1 + 3,)
     observation, info = env.reset(seed=0)
     assert env.observation_space.contains(observation)
@@ -133,49 +137,50 @@ def test_info_and_observation_have_phase_and_command():
 
 
 @pytest.mark.parametrize(("kind", "keys"), [("dict", {"state", "phase"}), ("image", {"observation", "phase"})])
-def test_other_observation_spaces_are_extended(kind, keys):
-    env = guided(kind=kind, observe=["phase"])
+def test_dict_and_image_observations_are_extended(kind, keys):
+    env = make_guided(kind=kind, observe=["phase"])
     observation, _ = env.reset(seed=0)
     assert set(observation) == keys
     assert env.observation_space.contains(observation)
 
 
 def test_observation_is_unchanged_without_additions():
-    env = guided(observe=())
+    env = make_guided(observe=())
     assert env.observation_space == env.env.observation_space
     observation, _ = env.reset(seed=0)
     assert observation.shape == (6,)
 
 
 def two_segments(**second):
-    first = demonstrations(end=(0.0, 0.0, 0.1))
+    """Return a motion to 0.1 m above the target, and a motion down; `second` replaces arguments of the latter."""
+    approach = demonstrations(end=(0.0, 0.0, 0.1))
     down = demonstrations(start=(0.0, 0.0, 0.1), steps=15, seed=1)
     return [
-        Segment(first, frame=at_target, extra=-1.0, name="approach"),
+        Segment(approach, frame=at_target, extra=-1.0, name="approach"),
         Segment(down, **{"frame": at_target, "extra": 1.0, "name": "insert", "dwell": 6, **second}),
     ]
 
 
-def test_segments_follow_each_other_with_their_extra():
-    env = guided(demonstrations=two_segments(), constraints=None, frame=None)
-    infos = episode(env, lambda k: np.zeros(3))
+def test_segments_follow_in_order_with_their_gripper_values():
+    env = make_guided(demonstrations=two_segments(), constraints=None, frame=None)
+    infos = run_episode(env, lambda k: np.zeros(3))
     names = [info["segment"] for info in infos]
     assert names == sorted(names, key=["approach", "insert"].index)
     assert infos[-1]["is_success"]  # only a closed gripper at the target succeeds
     assert infos[-1]["terminated"]
 
 
-def test_frame_is_read_when_its_segment_begins():
-    seen = []
+def test_frame_is_evaluated_at_the_start_of_the_segment():
+    positions = []
 
-    def moving(env, observation):
-        seen.append(env.unwrapped.p.copy())
+    def frame(env, observation):
+        positions.append(env.unwrapped.p.copy())
         return env.unwrapped.target
 
-    env = guided(demonstrations=two_segments(frame=moving), constraints=None, frame=None)
-    episode(env, lambda k: np.zeros(3))
-    assert len(seen) == 1
-    assert np.linalg.norm(seen[0] - env.unwrapped.target) < 0.15
+    env = make_guided(demonstrations=two_segments(frame=frame), constraints=None, frame=None)
+    run_episode(env, lambda k: np.zeros(3))
+    assert len(positions) == 1
+    assert np.linalg.norm(positions[0] - env.unwrapped.target) < 0.15
 
 
 def test_event_ends_a_segment_early():
@@ -185,55 +190,57 @@ def test_event_ends_a_segment_early():
     )
     counts = []
     for segments in (late, early):
-        env = guided(demonstrations=segments, constraints=None, frame=None, action_repeat=1)
-        counts.append(sum(info["segment"] == "approach" for info in episode(env, lambda k: np.zeros(3))))
+        env = make_guided(demonstrations=segments, constraints=None, frame=None, action_repeat=1)
+        counts.append(sum(info["segment"] == "approach" for info in run_episode(env, lambda k: np.zeros(3))))
     assert counts[1] < counts[0] - 3
 
 
-def test_rotated_frame_gives_the_same_motion():
+def test_motion_is_independent_of_the_rotation_of_the_frame():
     R = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = [y @ R for y in SHOWN.outputs]  # R^T applied to every row
-    rotated = type(SHOWN)(SHOWN.times, turned)
-    plain = guided(constraints=None)
-    other = guided(demonstrations=rotated, constraints=None, frame=lambda env, o: Frame(env.unwrapped.target, R))
-    a, b = (episode(env, lambda k: np.zeros(3)) for env in (plain, other))
+    rotated = Demonstrations(RECORDED.times, [y @ R for y in RECORDED.outputs])  # Rᵀ applied to every row
+    unrotated = make_guided(constraints=None)
+    in_rotated_frame = make_guided(
+        demonstrations=rotated, constraints=None, frame=lambda env, o: Frame(env.unwrapped.target, R)
+    )
+    a, b = (run_episode(env, lambda k: np.zeros(3)) for env in (unrotated, in_rotated_frame))
     np.testing.assert_allclose(a[5]["command"], b[5]["command"], atol=5e-3)
     np.testing.assert_allclose(a[-1]["command"], b[-1]["command"], atol=5e-3)
 
 
 @pytest.mark.parametrize("orientation", ["rotation_vector", "euler_zyx"])
-def test_frame_transforms_poses_there_and_back(orientation):
+def test_frame_transforms_are_inverse(orientation):
     frame = Frame([0.1, 0.2, 0.3], [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     output = np.array([0.5, -0.2, 0.1, 0.3, 0.4, -0.5])
     inside = frame.to_frame(output, orientation)
     assert not np.allclose(inside[3:], output[3:])
     np.testing.assert_allclose(frame.to_world(inside, orientation), output, atol=1e-12)
-    turned = frame.to_frame(output, orientation, near=np.array([0, 0, 0, 6.3, 0, 0]))
-    np.testing.assert_allclose(frame.to_world(turned, orientation)[:3], output[:3], atol=1e-12)
+    unwrapped = frame.to_frame(output, orientation, near=np.array([0, 0, 0, 6.3, 0, 0]))
+    np.testing.assert_allclose(frame.to_world(unwrapped, orientation)[:3], output[:3], atol=1e-12)
 
 
 EULER, VECTOR = ("Rz [rad]", "Ry [rad]", "Rx [rad]"), ("r_x [rad]", "r_y [rad]", "r_z [rad]")
 
 
-def pose_shown(angles):
-    """Return demonstrations of poses with a constant orientation, whose last three outputs have the names `angles`."""
-    outputs = [np.hstack([y, np.tile([0.5, -0.4, 0.3], (len(y), 1))]) for y in SHOWN.outputs]
-    return Demonstrations(SHOWN.times, outputs, ["x [m]", "y [m]", "z [m]", *angles])
+def pose_demonstrations(angles):
+    """Return demonstrations of poses with a constant orientation; `angles` are the names of the last three outputs."""
+    outputs = [np.hstack([y, np.tile([0.5, -0.4, 0.3], (len(y), 1))]) for y in RECORDED.outputs]
+    return Demonstrations(RECORDED.times, outputs, ["x [m]", "y [m]", "z [m]", *angles])
 
 
-def guided_poses(angles, **keywords):
+def make_guided_poses(angles, **keywords):
+    """Return an environment with these demonstrations in a frame that is rotated by 90° about z."""
     R = RotationMatrix.MakeZRotation(np.pi / 2).matrix()
     arguments = {
-        "demonstrations": pose_shown(angles),
+        "demonstrations": pose_demonstrations(angles),
         "frame": lambda env, observation: Frame(env.unwrapped.target, R),
         "pose": lambda env, observation: np.append(env.unwrapped.p, np.zeros(3)),
         "to_action": lambda env, observation, command, extra: np.zeros(4),
     }
-    return guided("kmp", **{"constraints": None, **arguments, **keywords})
+    return make_guided("kmp", **{"constraints": None, **arguments, **keywords})
 
 
 @pytest.mark.parametrize(
-    ("angles", "orientation", "meaning"),
+    ("angles", "orientation", "expected_orientation"),
     [
         (EULER, None, "euler_zyx"),
         (("psi_z [rad]", "psi_y [rad]", "psi_x [rad]"), None, "euler_zyx"),
@@ -243,11 +250,11 @@ def guided_poses(angles, **keywords):
         (("a", "b", "c"), "euler_zyx", "euler_zyx"),
     ],
 )
-def test_orientation_has_the_meaning_of_the_names(angles, orientation, meaning):
-    env = guided_poses(angles, orientation=orientation)
-    command = episode(env, lambda k: np.zeros(6))[-1]["command"]
-    expected = Rotation.from_euler("z", np.pi / 2) * pose_rotation(np.array([0.5, -0.4, 0.3]), meaning)
-    assert (pose_rotation(command[3:], meaning).inv() * expected).magnitude() < 0.02
+def test_orientation_follows_from_the_output_names(angles, orientation, expected_orientation):
+    env = make_guided_poses(angles, orientation=orientation)
+    command = run_episode(env, lambda k: np.zeros(6))[-1]["command"]
+    expected = Rotation.from_euler("z", np.pi / 2) * pose_rotation(np.array([0.5, -0.4, 0.3]), expected_orientation)
+    assert (pose_rotation(command[3:], expected_orientation).inv() * expected).magnitude() < 0.02
 
 
 @pytest.mark.parametrize(
@@ -259,26 +266,27 @@ def test_orientation_has_the_meaning_of_the_names(angles, orientation, meaning):
         (EULER, ["euler_zyx"], "no orientation"),
     ],
 )
-def test_orientation_other_than_that_of_the_names_is_refused(angles, orientation, message):
+def test_orientation_that_contradicts_the_names_is_refused(angles, orientation, message):
     with pytest.raises(InputError, match=message):
-        guided_poses(angles, orientation=orientation)
+        make_guided_poses(angles, orientation=orientation)
 
 
 def test_segments_with_different_orientations_are_refused():
+    segments = [Segment(pose_demonstrations(angles)) for angles in (EULER, VECTOR)]
     with pytest.raises(InputError, match="contradicts the euler_zyx of another segment"):
-        guided_poses(EULER, demonstrations=[Segment(pose_shown(EULER)), Segment(pose_shown(VECTOR))], frame=None)
+        make_guided_poses(EULER, demonstrations=segments, frame=None)
 
 
-def test_demonstrated_bounds_and_callables_are_constraints():
-    bounds = compute_bounds(SHOWN, phases=3, margin=0.1, min_margin=0.005)
-    for constraints in (bounds, lambda env, o: LIMIT, lambda env, o: bounds):
-        env = guided(constraints=constraints, action_scale=20.0)
-        infos = episode(env, lambda k: np.array([1.0, 1.0, -1.0]))
+def test_constraints_may_be_computed_bounds_and_functions():
+    bounds = compute_bounds(RECORDED, phases=3, margin=0.1, min_margin=0.005)
+    for constraints in (bounds, lambda env, o: BOX, lambda env, o: bounds):
+        env = make_guided(constraints=constraints, action_scale=20.0)
+        infos = run_episode(env, lambda k: np.array([1.0, 1.0, -1.0]))
         assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
 
 
-def test_fallback_is_counted_and_stays_inside(monkeypatch):
-    env = guided()
+def test_fallback_is_counted_and_satisfies_the_constraints(monkeypatch):
+    env = make_guided()
     env.reset(seed=0)
 
     def fail(*_):
@@ -290,19 +298,19 @@ def test_fallback_is_counted_and_stays_inside(monkeypatch):
     assert info["constraint_violation"] <= TOLERANCE
 
 
-@pytest.mark.parametrize("bad", [[np.nan, 0, 0], [np.inf, 0, 0], [0.0, 0.0], ["a", "b", "c"]])
-def test_wrong_action_is_refused_before_the_environment_moves(bad):
-    env = guided()
+@pytest.mark.parametrize("action", [[np.nan, 0, 0], [np.inf, 0, 0], [0.0, 0.0], ["a", "b", "c"]])
+def test_invalid_action_is_refused_without_a_step(action):
+    env = make_guided()
     env.reset(seed=0)
     before = env.unwrapped.p.copy()
     with pytest.raises(InputError, match="action"):
-        env.step(bad)
+        env.step(action)
     np.testing.assert_array_equal(env.unwrapped.p, before)
     env.step(np.zeros(3))
 
 
 def test_action_beyond_the_range_is_clipped():
-    a, b = (episode(guided(), lambda k, s=scale: np.full(3, s)) for scale in (1.0, 100.0))
+    a, b = (run_episode(make_guided(), lambda k, s=scale: np.full(3, s)) for scale in (1.0, 100.0))
     np.testing.assert_array_equal(a[-1]["command"], b[-1]["command"])
 
 
@@ -335,7 +343,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"action_scale": "large"}, "action_scale is not an array of numbers"),
         ({"guidance": "residual", "action_scale": -1.0}, "action_scale .* must be positive"),
         (
-            {"demonstrations": [Segment(SHOWN, floor=[0.1] * 2)], "constraints": None, "frame": None},
+            {"demonstrations": [Segment(RECORDED, floor=[0.1] * 2)], "constraints": None, "frame": None},
             "floor .* 3 outputs",
         ),
         ({"frame": np.zeros(3)}, r"frame of a segment is a function \(env, observation\) → Frame or origin, not array"),
@@ -348,44 +356,44 @@ def test_action_beyond_the_range_is_clipped():
         ({"demonstrations": 5}, "a list of Segment"),
         ({"observe": None}, "observe has some of phase, command, not None"),
         ({"kind": "dict_with_phase"}, "has an entry 'phase' already"),
-        ({"guidance": "residual", "constraints": MotionConstraints(LIMIT, max_speed=np.ones(3))}, "enforce max_speed"),
+        ({"guidance": "residual", "constraints": MotionConstraints(BOX, max_speed=np.ones(3))}, "enforce max_speed"),
         ({"orientation": "euler_zyx"}, "orientation needs poses of 6 outputs, and there are 3: leave it out"),
     ],
 )
-def test_wrong_argument_is_refused(keywords, message):
+def test_invalid_argument_is_refused(keywords, message):
     with pytest.raises(InputError, match=message):
-        guided(**keywords)
+        make_guided(**keywords)
 
 
 @pytest.mark.parametrize("number", [1, 2])
 def test_fewer_than_three_demonstrations_are_refused(number):
-    segments = [Segment(SHOWN), Segment(SHOWN.first(number), name="insert")]
+    segments = [Segment(RECORDED), Segment(RECORDED.first(number), name="insert")]
     message = f"needs at least 3 in each segment, and segment insert has {number}: record more, or .* prior_std"
     with pytest.raises(InputError, match=message):
-        guided(demonstrations=segments, constraints=None, frame=None)
+        make_guided(demonstrations=segments, constraints=None, frame=None)
     with pytest.raises(InputError, match=f"segment 0 has {number}"):
-        guided(demonstrations=SHOWN.first(number))
+        make_guided(demonstrations=RECORDED.first(number))
 
 
-@pytest.mark.parametrize("wrong", [lambda e, o: np.full(3, np.nan), lambda e, o: np.zeros(2)])
-def test_wrong_pose_is_refused_at_reset(wrong):
-    env = guided(pose=wrong)
+@pytest.mark.parametrize("invalid", [np.full(3, np.nan), np.zeros(2)], ids=["nan", "size"])
+def test_invalid_pose_is_refused_at_reset(invalid):
+    env = make_guided(pose=lambda env, observation: invalid)
     with pytest.raises(InputError, match="pose must return 3 finite numbers"):
         env.reset(seed=0)
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "residual"])
-def test_vector_environment_equals_single_ones(guidance):
+def test_vector_environment_equals_single_environments(guidance):
     keywords = {
-        "demonstrations": SHOWN, "frame": at_target, "constraints": LIMIT, "pose": pose, "to_action": to_action,
+        "demonstrations": RECORDED, "frame": at_target, "constraints": BOX, "pose": pose, "to_action": to_action,
         "guidance": guidance, "period": PERIOD, "action_repeat": 2,
     }  # fmt: skip
     vector = GuidedVectorEnv([PointEnv] * 3, **keywords)
     singles = [GuidedEnv(PointEnv(), **keywords) for _ in range(3)]
     rng = np.random.default_rng(0)
     observations, _ = vector.reset(seed=[3, 4, 5])
-    alone = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4, 5), strict=True)]
-    np.testing.assert_allclose(observations, alone, atol=1e-12)
+    expected = [env.reset(seed=seed)[0] for env, seed in zip(singles, (3, 4, 5), strict=True)]
+    np.testing.assert_allclose(observations, expected, atol=1e-12)
     done = [False] * 3
     for _ in range(15):
         actions = rng.uniform(-1, 1, (3, 3))
@@ -395,17 +403,17 @@ def test_vector_environment_equals_single_ones(guidance):
                 observation, _ = env.reset()
                 done[i] = False
             else:
-                observation, reward, end, cut, info = env.step(actions[i])
-                done[i] = end or cut
+                observation, reward, *ends, info = env.step(actions[i])
+                done[i] = any(ends)
                 assert rewards[i] == pytest.approx(reward, abs=1e-9)
-                assert (terminated[i], truncated[i]) == (end, cut)
+                assert [terminated[i], truncated[i]] == ends
                 assert infos["constraint_violation"][i] == pytest.approx(info["constraint_violation"], abs=1e-12)
             np.testing.assert_allclose(observations[i], observation, atol=1e-6)
     assert vector.single_action_space.shape == (3,)
 
 
-class PoseEnv(PointEnv):
-    """The same with an orientation that follows at once."""
+class PouringPointEnv(PointEnv):
+    """Point environment that starts 0.34 m from the mug of the test."""
 
     def reset(self, *, seed=None, options=None):
         result = super().reset(seed=seed, options=options)
@@ -416,7 +424,7 @@ class PoseEnv(PointEnv):
 def test_template_guides_within_its_active_constraints():
     frames = {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}
     env = GuidedEnv(
-        PoseEnv(),
+        PouringPointEnv(),
         guidance="template",
         template="pouring",
         template_frames=lambda env, o: frames,
@@ -434,7 +442,7 @@ def test_template_guides_within_its_active_constraints():
     assert env.action_space.shape == (3,)
 
 
-def test_template_guide_scales_its_command_in_the_frame():
+def test_scaled_command_of_a_template_is_in_its_frame():
     X_WF = RigidTransform(RotationMatrix.MakeZRotation(np.pi / 2), [6.0, -3.0, 3.0])
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: {"mug_tip": X_WF}, 0.02)
     X_FE = pose_to_transform(np.array([-0.1, -0.2, 0.15, 0.3, 0.1, -0.2]))
@@ -451,38 +459,38 @@ def test_template_guide_scales_its_command_in_the_frame():
 def test_gymnasium_checker_accepts_the_environment():
     from gymnasium.utils.env_checker import check_env
 
-    check_env(guided(), skip_render_check=True)
-    assert isinstance(guided(), gymnasium.Wrapper)
+    check_env(make_guided(), skip_render_check=True)
+    assert isinstance(make_guided(), gymnasium.Wrapper)
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
-def test_shapes_and_limits_hold_in_the_frame_of_a_segment(guidance):
+def test_shapes_and_limits_apply_in_the_segment_frame(guidance):
     ball = Sphere([-0.2, -0.03, 0.0], 0.04)
-    motion = MotionConstraints(LIMIT, [ball], (), np.full(3, 0.8), np.full(3, 8.0))
-    env = guided(guidance, constraints=motion, action_scale=5.0)
+    motion = MotionConstraints(BOX, [ball], (), np.full(3, 0.8), np.full(3, 8.0))
+    env = make_guided(guidance, constraints=motion, action_scale=5.0)
     rng = np.random.default_rng(0)
     env.unwrapped.commands.clear()
-    infos = episode(env, lambda k: rng.uniform(-1, 1, 3))
+    infos = run_episode(env, lambda k: rng.uniform(-1, 1, 3))
     local = np.array(env.unwrapped.commands) - env.unwrapped.target
     assert min(ball.distance(y) for y in local) >= 0.0
-    assert max(LIMIT.violation(y) for y in local) <= TOLERANCE
+    assert max(BOX.violation(y) for y in local) <= TOLERANCE
     assert max(info["constraint_violation"] for info in infos[1:]) <= TOLERANCE
     displacements = np.diff(local, axis=0)
     assert np.abs(displacements).max() <= 0.8 * PERIOD * (1 + 1e-9)
     assert np.abs(np.diff(displacements, axis=0)).max() <= 8.0 * PERIOD**2 * (1 + 1e-6)
 
 
-def test_constraints_of_the_motion_need_a_period():
-    segment = Segment(SHOWN, constraints=MotionConstraints(LIMIT), num_steps=40)
-    env = guided(demonstrations=[segment], constraints=None, frame=None, period=None)
+def test_motion_constraints_raise_without_a_period():
+    segment = Segment(RECORDED, constraints=MotionConstraints(BOX), num_steps=40)
+    env = make_guided(demonstrations=[segment], constraints=None, frame=None, period=None)
     with pytest.raises(InputError, match="period"):
         env.reset(seed=0)
-    guided(demonstrations=[segment], constraints=None, frame=None).reset(seed=0)
+    make_guided(demonstrations=[segment], constraints=None, frame=None).reset(seed=0)
 
 
 @pytest.mark.parametrize("actions", [np.zeros((3, 3)), np.zeros((1, 3)), np.zeros((2, 2)), [[0.0] * 3, [0.0] * 2]])
-def test_vector_environment_refuses_other_numbers_of_actions(actions):
-    vector = GuidedVectorEnv([PointEnv] * 2, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+def test_vector_environment_refuses_actions_of_wrong_shape(actions):
+    vector = GuidedVectorEnv([PointEnv] * 2, demonstrations=RECORDED, pose=pose, to_action=to_action, period=PERIOD)
     vector.reset(seed=0)
     before = [env.unwrapped.p.copy() for env in vector.envs]
     with pytest.raises(InputError, match="actions"):
@@ -491,19 +499,19 @@ def test_vector_environment_refuses_other_numbers_of_actions(actions):
 
 
 @pytest.mark.parametrize("env_fns", [[], [PointEnv()], [PointEnv, None]])
-def test_vector_environment_needs_functions(env_fns):
+def test_vector_environment_raises_without_functions(env_fns):
     with pytest.raises(InputError, match=r"at least one environment|env_fns are functions"):
-        GuidedVectorEnv(env_fns, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+        GuidedVectorEnv(env_fns, demonstrations=RECORDED, pose=pose, to_action=to_action, period=PERIOD)
 
 
-def test_vector_environment_refuses_one_environment_for_two():
+def test_vector_environment_refuses_an_environment_twice():
     env = PointEnv()
     with pytest.raises(InputError, match="an environment of its own: two of them return the same one"):
-        GuidedVectorEnv([lambda: env] * 2, demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+        GuidedVectorEnv([lambda: env] * 2, demonstrations=RECORDED, pose=pose, to_action=to_action, period=PERIOD)
 
 
-class Passing(gymnasium.Wrapper):
-    """Environment whose target is reached at the fourth step alone."""
+class TransientSuccess(gymnasium.Wrapper):
+    """Environment that reports success at its fourth step only."""
 
     def step(self, action):
         self.count = getattr(self, "count", 0) + 1
@@ -512,24 +520,24 @@ class Passing(gymnasium.Wrapper):
 
 @pytest.mark.parametrize("is_vector", [False, True])
 def test_success_inside_an_action_is_reported(is_vector):
-    keywords = {"demonstrations": SHOWN, "pose": pose, "to_action": to_action, "period": PERIOD, "action_repeat": 3}
-    env = GuidedEnv(Passing(PointEnv()), **keywords)
+    keywords = {"demonstrations": RECORDED, "pose": pose, "to_action": to_action, "period": PERIOD, "action_repeat": 3}
+    env = GuidedEnv(TransientSuccess(PointEnv()), **keywords)
     if is_vector:
-        env = GuidedVectorEnv([lambda: Passing(PointEnv())] * 2, **keywords)
+        env = GuidedVectorEnv([lambda: TransientSuccess(PointEnv())] * 2, **keywords)
     env.reset(seed=0)
     infos = [env.step(np.zeros(env.action_space.shape))[-1] for _ in range(3)]
     assert [bool(np.all(info["is_success"])) for info in infos] == [False, True, False]
     assert [np.max(info["control_steps"]) for info in infos] == [3, 6, 9]
     if not is_vector:
-        env = GuidedEnv(Passing(PointEnv()), **keywords)
+        env = GuidedEnv(TransientSuccess(PointEnv()), **keywords)
         row = rollout(env, lambda observation: np.zeros(3), seed=0)
-        assert (row["success"], row["steps"]) == (1, SHOWN.times[0].size)
+        assert (row["success"], row["steps"]) == (1, RECORDED.times[0].size)
 
 
 @pytest.mark.parametrize("reason", ["terminated", "truncated"])
-def test_step_after_the_end_of_an_episode_is_refused(reason):
-    segments = two_segments() if reason == "terminated" else [Segment(SHOWN, frame=at_target)]
-    env = guided(demonstrations=segments, constraints=None, frame=None, action_repeat=60)
+def test_step_raises_after_the_end_of_an_episode(reason):
+    segments = two_segments() if reason == "terminated" else [Segment(RECORDED, frame=at_target)]
+    env = make_guided(demonstrations=segments, constraints=None, frame=None, action_repeat=60)
     env.reset(seed=0)
     _, _, terminated, truncated, _ = env.step(np.zeros(3))
     assert (terminated, truncated) == (reason == "terminated", reason == "truncated")
@@ -543,19 +551,19 @@ def test_step_after_the_end_of_an_episode_is_refused(reason):
 
 def test_condition_that_returns_an_array_is_refused():
     segments = two_segments(until=lambda env, observation: np.zeros(3))
-    env = guided(demonstrations=segments, constraints=None, frame=None)
+    env = make_guided(demonstrations=segments, constraints=None, frame=None)
     with pytest.raises(InputError, match="until of a segment must return True or False, not array"):
-        episode(env, lambda k: np.zeros(3))
+        run_episode(env, lambda k: np.zeros(3))
 
 
-def test_step_needs_a_reset():
-    env = GuidedEnv(PointEnv(), demonstrations=SHOWN, pose=pose, to_action=to_action, period=PERIOD)
+def test_step_raises_before_a_reset():
+    env = GuidedEnv(PointEnv(), demonstrations=RECORDED, pose=pose, to_action=to_action, period=PERIOD)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.step(np.zeros(env.action_space.shape))
 
 
 @pytest.mark.parametrize(("x_of_frame", "x"), [(np.nan, 0.0), (0.0, np.nan)])
-def test_template_guide_refuses_a_start_that_is_not_finite(x_of_frame, x):
+def test_template_guide_refuses_nan_in_frame_or_start(x_of_frame, x):
     frames = {"mug_tip": RigidTransform([x_of_frame, 0.0, 0.0])}
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
     with pytest.raises(InputError, match="must be finite at a reset"):
@@ -563,11 +571,11 @@ def test_template_guide_refuses_a_start_that_is_not_finite(x_of_frame, x):
 
 
 @pytest.mark.parametrize(("guidance", "history"), [("kgrl", 4), ("kmp", 4), ("skgrl", 1), ("skgrl", 4)])
-def test_acceleration_limit_holds_from_segment_to_segment(guidance, history):
+def test_acceleration_is_limited_from_segment_to_segment(guidance, history):
     limits = MotionConstraints(LinearConstraints.none(3), max_speed=np.full(3, 0.8), max_acceleration=np.full(3, 4.0))
     parts = [replace(part, frame=None, constraints=limits, until=None, dwell=0) for part in two_segments()]
-    env = guided(guidance, demonstrations=parts, constraints=None, frame=None, history=history, action_repeat=1)
-    infos = episode(env, lambda k: np.array([1.0, 0.3, 0.0]))
+    env = make_guided(guidance, demonstrations=parts, constraints=None, frame=None, history=history, action_repeat=1)
+    infos = run_episode(env, lambda k: np.array([1.0, 0.3, 0.0]))
     commands = np.array([info["command"] for info in infos[1:]])
     at = next(k for k, info in enumerate(infos[1:]) if info["segment"] != infos[1]["segment"])
     assert np.abs(commands[at - 1] - commands[at - 2]).max() > 1e-3
@@ -576,24 +584,26 @@ def test_acceleration_limit_holds_from_segment_to_segment(guidance, history):
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "kmp", "skgrl"])
-def test_segment_that_begins_too_fast_stays_outside_of_an_obstacle(guidance):
+def test_fast_start_of_a_segment_avoids_an_obstacle(guidance):
     first, second = (replace(part, frame=None, until=None, dwell=0) for part in two_segments())
-    env = guided(guidance, demonstrations=[first, second], constraints=None, frame=None, action_repeat=1)
-    plain = episode(env, lambda k: np.zeros(3))[1:]
-    at = next(k for k, info in enumerate(plain) if info["segment"] != plain[0]["segment"])
-    move = plain[at - 1]["command"] - plain[at - 2]["command"]
-    ball = Sphere(plain[at - 1]["command"] + 0.06 * move / np.linalg.norm(move), 0.05)
+    env = make_guided(guidance, demonstrations=[first, second], constraints=None, frame=None, action_repeat=1)
+    free = run_episode(env, lambda k: np.zeros(3))[1:]
+    at = next(k for k, info in enumerate(free) if info["segment"] != free[0]["segment"])  # start of the second segment
+    displacement = free[at - 1]["command"] - free[at - 2]["command"]
+    # The motion approaches the ball, whose surface is 10 mm away.
+    ball = Sphere(free[at - 1]["command"] + 0.06 * displacement / np.linalg.norm(displacement), 0.05)
     limits = MotionConstraints(LinearConstraints.none(3), [ball], max_acceleration=np.full(3, 0.2))
     parts = [first, replace(second, constraints=limits)]
-    env = guided(guidance, demonstrations=parts, constraints=None, frame=None, action_repeat=1)
-    infos = episode(env, lambda k: np.zeros(3))[1:]
+    env = make_guided(guidance, demonstrations=parts, constraints=None, frame=None, action_repeat=1)
+    infos = run_episode(env, lambda k: np.zeros(3))[1:]
     assert max(info["constraint_violation"] for info in infos[at:]) <= TOLERANCE
     assert infos[at]["fallback"] == 1
 
 
 @pytest.mark.parametrize(("guidance", "last"), [("kgrl", 3.14), ("skgrl", 3.16)])
-def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
-    def turning(first, last):
+def test_angle_near_pi_is_continuous_in_the_next_segment(guidance, last):
+    def rotation(first, last):
+        """Return demonstrations of a rotation about z from one angle to another [rad]."""
         rng, t = np.random.default_rng(0), PERIOD * np.arange(20)
         angles = np.linspace(first, last, 20) + rng.normal(scale=0.02, size=(5, 1)) * np.sin(np.pi * t / t[-1])
         return Demonstrations([t] * 5, [np.column_stack([np.zeros((20, 3)), a, np.zeros((20, 2))]) for a in angles])
@@ -601,7 +611,7 @@ def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
     limits = MotionConstraints(LinearConstraints.none(6), max_speed=np.full(6, 3.0), max_acceleration=np.full(6, 20.0))
     env = GuidedEnv(
         PointEnv(),
-        demonstrations=[Segment(turning(*ends), constraints=limits) for ends in ((2.0, last), (0.0, 0.1))],
+        demonstrations=[Segment(rotation(*ends), constraints=limits) for ends in ((2.0, last), (0.0, 0.1))],
         pose=lambda env, observation: np.array([0.0, 0.0, 0.0, 2.0, 0.0, 0.0]),
         to_action=lambda env, observation, command, extra: np.zeros(4),
         orientation="euler_zyx",
@@ -609,44 +619,44 @@ def test_turn_beyond_half_a_turn_continues_in_the_next_segment(guidance, last):
         period=PERIOD,
         action_repeat=1,
     )
-    turn = np.unwrap([info["command"][3] for info in episode(env, lambda k: np.zeros(6))[1:]])
-    assert np.ptp(turn[:20]) > 1.0
-    assert np.abs(np.diff(turn)).max() <= 3.0 * PERIOD * (1 + 1e-6)
-    assert np.abs(np.diff(turn, 2)).max() <= 20.0 * PERIOD**2 * (1 + 1e-6)
+    angles = np.unwrap([info["command"][3] for info in run_episode(env, lambda k: np.zeros(6))[1:]])
+    assert np.ptp(angles[:20]) > 1.0
+    assert np.abs(np.diff(angles)).max() <= 3.0 * PERIOD * (1 + 1e-6)
+    assert np.abs(np.diff(angles, 2)).max() <= 20.0 * PERIOD**2 * (1 + 1e-6)
 
 
 @pytest.mark.parametrize("guidance", ["residual", "clipped_residual", "kgrl"])
 @pytest.mark.parametrize(
-    ("wrong", "message"),
+    ("constraints", "message"),
     [
         (LinearConstraints.none(2), "on 2 outputs, the reference has 3"),
         (LinearConstraints.box(-np.ones((10, 3)), np.ones((10, 3))), "for 10 steps, the reference has 25"),
     ],
 )
-def test_constraints_of_another_size_are_refused_at_reset(guidance, wrong, message):
-    env = guided(guidance, constraints=lambda env, observation: wrong)
+def test_constraints_of_a_wrong_size_are_refused_at_reset(guidance, constraints, message):
+    env = make_guided(guidance, constraints=lambda env, observation: constraints)
     with pytest.raises(InputError, match=message):
         env.reset(seed=0)
 
 
 @pytest.mark.parametrize("limit", ["max_speed", "max_acceleration"])
-def test_residual_refuses_limits_that_a_function_returns(limit):
-    motion = MotionConstraints(LIMIT, **{limit: [1.0, np.inf, np.inf]})
-    env = guided("clipped_residual", constraints=lambda env, observation: motion)
+def test_residual_refuses_motion_limits_at_reset(limit):
+    motion = MotionConstraints(BOX, **{limit: [1.0, np.inf, np.inf]})
+    env = make_guided("clipped_residual", constraints=lambda env, observation: motion)
     with pytest.raises(InputError, match=f"only kgrl, skgrl and kmp enforce {limit}"):
         env.reset(seed=0)
-    episode(guided("clipped_residual", constraints=MotionConstraints(LIMIT)), lambda k: np.zeros(3))
+    run_episode(make_guided("clipped_residual", constraints=MotionConstraints(BOX)), lambda k: np.zeros(3))
 
 
-def test_failed_reset_leaves_no_episode():
-    measured = [np.zeros(3), np.full(3, np.nan)]
-    env = guided(pose=lambda env, observation: measured[0])
+def test_step_raises_after_a_failed_reset():
+    measured = np.zeros(3)
+    env = make_guided(pose=lambda env, observation: measured)
     env.reset(seed=0)
     env.step(np.zeros(3))
-    measured.reverse()
+    measured = np.full(3, np.nan)
     with pytest.raises(InputError, match="pose must return"):
         env.reset(seed=1)
-    measured.reverse()
+    measured = np.zeros(3)
     with pytest.raises(gymnasium.error.ResetNeeded, match="call reset"):
         env.step(np.zeros(3))
 
@@ -656,7 +666,7 @@ def test_failed_reset_leaves_no_episode():
 def test_error_skips_no_command(failing, guidance, monkeypatch):
     calls = {failing: 0}
 
-    def fails(name, function):
+    def fail_at_fourth_call(name, function):
         def call(*arguments):
             calls[name] = calls.get(name, 0) + 1
             if name == failing and calls[name] == 4:
@@ -666,44 +676,45 @@ def test_error_skips_no_command(failing, guidance, monkeypatch):
         return call
 
     def commands(is_failing):
-        wrap = fails if is_failing else lambda name, function: function
-        segment = Segment(SHOWN, frame=at_target, constraints=LIMIT, extra=wrap("extra", lambda phase, is_over: 0.0))
+        """Return the commands of eight actions; a failed action is repeated."""
+        wrap = fail_at_fourth_call if is_failing else lambda name, function: function
+        segment = Segment(RECORDED, frame=at_target, constraints=BOX, extra=wrap("extra", lambda phase, is_over: 0.0))
         keywords = {"demonstrations": [segment], "constraints": None, "frame": None, "action_repeat": 1}
-        env = guided(
+        env = make_guided(
             guidance, **keywords, to_action=wrap("to_action", lambda e, o, command, extra: np.append(command, 0))
         )
         monkeypatch.setattr(env.unwrapped, "step", wrap("step", env.unwrapped.step))
         env.reset(seed=0)
-        taken = []
-        while len(taken) < 8:
+        results = []
+        while len(results) < 8:
             with nullcontext() if not is_failing or calls[failing] != 3 else pytest.raises(OSError, match="connection"):
-                taken.append(env.step(np.full(3, 0.3))[-1]["command"])
-        return taken
+                results.append(env.step(np.full(3, 0.3))[-1]["command"])
+        return results
 
     np.testing.assert_array_equal(commands(True), commands(False))
 
 
 def test_error_skips_no_command_of_a_template():
-    is_failing = [False]
+    is_failing = False
 
     def extra(state):
-        if is_failing[0]:
+        if is_failing:
             raise OSError("no connection")
         return 0.0
 
     outputs = []
-    for failing_at in (None, 3):
+    for failing_step in (None, 3):
         template_guide = guide.TemplateGuide(
             load_template("pouring"), lambda env, o: {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}, 0.02, extra
         )
         template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.0, 0.0, 0.0]))
         for k in range(6):
-            is_failing[0] = k == failing_at
+            is_failing = k == failing_step
             template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
-            if is_failing[0]:
+            if is_failing:
                 with pytest.raises(OSError, match="connection"):
                     template_guide.finish(None)
-                is_failing[0] = False
+                is_failing = False
                 template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
             command = template_guide.finish(None)
         outputs.append(command.output)
@@ -711,18 +722,18 @@ def test_error_skips_no_command_of_a_template():
 
 
 @pytest.mark.parametrize("name", ["demonstrations", "constraints", "frame", "action_dims"])
-def test_argument_that_a_guide_does_not_use_is_refused(name):
-    given = {"demonstrations": SHOWN, "constraints": LIMIT, "frame": at_target, "action_dims": [0]}
-    functions = {"pose": pose, "to_action": to_action, "guidance": guided().guide}
+def test_unused_argument_is_refused_with_a_guide(name):
+    arguments = {"demonstrations": RECORDED, "constraints": BOX, "frame": at_target, "action_dims": [0]}
+    functions = {"pose": pose, "to_action": to_action, "guidance": make_guided().guide}
     with pytest.raises(InputError, match=f"a guide does not use {name}"):
-        GuidedEnv(PointEnv(), **functions, **{name: given[name]})
+        GuidedEnv(PointEnv(), **functions, **{name: arguments[name]})
     GuidedEnv(PointEnv(), **functions).reset(seed=0)
 
 
-def test_vector_environment_refuses_nan_in_the_row_of_a_reset():
+def test_vector_environment_refuses_nan_when_it_resets():
     vector = GuidedVectorEnv(
         (make for make in [PointEnv] * 2),
-        demonstrations=SHOWN, frame=at_target, pose=pose, to_action=to_action, period=PERIOD, action_repeat=100,
+        demonstrations=RECORDED, frame=at_target, pose=pose, to_action=to_action, period=PERIOD, action_repeat=100,
     )  # fmt: skip
     vector.reset(seed=0)
     *_, truncated, _ = vector.step(np.zeros((2, 3)))
@@ -731,7 +742,7 @@ def test_vector_environment_refuses_nan_in_the_row_of_a_reset():
         vector.step(np.full((2, 3), np.nan))
 
 
-def test_frames_of_a_template_may_be_transforms_of_drake():
+def test_template_frames_may_be_drake_transforms():
     drake, scaled = pytest.importorskip("pydrake.math"), []
     for X_WF in (RigidTransform([0.6, 0.0, 0.3]), drake.RigidTransform([0.6, 0.0, 0.3])):
         template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, o, X=X_WF: {"mug_tip": X}, 0.02)
@@ -743,42 +754,45 @@ def test_frames_of_a_template_may_be_transforms_of_drake():
 
 
 @pytest.mark.parametrize("frames", [None, 5, {"mug_tip": np.eye(4)}, {"mug_tip": None}])
-def test_frames_of_a_template_that_are_no_poses_are_refused(frames):
+def test_template_frames_are_refused_when_not_poses(frames):
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
     with pytest.raises(InputError, match=r"poses by name, not|the frame mug_tip is a RigidTransform, as of Drake, not"):
         template_guide.reset(None, None, np.zeros(6))
 
 
-class Broken(PointEnv):
-    """Environment whose step returns NaN in one place."""
-
-    where = "observation"
+class NanObservationEnv(PointEnv):
+    """Point environment whose observations after the reset are NaN."""
 
     def step(self, action):
-        observation, reward, *rest = super().step(action)
-        return (observation * np.nan, reward, *rest) if self.where == "observation" else (observation, np.nan, *rest)
+        observation, *rest = super().step(action)
+        return observation * np.nan, *rest
 
 
-class BrokenReward(Broken):
-    where = "reward"
+class NanRewardEnv(PointEnv):
+    """Point environment whose rewards are NaN."""
+
+    def step(self, action):
+        observation, _, *rest = super().step(action)
+        return observation, np.nan, *rest
 
 
-def stepped(make, is_vector, to_action):
-    keywords = {"demonstrations": SHOWN, "frame": at_target, "pose": pose, "to_action": to_action, "period": PERIOD}
+def reset_and_step(make, is_vector, to_action):
+    """Reset and step one guided environment, or a vector of two."""
+    keywords = {"demonstrations": RECORDED, "frame": at_target, "pose": pose, "to_action": to_action, "period": PERIOD}
     env = GuidedVectorEnv([make] * 2, **keywords) if is_vector else GuidedEnv(make(), **keywords)
     env.reset(seed=0)
     env.step(np.zeros((2, 3) if is_vector else 3))
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
-@pytest.mark.parametrize("wrong", [None, np.zeros(3), np.full(4, np.nan), [0.0, [0.0]], "open", np.full(4, np.inf)])
-def test_to_action_that_returns_no_action_is_refused(wrong, is_vector):
+@pytest.mark.parametrize("action", [None, np.zeros(3), np.full(4, np.nan), [0.0, [0.0]], "open", np.full(4, np.inf)])
+def test_invalid_result_of_to_action_is_refused(action, is_vector):
     with pytest.raises(InputError, match=r"to_action must return finite numbers of shape \(4,\), not"):
-        stepped(PointEnv, is_vector, lambda env, observation, command, extra: wrong)
+        reset_and_step(PointEnv, is_vector, lambda env, observation, command, extra: action)
 
 
 @pytest.mark.parametrize("is_vector", [False, True])
-@pytest.mark.parametrize("make", [Broken, BrokenReward])
-def test_environment_that_returns_nan_is_refused(make, is_vector):
+@pytest.mark.parametrize("make", [NanObservationEnv, NanRewardEnv])
+def test_nan_from_the_environment_is_refused(make, is_vector):
     with pytest.raises(InputError, match=r"the environment returned .*(nan|NaN)"):
-        stepped(make, is_vector, to_action)
+        reset_and_step(make, is_vector, to_action)

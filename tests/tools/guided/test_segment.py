@@ -1,4 +1,4 @@
-"""Cutting at events, discrete outputs and alignment in time."""
+"""Segments of a motion: events, cuts, discrete outputs, frames and alignment in time."""
 
 import tracemalloc
 
@@ -12,12 +12,13 @@ from guiderail.tools.guided.guide import GuideSettings
 
 
 def recordings():
+    """Return three demonstrations of 40 samples of two outputs, 0.1 s apart."""
     t = 0.1 * np.arange(40)
     paths = [np.column_stack([np.linspace(0, 1, 40), np.full(40, float(m))]) for m in range(3)]
     return Demonstrations([t] * 3, paths, ["x [m]", "y [m]"])
 
 
-def test_events_are_found_one_after_the_other():
+def test_find_events_searches_the_conditions_in_order():
     signals = [np.array([[0], [1], [0], [1], [2]]), np.array([[1], [1], [0], [2], [1]])]
     events = find_events(signals, [lambda s: s[0] == 1, lambda s: s[0] == 2])
     assert events == [[1, 4], [0, 3]]
@@ -37,16 +38,16 @@ def test_events_are_found_one_after_the_other():
         ([np.zeros((5, 2))], [lambda s: s > 0], r"a condition must return True or False, not array"),
     ],
 )
-def test_wrong_argument_of_the_search_for_events_is_refused(signals, conditions, message):
+def test_find_events_raises_when_an_argument_is_invalid(signals, conditions, message):
     with pytest.raises(InputError, match=message):
         find_events(signals, conditions)
 
 
-def test_events_are_found_in_an_array_of_recordings():
+def test_find_events_accepts_an_array_of_recordings():
     assert find_events(np.arange(10.0).reshape(2, 5, 1), [lambda s: s[0] in (3, 7)]) == [[3], [2]]
 
 
-def test_cut_parts_share_the_sample_and_begin_at_zero():
+def test_cut_parts_share_a_sample_and_begin_at_time_zero():
     parts = cut_demonstrations(recordings(), [[10, 30], [12, 25], [9, 20]])
     assert [len(part.times[0]) for part in parts] == [11, 21, 10]
     assert all(t[0] == 0.0 for part in parts for t in part.times)
@@ -67,21 +68,32 @@ def test_cut_parts_share_the_sample_and_begin_at_zero():
         [[5.5]] * 3,
     ],
 )
-def test_wrong_cut_is_refused(cuts):
+def test_cut_demonstrations_raises_when_a_cut_is_invalid(cuts):
     with pytest.raises(InputError, match="cuts"):
         cut_demonstrations(recordings(), cuts)
 
 
-def test_discrete_output_is_the_most_frequent_at_each_phase():
-    grips = [np.where(np.arange(40) < k, -1, 1) for k in (10, 20, 30)]
-    values = Segment(recordings(), discrete=grips).discrete_values(20)
+GRIPPER = [np.where(np.arange(40) < k, -1, 1) for k in (10, 20, 30)]  # closes at sample k
+
+
+def test_discrete_value_is_the_most_frequent_at_each_phase():
+    values = Segment(recordings(), discrete=GRIPPER).discrete_values(20)
     assert [int(v) for v in values] == [-1] * 10 + [1] * 10
-    uneven = [np.zeros((40, width)) for width in (1, 1, 2)]
-    for wrong in (grips[:2], [1, 2, 3], 5, [[[1], [1, 2]]] * 3, uneven):
-        with pytest.raises(InputError, match="a value for each sample"):
-            Segment(recordings(), discrete=wrong).discrete_values(20)
+
+
+@pytest.mark.parametrize(
+    "discrete",
+    [5, [1, 1, 1], [None] * 3, [[0.0, [1.0]]] * 3, [[[1], [1, 2]]] * 3, GRIPPER[:2],
+     [np.zeros((40, width)) for width in (1, 1, 2)]],
+)  # fmt: skip
+def test_discrete_values_raise_when_not_one_per_sample(discrete):
+    with pytest.raises(InputError, match="a value for each sample"):
+        Segment(recordings(), discrete=discrete).discrete_values(20)
+
+
+def test_segment_raises_when_it_has_discrete_and_extra():
     with pytest.raises(InputError, match="not both"):
-        Segment(recordings(), discrete=grips, extra=1.0)
+        Segment(recordings(), discrete=GRIPPER, extra=1.0)
 
 
 @pytest.mark.parametrize(
@@ -95,18 +107,21 @@ def test_discrete_output_is_the_most_frequent_at_each_phase():
         ({"dwell": np.inf}, "at least 0, not inf"),
     ],
 )
-def test_wrong_argument_of_a_segment_is_refused(keywords, message):
+def test_segment_raises_when_an_argument_is_invalid(keywords, message):
     with pytest.raises(InputError, match=message):
         Segment(recordings(), **keywords)
 
 
-def test_demonstrations_of_another_type_are_refused():
-    with pytest.raises(InputError, match=r"Demonstrations or their file, not \[1, 2\]"):
-        Segment([1, 2])
+@pytest.mark.parametrize(
+    ("demonstrations", "value"), [(None, "None"), (5, "5"), ([1, 2], r"\[1, 2\]"), ([recordings()], "")]
+)
+def test_segment_raises_when_demonstrations_have_a_wrong_type(demonstrations, value):
+    with pytest.raises(InputError, match=f"demonstrations of a segment are Demonstrations or their file, not {value}"):
+        Segment(demonstrations)
 
 
 @pytest.mark.parametrize("history", [0, 1.5, np.inf, "4"])
-def test_history_without_an_output_is_refused(history):
+def test_guide_settings_raise_when_history_is_invalid(history):
     with pytest.raises(InputError, match="history is a number of outputs, at least 1, not"):
         GuideSettings(history=history)
     assert type(GuideSettings(history=2.0).history) is int
@@ -133,12 +148,12 @@ def test_number_of_steps_follows_from_the_period():
         (([0, 0, 0], np.diag([1.0, 1.0, -1.0])), "must not be a reflection"),
     ],
 )
-def test_wrong_frame_is_refused(arguments, message):
+def test_frame_raises_when_an_argument_is_invalid(arguments, message):
     with pytest.raises(InputError, match=message):
         Frame(*arguments)
 
 
-def test_frame_that_does_not_fit_the_outputs_is_refused():
+def test_frame_raises_when_outputs_have_a_wrong_size():
     with pytest.raises(InputError, match="does not fit outputs of 2 numbers"):
         Frame([0, 0, 0]).to_world(np.zeros(2), "rotation_vector")
     with pytest.raises(InputError, match="and a rotation does not fit outputs of 4 numbers"):
@@ -150,15 +165,15 @@ def test_alignment_moves_an_event_to_the_same_phase():
     steps = [np.column_stack([1 / (1 + np.exp(-60 * (t - at))), t * 0]) for at in (0.4, 0.5, 0.6)]
     before = Demonstrations([t] * 3, steps)
     after = align_demonstrations(before, band=0.3)
-    at = [[int(np.argmax(y[:, 0] > 0.5)) for y in shown.outputs] for shown in (before, after)]
-    assert np.ptp(at[0]) >= 19
-    assert np.ptp(at[1]) <= 2
+    events = [[int(np.argmax(y[:, 0] > 0.5)) for y in motions.outputs] for motions in (before, after)]
+    assert np.ptp(events[0]) >= 19  # samples
+    assert np.ptp(events[1]) <= 2
     assert all(y.min() >= 0 and y.max() <= 1 for y in after.outputs)
     np.testing.assert_array_equal(after.outputs[1], steps[1])
 
 
-def path_of_the_full_matrix(target, other, width):
-    """Return the warping path from the matrix of all costs."""
+def warping_path_by_full_matrix(target, other, width):
+    """Return the first and last matching sample of `other` for each sample of `target`, by the matrix of all costs."""
     size = len(target)
     cost = np.full((size + 1, size + 1), np.inf)
     cost[0, 0] = 0.0
@@ -175,10 +190,10 @@ def path_of_the_full_matrix(target, other, width):
 
 @pytest.mark.parametrize("decimals", [0, 6])  # rounded samples have equal costs
 @pytest.mark.parametrize("width", [1, 7, 60])
-def test_alignment_path_equals_that_of_the_full_matrix(width, decimals):
+def test_warping_path_equals_the_path_by_the_full_matrix(width, decimals):
     rng = np.random.default_rng(width)
     target, other = (np.round(rng.normal(size=(50, 2)).cumsum(axis=0), decimals) for _ in range(2))
-    assert _warping_path(target, other, width) == path_of_the_full_matrix(target, other, width)
+    assert _warping_path(target, other, width) == warping_path_by_full_matrix(target, other, width)
 
 
 def test_alignment_needs_less_than_a_byte_per_pair_of_samples():
@@ -191,7 +206,7 @@ def test_alignment_needs_less_than_a_byte_per_pair_of_samples():
     assert peak < 1000**2
 
 
-def test_alignment_of_too_many_samples_is_refused():
+def test_alignment_raises_when_there_are_too_many_samples():
     times = np.linspace(0.0, 1.0, MAX_ALIGNED_SAMPLES + 1)
     long = Demonstrations(times, [np.sin(times)[:, None], times[:, None]])
     with pytest.raises(InputError, match=r"10,001 samples can't be aligned, at most 10,000: resample them first"):
@@ -199,18 +214,6 @@ def test_alignment_of_too_many_samples_is_refused():
 
 
 @pytest.mark.parametrize("band", [0.0, -1.0, 1.5])
-def test_wrong_band_is_refused(band):
+def test_alignment_raises_when_the_band_is_invalid(band):
     with pytest.raises(InputError, match="band"):
         align_demonstrations(recordings(), band)
-
-
-@pytest.mark.parametrize("wrong", [None, 5, [recordings()]])
-def test_segment_needs_demonstrations_or_their_file(wrong):
-    with pytest.raises(InputError, match="demonstrations of a segment are Demonstrations or their file, not"):
-        Segment(wrong)
-
-
-@pytest.mark.parametrize("discrete", [5, [1, 1, 1], [None] * 3, [[0.0, [1.0]]] * 3])
-def test_discrete_outputs_that_are_no_lists_are_refused(discrete):
-    with pytest.raises(InputError, match="a value for each sample"):
-        Segment(recordings(), discrete=discrete).discrete_values(12)

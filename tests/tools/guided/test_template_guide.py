@@ -1,4 +1,4 @@
-"""Guide by a template: refused templates and starts."""
+"""Templates and start poses that a template guide refuses."""
 
 import numpy as np
 import pytest
@@ -26,13 +26,13 @@ states:
 """
 
 
-def test_template_guide_refuses_a_start_far_outside():
-    frames = {"mug_tip": RigidTransform([0.0, 0.0, 300.0])}  # in millimeters
+def test_template_guide_raises_far_from_the_constraints():
+    frames = {"mug_tip": RigidTransform([0.0, 0.0, 300.0])}  # height of 300 mm, given in meters by mistake
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
     with pytest.raises(InputError, match="outside of the active constraints of the template pouring"):
         template_guide.reset(None, None, np.zeros(6))
 
 
-def test_template_guide_refuses_constraints_that_contradict():
+def test_template_guide_raises_when_constraints_contradict():
     with pytest.raises(InputError, match="slab, state above: active constraint 1"):
         guide.TemplateGuide(parse_template(CONTRADICTORY), lambda env, observation: {}, 0.02)
