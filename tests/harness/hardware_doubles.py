@@ -14,7 +14,7 @@ class ClockRecorder:
 
 
 def unplugged(*arguments):
-    """Raise an error; the message has two spaces, of which reports keep one."""
+    """Raise an error whose message has two successive spaces, which reports replace by one."""
     raise OSError("cable  unplugged")
 
 

@@ -153,7 +153,7 @@ def test_lockstep_clock_acknowledges_repeats_without_a_step():
         clock.advance(simulator, ClockRecorder(), 1)
         lcm.HandleSubscriptions(0)
     assert simulator.get_context().get_time() == 3 * STATUS_PERIOD
-    # A status is acknowledged when the next one is needed.
+    # A status is acknowledged when the next status is needed.
     assert acknowledgements == [b"", *(bytes([number]) * HEAD_SIZE for number in range(2))]
     acknowledgements.clear()
     lcm.Publish("STATUS", bytes([2]) * 40)

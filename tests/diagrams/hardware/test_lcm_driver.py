@@ -12,11 +12,11 @@ OWN, FOREIGN = np.full(7, 0.5), np.full(7, -0.5)
 
 
 class TwoPrograms:
-    """Drivers of two programs on the same bus; `driver` is under test."""
+    """Drivers of two programs on the same bus; `driver` is under test, and `second` is foreign."""
 
     def __init__(self):
         lcm = DrakeLcm("memq://")
-        self.driver, self.other, self.step = IiwaDriver(lcm), IiwaDriver(lcm), 0
+        self.driver, self.second, self.step = IiwaDriver(lcm), IiwaDriver(lcm), 0
 
     def send_status(self, time=None, position=0.0):
         """Send a status at `time` [s], by default a period later, and read it."""
@@ -44,14 +44,14 @@ def test_own_commands_are_not_foreign():
 
 def test_foreign_commands_count_after_the_first_own_command():
     programs = TwoPrograms()
-    programs.other.write(FOREIGN, 1.0)
+    programs.second.write(FOREIGN, 1.0)
     assert programs.send_status().foreign_commands == 0
     assert programs.driver.num_foreign_commands == 1
     programs.driver.write(OWN, 1.0)
     assert programs.read().foreign_commands == 0
-    programs.other.write(FOREIGN, 1.0)
+    programs.second.write(FOREIGN, 1.0)
     assert programs.read().foreign_commands == 1  # without a new status
-    programs.other.write(FOREIGN, 1.005)
+    programs.second.write(FOREIGN, 1.005)
     assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands - 1 == 2
 
 
@@ -59,27 +59,27 @@ def test_foreign_commands_count_after_the_first_own_command():
 def test_commands_of_a_safety_monitor_are_not_foreign(is_stopping):
     programs = TwoPrograms()
     programs.driver.write(OWN, 1.0)
-    programs.other.write_heartbeat(Heartbeat(1, False, 5))
-    programs.other.write_heartbeat(Heartbeat(1, is_stopping, 4))
-    programs.other.write(FOREIGN, 1.0)
+    programs.second.write_heartbeat(Heartbeat(1, False, 5))
+    programs.second.write_heartbeat(Heartbeat(1, is_stopping, 4))
+    programs.second.write(FOREIGN, 1.0)
     assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands == (not is_stopping)
-    programs.other.write_heartbeat(Heartbeat(2, False, 4))
-    programs.other.write(FOREIGN, 1.005)
+    programs.second.write_heartbeat(Heartbeat(2, False, 4))
+    programs.second.write(FOREIGN, 1.005)
     assert programs.read().foreign_commands == 1 + (not is_stopping)
 
 
 def test_commands_are_foreign_after_a_stopping_monitor_ended():
     programs = TwoPrograms()
     programs.driver.write(OWN, 1.0)
-    programs.other.write_heartbeat(Heartbeat(7, True, 4))
+    programs.second.write_heartbeat(Heartbeat(7, True, 4))
     for sequence in range(MAX_HEARTBEATS_MISSED + 1):
-        programs.other.write(FOREIGN, sequence * 0.005)
+        programs.second.write(FOREIGN, sequence * 0.005)
         assert programs.read() is None
         assert programs.driver.num_foreign_commands == 0
-        programs.other.write_heartbeat(Heartbeat(sequence, False, 5))  # of the monitor that replaces the ended monitor
+        programs.second.write_heartbeat(Heartbeat(sequence, False, 5))  # of the monitor that replaces the ended monitor
     programs.read()
     assert {heartbeat.sender for heartbeat in programs.driver.read_heartbeats()} == {5}
-    programs.other.write(FOREIGN, 9.0)
+    programs.second.write(FOREIGN, 9.0)
     assert programs.send_status().foreign_commands == programs.driver.num_foreign_commands == 1
 
 
@@ -135,7 +135,7 @@ def test_heartbeats_of_two_monitors_do_not_displace_each_other():
 def test_older_heartbeat_does_not_replace_a_newer_heartbeat():
     programs = TwoPrograms()
     for number, sequence in ((1, 5), (0, 4)):
-        programs.other.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
+        programs.second.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
         programs.read()
     assert programs.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
 

@@ -66,7 +66,7 @@ def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_pa
     monkeypatch.setattr(executing.Policy, "load", lambda folder: policy)
     monkeypatch.setattr(executing, "set_realtime_priority", lambda: True)
     monkeypatch.setattr(RobotConnection, "simulated_driver", simulated_driver)
-    monkeypatch.setattr(RobotConnection, "clocks", lambda other, station: (clock, None))
+    monkeypatch.setattr(RobotConnection, "clocks", lambda connection, station: (clock, None))
     monkeypatch.setattr("guiderail.tools.hardware.preflight.SETTLING_TIME", 0.1)
     monkeypatch.setattr(RobotConnection, "timing", lambda connection, station, clock: {})
     options = {"guidance": "kmp", "fixture_offset": "none"}
