@@ -24,6 +24,6 @@ def failed_checks(checks):
 
 
 def max_joint_speed(clock):
-    """Return the largest joint speed [rad/s] of the simulated robot of an `injections.together.Together`."""
+    """Return the largest joint speed [rad/s] of the simulated robot of a `SteppedRobotClock`."""
     plant = clock.robot.plant
     return np.abs(plant.GetVelocities(plant.GetMyContextFromRoot(clock.simulator.get_context()))).max()
