@@ -1,4 +1,4 @@
-"""A simulation can be continued from a cloned context."""
+"""Simulation that continues from a cloned context."""
 
 import numpy as np
 from pydrake.systems.analysis import InitializeParams, Simulator

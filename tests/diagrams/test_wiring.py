@@ -1,4 +1,4 @@
-"""Addition of a system together with its connections."""
+"""Connections that `add_system` makes, and terms of an observation."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from guiderail.diagrams.envs.observation import Observation, ObservationTerm
 from guiderail.diagrams.wiring import add_system
 
 
-def test_ports_are_connected_in_order_and_the_system_is_returned():
+def test_add_system_connects_ports_in_order():
     builder = DiagramBuilder()
     first, second = (add_system(builder, name, ConstantVectorSource([x])) for name, x in (("one", 1.0), ("two", 2.0)))
     adder = Adder(2, 1)
@@ -21,7 +21,7 @@ def test_ports_are_connected_in_order_and_the_system_is_returned():
 
 
 @pytest.mark.parametrize("waits", [False, True])
-def test_observation_has_a_signal_of_any_name_twice(waits):
+def test_observation_contains_a_signal_for_each_term(waits):
     sizes = dict.fromkeys(("observed", "scaled", "clipped", "motion_time"), 1)
     terms = [ObservationTerm(name, scale=scale) for scale in (1.0, 0.5) for name in (*sizes, "time", "phase")]
     observation = Observation(terms, sizes, duration=4.0, clip=100.0, waits=waits)
@@ -30,12 +30,11 @@ def test_observation_has_a_signal_of_any_name_twice(waits):
     for value, name in enumerate(sizes):
         observation.GetInputPort(name).FixValue(context, [float(value)])
     once = np.array([0.0, 1.0, 2.0, 3.0, *((3.0, 0.5) if waits else (2.0, 0.0))])
-    seen = observation.get_observation_output_port().Eval(context)
-    np.testing.assert_allclose(seen, [*once, *(2.0 * once)], atol=1e-12)
+    observed = observation.get_observation_output_port().Eval(context)
+    np.testing.assert_allclose(observed, [*once, *(2.0 * once)], atol=1e-12)
 
 
-def test_ports_are_connected_by_any_name():
-    """A signal of a task may have the name of an argument of the function."""
+def test_add_system_connects_ports_named_like_its_arguments():
     builder = DiagramBuilder()
     terms = [ObservationTerm(name) for name in ("name", "system", "builder")]
     observation = Observation(terms, dict.fromkeys(("name", "system", "builder"), 1), duration=1.0, clip=10.0)

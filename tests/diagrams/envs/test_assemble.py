@@ -1,4 +1,4 @@
-"""Prior knowledge of a task on stations, and log output."""
+"""Prior knowledge of a task for a station, and log output of environments."""
 
 from types import SimpleNamespace
 
@@ -21,7 +21,7 @@ PERIOD = 0.02
 
 
 def make_prior(turn, station, period=PERIOD):
-    """Return the prior knowledge of a motion that turns by `turn` [rad] about z."""
+    """Return the prior knowledge of a turn by `turn` [rad] about z, for a station with the period `period` [s]."""
     means = np.zeros((30, 6))
     means[:, 3] = np.linspace(0.0, turn, 30)
     reference = ReferenceTrajectory(PERIOD * np.arange(30), means, np.tile(1e-6 * np.eye(6), (30, 1, 1)))
@@ -33,26 +33,26 @@ def make_prior(turn, station, period=PERIOD):
         isotropic_groups=None,
         config=SimpleNamespace(part=lambda name: {}),
     )
-    where = SimpleNamespace(
+    ports = SimpleNamespace(
         wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period
     )
-    return build_prior_knowledge(task, where)
+    return build_prior_knowledge(task, ports)
 
 
 @pytest.mark.parametrize("period", [0.01, 0.1])
-def test_motion_of_another_period_is_refused(period):
+def test_prior_is_refused_when_the_control_period_differs(period):
     with pytest.raises(InputError, match="would not have the demonstrated speed"):
         make_prior(1.0, GantryStation, period)
 
 
-def test_a_clock_that_is_disturbed_is_no_other_demonstration():
+def test_prior_is_accepted_when_clock_factor_changes_the_period():
     env = make_env("BncConnector", clock_factor=0.5)
     assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
 def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
-    """A measured angle jumps by a full turn at ±180°, so a history of it would command a full turn."""
+    """A measured angle jumps by a full turn at ±180°, so a history of measured angles would command a full turn."""
     assert make_prior(turn, GantryStation).demonstrations is not None
     for station in (ArmStation, HardwareStation):
         with pytest.raises(InputError, match="angles jump by a full turn at 180°"):
@@ -60,18 +60,18 @@ def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
         assert make_prior(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
 
 
-def test_signal_that_the_station_has_no_input_for_is_refused():
-    class Bounded(type(EnvConfig.resolve("NarrowPassage").make_task())):
+def test_signal_is_refused_when_the_station_has_no_input():
+    class BoundedPassage(type(EnvConfig.resolve("NarrowPassage").make_task())):
         def signals(self, builder, station):
             bound = builder.AddSystem(ConstantVectorSource(np.ones(MAX_WRENCH_SIZE)))
             return {**super().signals(builder, station), "max_wrench": bound.get_output_port()}
 
-    task = Bounded(EnvConfig.resolve("NarrowPassage"))
+    task = BoundedPassage(EnvConfig.resolve("NarrowPassage"))
     station = make_station(task)
     with pytest.raises(InputError, match="station='plane' has no input for the signal 'max_wrench' of NarrowPassage"):
         Loop(task, station, make_guidance(task, station))
 
 
-def test_making_an_environment_logs_nothing_of_drake(forks, tmp_path):
+def test_make_env_prints_no_log_message_of_drake(forks, tmp_path):
     script = "import guiderail\nguiderail.make_env('NarrowPassage', guidance='kgrl', render_mode='human').reset(seed=0)"
     assert forks.run("-c", script, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat").stderr == ""

@@ -1,4 +1,4 @@
-"""The option `control_period`: clock of guidance, station and task, and the refusals of other periods."""
+"""The option `control_period`: period of guidance, station and task; refused periods."""
 
 import gymnasium
 import numpy as np
@@ -25,30 +25,30 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 
-def task_of(name, **options):
+def make_task(name, **options):
     return EnvConfig.resolve(name, options).make_task()
 
 
 @pytest.mark.parametrize("name", ["NarrowPassage", "BncConnector", "GridClamp", "Pouring"])
-def test_episode_lasts_as_long_when_the_period_is_longer(name):
-    usual, slow = task_of(name), task_of(name, control_period=0.1)
+def test_episode_duration_is_equal_when_the_period_is_longer(name):
+    standard, slow = make_task(name), make_task(name, control_period=0.1)
     assert slow.control_period == pytest.approx(0.1, rel=1e-9)
-    assert slow.num_steps * slow.control_period == pytest.approx(usual.num_steps * usual.control_period, rel=1e-6)
+    assert slow.num_steps * slow.control_period == pytest.approx(standard.num_steps * standard.control_period, rel=1e-6)
 
 
-def test_default_reference_is_the_shipped_one():
-    assert task_of("BncConnector").reference() is reference_trajectory("insert")
-    assert task_of("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
+def test_shipped_reference_is_used_at_the_default_period():
+    assert make_task("BncConnector").reference() is reference_trajectory("insert")
+    assert make_task("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
 
 
-def test_same_number_of_steps_when_the_motion_is_slower_too():
-    shipped, task = reference_trajectory("insert"), task_of("BncConnector", control_period=0.1, time_scale=5.0)
+def test_reference_is_equal_when_period_and_motion_scale():
+    shipped, task = reference_trajectory("insert"), make_task("BncConnector", control_period=0.1, time_scale=5.0)
     assert task.num_steps == task.reference().num_steps == shipped.num_steps
     np.testing.assert_allclose(task.reference().means, shipped.means, atol=1e-12)
     np.testing.assert_allclose(np.diff(task.reference().times), 0.1, rtol=1e-9)
 
 
-def test_commands_change_once_a_control_period():
+def test_step_and_reference_have_the_given_control_period():
     env = make_env("NarrowPassage", guidance="skgrl", control_period=0.1, action_repeat=1)
     env.reset(seed=0)
     for number in range(3):
@@ -70,27 +70,29 @@ def test_commands_change_once_a_control_period():
         ("BncConnector", {"control_period": 0.015, "station": "arm"}, "whole multiple of 0.01 s"),
     ],
 )
-def test_other_periods_are_refused(task, options, message):
+def test_control_period_is_refused_when_out_of_range(task, options, message):
     with pytest.raises(InputError, match=message):
         make_env(task, **options)
 
 
-def test_period_that_the_plant_divides_is_accepted():
+def test_period_is_accepted_when_a_multiple_of_the_plants():
     assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).task.control_period == 3 * PLANT_PERIOD
 
 
-def test_period_of_a_robot_is_a_multiple_of_its_drivers():
-    skill = make_skill("GridClamp", lambda seen: seen, station="hardware", robot_url="memq://", control_period=0.1)
+def test_hardware_period_is_a_multiple_of_the_drivers():
+    skill = make_skill(
+        "GridClamp", lambda observation: observation, station="hardware", robot_url="memq://", control_period=0.1
+    )
     station = skill.diagram.GetSubsystemByName("station")
     assert skill.control_period == station.control_period == 20 * station.period
-    assert station.clone(task_of("GridClamp").workcell()).control_period == station.control_period
+    assert station.clone(make_task("GridClamp").workcell()).control_period == station.control_period
     with pytest.raises(InputError, match=r"whole multiple of 0\.005 s"):
         whole_multiple(0.0125, station.period)
 
 
-@pytest.mark.parametrize("nonsense", [0.0, -0.01, np.nan, np.inf])
-def test_period_or_unit_that_is_nonsense_is_refused(nonsense):
-    for period, unit in ((nonsense, 0.01), (0.02, nonsense)):
+@pytest.mark.parametrize("invalid", [0.0, -0.01, np.nan, np.inf])
+def test_whole_multiple_is_refused_when_not_positive(invalid):
+    for period, unit in ((invalid, 0.01), (0.02, invalid)):
         with pytest.raises(InputError, match="whole multiple"):
             whole_multiple(period, unit)
 
@@ -123,7 +125,7 @@ class Lane(Task):
 
 @pytest.fixture
 def own_tasks():
-    """Register an own task, and one with a time unit of its own; remove both after the test."""
+    """Register lab/Lane, and lab/Units with `time_unit` 0.01 s; remove both after the test."""
     names = "lab/Lane", "lab/Units"
     register_task(names[0])(Lane)
     register_task(names[1])(type("Units", (Lane,), {"time_unit": 0.01}))
@@ -134,30 +136,30 @@ def own_tasks():
 
 
 @pytest.mark.parametrize("period", [None, 0.012, 0.04, 0.05])
-def test_own_task_has_the_periods_of_its_station(own_tasks, period):
+def test_own_task_has_the_given_control_period(own_tasks, period):
     env = make_env("lab/Lane", guidance="kmp", action_repeat=1, control_period=period)
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(2))
     assert env.task.declaration.control_period == env.task.control_period == pytest.approx(period or 0.02, rel=1e-9)
-    # The demonstrated speed is 0.5 m/s, whatever the period.
+    # The demonstrated speed is 0.5 m/s at every control period.
     assert env.trace.commanded[4, 1] - env.trace.commanded[3, 1] == pytest.approx(0.5 * (period or 0.02), rel=0.1)
 
 
-def test_message_names_the_time_unit_when_it_is_not_the_stations(own_tasks):
+def test_period_is_refused_when_task_and_station_units_differ(own_tasks):
     with pytest.raises(InputError, match=r"^time_unit of lab/Units is 0\.01 s, .* leave time_unit out"):
         make_env("lab/Units", guidance="kmp", control_period=0.05)
 
 
-def test_reference_of_another_clock_is_refused():
-    class Deaf(task_of("NarrowPassage").__class__):
+def test_reference_is_refused_when_not_resampled():
+    class UnresampledPassage(make_task("NarrowPassage").__class__):
         def on_clock(self, reference, time_scale=1.0):
             return reference
 
     from guiderail.diagrams.envs.assemble import build_prior_knowledge
     from guiderail.diagrams.envs.make import make_station
 
-    task = Deaf(EnvConfig.resolve("NarrowPassage", {"control_period": 0.1}))
+    task = UnresampledPassage(EnvConfig.resolve("NarrowPassage", {"control_period": 0.1}))
     with pytest.raises(InputError, match="would not have the demonstrated speed"):
         build_prior_knowledge(task, make_station(task))
 

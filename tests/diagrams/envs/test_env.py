@@ -1,4 +1,4 @@
-"""Reset and step of `DiagramEnv`, on a task so small that every number is known."""
+"""Reset and step of `DiagramEnv`, on a task with one position, whose outputs are known exactly."""
 
 from dataclasses import replace
 
@@ -22,16 +22,16 @@ HESSIAN_FAILURE = "The Hessian of the momentum cost along the search direction i
 
 
 class Toy(LeafSystem):
-    """A position that the held action moves by a tenth per control step; it records what an environment must know.
+    """System with one position, which changes by 0.1 times the held action at each control step.
 
-    State: position, what initialization saw, fast ticks so far, the action of this control step.
+    State: position, position at initialization, number of plant steps, held action of the control step.
     """
 
     def __init__(self):
         super().__init__()
         self.error: Exception | None = None
-        self.failing, self.fails_from = "", 0.0  # port, or "initialize", that fails from a time on [s]
-        self.nan_port = ""  # port that is NaN at the position 0.1
+        self.failing, self.fails_from = "", 0.0  # name of a port or method; time from which it fails [s]
+        self.nan_port = ""  # port whose value is NaN at position 0.1
         self.action = self.DeclareVectorInputPort("action", 1)
         self.state = self.DeclareDiscreteState(4)
         self.DeclareInitializationDiscreteUpdateEvent(self.initialize)
@@ -49,7 +49,7 @@ class Toy(LeafSystem):
         port("observation", 4, lambda x: x)
         port("reward", 1, lambda x: 2 * x[0] + 1)
         port("double", 1, lambda x: 2 * x[0])
-        port("one", 1, lambda x: 1.0)
+        port("constant", 1, lambda x: 1.0)
         port("termination", 1, lambda x: float(x[0] >= 0.95))
         port("commanded_violation", 1, lambda x: x[0] - 1)
         port("measured_violation", 1, lambda x: x[0] - 2)
@@ -86,6 +86,7 @@ class Toy(LeafSystem):
 
 
 def make(num_steps=20, **arguments):
+    """Return an environment of `Toy`, whose reset option `start` is the initial position."""
     builder = DiagramBuilder()
     toy = builder.AddNamedSystem("toy", Toy())
     builder.ExportInput(toy.get_input_port(), "action")
@@ -103,7 +104,7 @@ def make(num_steps=20, **arguments):
         control_period=PERIOD,
         num_steps=num_steps,
         observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float32),
-        reward_terms=("double", "one"),
+        reward_terms=("double", "constant"),
         randomize=randomize,
     )
     env = DiagramEnv(task, **arguments)
@@ -113,14 +114,14 @@ def make(num_steps=20, **arguments):
 
 def test_info_has_all_keys_at_reset_and_every_step():
     env = make()
-    expected = {*INFO_KEYS, "double", "one"} - {"simulation_failure"}  # of an episode that is over
+    expected = {*INFO_KEYS, "double", "constant"} - {"simulation_failure"}  # only after a failed simulation
     _, info = env.reset(options={"start": 0.0})
     assert set(info) == expected | {"start"}
     assert info["constraint_violation"] == -1.0
     _, reward, _, _, info = env.step([1.0])
     assert set(info) == expected
     assert info["contact_force"] == pytest.approx(1.0)
-    assert reward == pytest.approx(info["double"] + info["one"])
+    assert reward == pytest.approx(info["double"] + info["constant"])
 
 
 def test_initialization_reads_the_state_of_the_new_episode():
@@ -131,7 +132,7 @@ def test_initialization_reads_the_state_of_the_new_episode():
     np.testing.assert_array_equal(observation, np.float32([-0.25, -0.25, 0, 0]))
 
 
-def test_the_last_action_does_not_survive_a_reset():
+def test_reset_sets_the_held_action_to_zero():
     env = make()
     env.reset(options={"start": 0.0})
     env.step([1.0])
@@ -141,18 +142,18 @@ def test_the_last_action_does_not_survive_a_reset():
     assert env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context()) == [0.0]
 
 
-def test_same_seed_same_episodes_other_seed_other_ones():
+def test_starts_repeat_only_when_the_seed_is_equal():
     def starts(seed):
         env = make()
         return [env.reset(seed=seed)[1]["start"], *(env.reset()[1]["start"] for _ in range(3))]
 
     assert starts(3) == starts(3)
     assert not set(starts(3)) & set(starts(4))
-    # Unseeded environments don't repeat each other, as a generator with a constant seed would make them.
+    # Environments without a seed sample different starts.
     assert starts(None) != starts(None)
 
 
-def test_takes_the_same_number_of_plant_steps_every_time():
+def test_every_step_has_the_same_number_of_plant_steps():
     env = make(num_steps=1000)
     env.reset(options={"start": -1.0})
     ticks = [0.0]
@@ -162,7 +163,7 @@ def test_takes_the_same_number_of_plant_steps_every_time():
     assert set(np.diff(ticks)) == {SUBSTEPS}
 
 
-def test_a_time_limit_truncates():
+def test_episode_is_truncated_at_the_time_limit():
     env = make(num_steps=3)
     env.reset(options={"start": 0.0})
     results = [env.step([0.0])[2:] for _ in range(3)]
@@ -172,7 +173,7 @@ def test_a_time_limit_truncates():
     assert len(env.trace) == 3
 
 
-def test_a_success_in_the_last_step_is_no_time_limit():
+def test_success_in_the_last_step_terminates_the_episode():
     env = make(num_steps=2)
     env.reset(options={"start": 0.8})
     env.step([1.0])
@@ -180,15 +181,15 @@ def test_a_success_in_the_last_step_is_no_time_limit():
     assert (terminated, truncated, info["termination"], info["is_success"]) == (True, False, "success", True)
 
 
-def test_repeated_action_sums_rewards_and_stops_at_the_end():
+def test_repeated_action_sums_rewards_until_the_episode_ends():
     env = make(action_repeat=4)
     env.reset(options={"start": 0.0})
     _, reward, terminated, _, info = env.step([1.0])
     assert reward == pytest.approx(4 + 2 * (0.1 + 0.2 + 0.3 + 0.4))
-    assert info["one"] == 4
+    assert info["constant"] == 4
     assert info["contact_force"] == pytest.approx(4.0)
     _, _, _, _, info = env.step([-1.0])
-    assert info["constraint_violation"] == pytest.approx(0.3 - 1)  # the worst of the step, not its last
+    assert info["constraint_violation"] == pytest.approx(0.3 - 1)  # the largest violation of the repeated control steps
     env.reset(options={"start": 0.75})
     *_, terminated, _, info = env.step([1.0])
     assert terminated
@@ -212,7 +213,7 @@ def test_info_is_nan_when_a_control_step_is_nan(port, key, action_repeat):
     assert {name for name, value in info.items() if value != value} == {key}
 
 
-def test_the_trace_has_every_control_step():
+def test_trace_has_every_control_step():
     env = make(action_repeat=3)
     env.reset(options={"start": 0.0})
     env.step([0.5])
@@ -228,7 +229,7 @@ def test_the_trace_has_every_control_step():
 @pytest.mark.parametrize(
     "action", [[np.nan], [np.inf], [-np.inf], [0.5 + 1j], [0.0, 0.0], 0.0, "up", [[0.0]], None, [10**400]]
 )
-def test_a_bad_action_is_refused_before_anything_moves(action):
+def test_invalid_action_is_refused_before_time_advances(action):
     env = make()
     env.reset(options={"start": 0.0})
     with pytest.raises(InputError, match="action"):
@@ -238,7 +239,7 @@ def test_a_bad_action_is_refused_before_anything_moves(action):
     assert observation[0] == np.float32(0.1)
 
 
-def test_a_finite_action_is_clipped():
+def test_action_is_clipped_when_out_of_range():
     env = make()
     env.reset(options={"start": 0.0})
     observation, *_ = env.step([1e9])
@@ -283,12 +284,12 @@ READ_AT_RESET = ("observation", "pose", "commanded_violation", "measured_violati
 
 
 @pytest.mark.parametrize("port", PORTS)
-def test_failure_of_a_port_truncates_without_its_step(port):
+def test_port_failure_truncates_before_the_failed_step(port):
     env = make(action_repeat=3)
     before, info = env.reset(options={"start": 0.0})
     env.toy.failing, env.toy.fails_from = port, (3 if port == "observation" else 2) * PERIOD
     after, reward, terminated, truncated, info = env.step([1.0])
-    steps = 2 if port == "observation" else 1  # the observation is read after the last control step only
+    steps = 2 if port == "observation" else 1  # the observation is read only after the last control step
     assert (terminated, truncated, info["termination"]) == (False, True, "")
     assert info["simulation_failure"] == HESSIAN_FAILURE
     assert info["control_steps"] == len(env.trace) == steps
@@ -302,7 +303,7 @@ def test_failure_of_a_port_truncates_without_its_step(port):
 
 
 @pytest.mark.parametrize("port", PORTS)
-def test_failure_of_a_port_outranks_a_termination(port):
+def test_port_failure_takes_precedence_over_termination(port):
     env = make()
     env.reset(options={"start": 0.9})
     env.toy.failing, env.toy.fails_from = port, PERIOD
@@ -311,14 +312,14 @@ def test_failure_of_a_port_outranks_a_termination(port):
     assert info["simulation_failure"] == HESSIAN_FAILURE
 
 
-@pytest.mark.parametrize("place", [*PORTS, "randomize", "initialize"])
-def test_failure_of_a_reset_truncates_at_the_first_step(place):
+@pytest.mark.parametrize("failing", [*PORTS, "randomize", "initialize"])
+def test_reset_failure_truncates_at_the_first_step(failing):
     env = make()
     env.reset(options={"start": 0.0})
     before, *_ = env.step([1.0])
-    env.toy.failing = place
+    env.toy.failing = failing
     observation, info = env.reset(options={"start": 0.5})
-    if place in {*READ_AT_RESET, "randomize", "initialize"}:
+    if failing in {*READ_AT_RESET, "randomize", "initialize"}:
         assert info["simulation_failure"] == HESSIAN_FAILURE
         np.testing.assert_array_equal(observation, before)
         env.toy.failing = ""
@@ -332,16 +333,16 @@ def test_failure_of_a_reset_truncates_at_the_first_step(place):
     assert env.step([1.0])[0][0] == np.float32(0.1)
 
 
-@pytest.mark.parametrize("place", [*READ_AT_RESET, "randomize", "initialize"])
-def test_failure_before_the_first_observation_is_raised(place):
+@pytest.mark.parametrize("failing", [*READ_AT_RESET, "randomize", "initialize"])
+def test_failure_before_the_first_observation_is_raised(failing):
     env = make()
-    env.toy.failing = place
+    env.toy.failing = failing
     with pytest.raises(RuntimeError, match="Hessian"):
         env.reset()
 
 
 @pytest.mark.parametrize("position", [10.5, -10.5, 1e300, np.nan, np.inf])
-def test_implausible_position_is_a_failed_simulation(position):
+def test_simulation_fails_when_the_position_is_implausible(position):
     env = make(action_repeat=2)
     env.reset(options={"start": 0.0})
     context = env.toy.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
@@ -351,7 +352,7 @@ def test_implausible_position_is_a_failed_simulation(position):
     assert "the robot is at" in info["simulation_failure"] or "not finite" in info["simulation_failure"]
 
 
-def test_implausible_joint_speed_is_a_failed_simulation():
+def test_simulation_fails_when_joint_speed_is_implausible():
     env = make_env("NarrowPassage")
     env.reset(seed=0)
     (plant,) = env._plants
@@ -368,7 +369,7 @@ def test_implausible_joint_speed_is_a_failed_simulation():
 
 
 @pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
-def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
+def test_reset_options_are_refused_when_not_a_mapping(options):
     env = make()
     with pytest.raises(InputError, match="the options of a reset are values by name"):
         env.reset(options=options)
@@ -376,21 +377,21 @@ def test_options_of_a_reset_that_are_no_mapping_are_a_sentence(options):
     env.reset(options=None)
 
 
-def test_info_keys_are_listed():
+def test_info_keys_match_the_declared_keys():
     env = make(num_steps=2)
     _, info = env.reset()
-    said = set(info) - set(env.sampled)
-    said |= set(env.step([0.0])[4])
+    keys = set(info) - set(env.sampled)
+    keys |= set(env.step([0.0])[4])
     env.toy.error = RuntimeError(SOLVER_FAILURE)
-    said |= set(env.step([0.0])[4])
+    keys |= set(env.step([0.0])[4])
     env.toy.error = None
     env.reset()
     env.step([0.0])
-    said |= set(env.step([0.0])[4])
-    assert said - set(env.task.reward_terms) == set(INFO_KEYS)
+    keys |= set(env.step([0.0])[4])
+    assert keys - set(env.task.reward_terms) == set(INFO_KEYS)
 
 
-def test_stepping_on_after_the_end_is_refused():
+def test_step_is_refused_before_a_reset_and_after_the_end():
     env = make(num_steps=1)
     with pytest.raises(gymnasium.error.ResetNeeded):
         env.step([0.0])
@@ -424,12 +425,12 @@ def test_env_refuses_unsupported_arguments(arguments, message):
         make(**arguments)
 
 
-def test_a_push_needs_a_robot_that_can_be_pushed():
+def test_push_is_refused_when_the_task_has_no_push():
     with pytest.raises(InputError, match="pushed"):
         make().push([1.0])
 
 
-def test_a_task_that_lacks_a_port_is_refused_by_name():
+def test_task_diagram_names_a_missing_port():
     builder = DiagramBuilder()
     toy = builder.AddNamedSystem("toy", Toy())
     builder.ExportInput(toy.get_input_port(), "action")
@@ -438,7 +439,7 @@ def test_a_task_that_lacks_a_port_is_refused_by_name():
         TaskDiagram(builder.Build(), PERIOD, 3, gymnasium.spaces.Box(-1, 1, (4,)), (), ())
 
 
-def test_step_refuses_a_simulator_that_was_advanced_past_it():
+def test_step_is_refused_when_the_simulator_is_ahead():
     env = make()
     env.reset(seed=0)
     env.simulator.AdvanceTo(3 * PERIOD)
@@ -459,12 +460,12 @@ def test_task_diagram_refuses_arguments_that_do_not_fit(wrong, message):
         replace(make().task, **wrong)
 
 
-def test_multiples_of_an_exact_period_are_exact():
+def test_multiples_of_a_rounded_period_are_exact():
     period = round_period(0.002)
     assert period == pytest.approx(0.002, rel=1e-9)
     k = np.arange(1, 10000)
     assert all(10 * n * period == n * (10 * period) for n in range(1, 10000))
     np.testing.assert_array_equal(np.cumsum(np.full(len(k), period)), k * period)
-    for nonsense in (0.0, -1.0, np.nan, np.inf):
+    for invalid in (0.0, -1.0, np.nan, np.inf):
         with pytest.raises(ValueError):
-            round_period(nonsense)
+            round_period(invalid)

@@ -1,5 +1,6 @@
-"""Every task with every guidance: an episode runs, or the error names the missing requirement."""
+"""Shipped tasks with every guidance and station: episodes, ports, options and held-out conditions."""
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -10,15 +11,20 @@ from guiderail.diagrams.guidance.registry import GUIDANCE, REQUIREMENTS, possibl
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
-from guiderail.diagrams.tasks.registry import TASKS
+from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 
-OWN = [name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")]
-PAIRS = [(task, guidance) for task in OWN for guidance in GUIDANCE.names()]
+SHIPPED = [name for name in TASKS.names() if TASKS.get(name).__module__.startswith("guiderail.")]
+PAIRS = [(task, guidance) for task in SHIPPED for guidance in GUIDANCE.names()]
+
+
+@pytest.mark.parametrize("task", SHIPPED)
+def test_task_is_registered_as_an_environment(task):
+    assert environment_id(task) in gymnasium.registry
 
 
 @pytest.mark.parametrize(("task", "guidance"), PAIRS)
-def test_pair_of_task_and_guidance_runs_or_names_what_is_missing(task, guidance):
+def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
     provides = TASKS.get(task).provides()
     if guidance not in possible_guidance(provides):
         with pytest.raises(InputError) as error:
@@ -40,8 +46,8 @@ def test_pair_of_task_and_guidance_runs_or_names_what_is_missing(task, guidance)
     assert np.isfinite(env.trace.measured).all()
 
 
-@pytest.mark.parametrize("task", OWN)
-def test_both_contracts_hold_in_every_tasks_diagram(task):
+@pytest.mark.parametrize("task", SHIPPED)
+def test_station_and_guidance_have_the_declared_ports(task):
     for name in TASKS.get(task).stations():
         if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).task.diagram
@@ -58,20 +64,20 @@ def test_both_contracts_hold_in_every_tasks_diagram(task):
         assert all(guidance.HasOutputPort(port) for port in OUTPUTS)
 
 
-@pytest.mark.parametrize("task", OWN)
+@pytest.mark.parametrize("task", SHIPPED)
 def test_resolved_options_resolve_to_themselves(task):
-    """Options that a run stores make an equal environment."""
+    """The options stored with a run resolve to the same options again."""
     values = EnvConfig.resolve(task, {}).options
     assert EnvConfig.resolve(task, values).options == values
 
 
-@pytest.mark.parametrize("task", OWN)
-def test_every_task_has_held_out_conditions(task):
+@pytest.mark.parametrize("task", SHIPPED)
+def test_held_out_conditions_differ_from_training_and_repeat(task):
     env = make_env(task)
-    drawn = []
+    samples = []
     for options in ({}, {"held_out": True}, {"held_out": True}):
         _, info = env.reset(seed=3, options=options)
-        drawn.append({key: np.array(value) for key, value in info.items() if isinstance(value, np.ndarray)})
-    usual, held_out, second = drawn
-    assert any((usual[key] != held_out[key]).any() for key in usual)
-    assert all((held_out[key] == second[key]).all() for key in usual)
+        samples.append({key: np.array(value) for key, value in info.items() if isinstance(value, np.ndarray)})
+    training, held_out, second = samples
+    assert any((training[key] != held_out[key]).any() for key in training)
+    assert all((held_out[key] == second[key]).all() for key in training)

@@ -1,4 +1,4 @@
-"""Access to a page needs its token and an allowed origin; malformed messages do not end it."""
+"""Meshcat page: access by token and origin, messages of browsers, cache of the scene, and release of resources."""
 
 import gc
 import os
@@ -21,11 +21,11 @@ from guiderail.diagrams.envs.page_gateway import MAX_GAMEPAD, MAX_MESSAGE, Scene
 
 CONTROLS = {"x": (-2.0, 2.0), "keep": None}
 GAMEPAD = {"index": 0, "button_values": [0.5], "axes": [0.25, -1.0]}
-PAGES = []  # Meshcat must not be deleted by the garbage collector in the thread of a client
+PAGES = []  # all pages, because the garbage collector must not delete Meshcat in the thread of a client
 
 
 @pytest.fixture(scope="module")
-def opened():
+def module_page():
     PAGES.append(page := MeshcatPage())
     page.AddSlider("x", -2.0, 2.0, 0.5, 0.0, "KeyA", "KeyD")
     page.AddButton("keep", "Enter")
@@ -35,11 +35,11 @@ def opened():
 
 
 @pytest.fixture
-def page(opened):
-    """Return the page with its slider at zero, and count clicks from now on."""
-    opened.SetSliderValue("x", 0.0)
-    opened.clicks_before = opened.GetButtonClicks("keep")
-    return opened
+def page(module_page):
+    """Return the page of the module with its slider at zero, and store its number of button clicks."""
+    module_page.SetSliderValue("x", 0.0)
+    module_page.clicks_before = module_page.GetButtonClicks("keep")
+    return module_page
 
 
 def origin(page, host="localhost"):
@@ -47,6 +47,7 @@ def origin(page, host="localhost"):
 
 
 def browser(page, **changed):
+    """Return a WebSocket client of the page; `changed` replaces arguments of the connection."""
     return connect(**({"uri": page.ws_url(), "origin": origin(page), "compression": None, "proxy": None} | changed))
 
 
@@ -59,20 +60,21 @@ def wait_until(condition):
 
 
 def inputs(page):
+    """Return the slider's value, the number of new clicks, and the axes of the gamepad."""
     return page.GetSliderValue("x"), page.GetButtonClicks("keep") - page.clicks_before, list(page.GetGamepad().axes)
 
 
 def test_browser_with_token_and_origin_moves_the_controls(page):
     for host in ("localhost", "127.0.0.1"):
-        with browser(page, origin=origin(page, host)) as one:
+        with browser(page, origin=origin(page, host)) as client:
             clicks = inputs(page)[1]
-            one.send(msgpack.packb({"type": "slider", "name": "x", "value": 7}))  # above the slider's maximum of 2
-            one.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": GAMEPAD}))
-            one.send(msgpack.packb({"type": "button", "name": "keep"}))
+            client.send(msgpack.packb({"type": "slider", "name": "x", "value": 7}))  # above the slider's maximum of 2
+            client.send(msgpack.packb({"type": "gamepad", "name": "", "gamepad": GAMEPAD}))
+            client.send(msgpack.packb({"type": "button", "name": "keep"}))
             wait_until(lambda clicks=clicks: inputs(page)[1] == clicks + 1)
             assert inputs(page) == (2.0, clicks + 1, [0.25, -1.0])
             assert page.GetNumActiveConnections() == 1
-        # The gamepad of a closed browser must not stay deflected.
+        # The gamepad's axes are cleared when its browser disconnects.
         wait_until(lambda: not page.GetGamepad().axes)
         wait_until(lambda: page.GetNumActiveConnections() == 0)
 
@@ -94,45 +96,45 @@ def test_browser_with_token_and_origin_moves_the_controls(page):
         ({"origin": "http://localhost:{port}.example.org"}, 403),
     ],
 )
-def test_connection_without_token_or_origin_is_refused(page, changed, status):
+def test_connection_is_refused_without_token_or_origin(page, changed, status):
     token = page._gateway.token
     path = changed.get("path", f"/{changed.get('token', str)(token)}/")
     allowed = changed.get("origin", origin(page))
     allowed = allowed and allowed.format(port=page.port())
     with (
         pytest.raises(InvalidStatus) as refused,
-        browser(page, uri=f"ws://localhost:{page.port()}{path}", origin=allowed) as one,
+        browser(page, uri=f"ws://localhost:{page.port()}{path}", origin=allowed) as client,
     ):
-        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+        client.send(msgpack.packb({"type": "button", "name": "keep"}))
     assert refused.value.response.status_code == status
     assert inputs(page) == (0.0, 0, [])
 
 
-def test_files_need_the_token(page):
+def test_files_are_served_only_with_the_token(page):
     address = page.web_url()
     for name, size in (("", 5_000), ("meshcat.js", 500_000)):
         with urllib.request.urlopen(address + name) as answer:
             assert len(answer.read()) > size
             assert answer.headers["X-Frame-Options"] == "DENY"
-    for other in (address.replace(page._gateway.token, "x"), address + "config.yaml", address + "../etc/passwd"):
+    for wrong in (address.replace(page._gateway.token, "x"), address + "config.yaml", address + "../etc/passwd"):
         with pytest.raises(urllib.error.HTTPError, match="404"):
-            urllib.request.urlopen(other)
+            urllib.request.urlopen(wrong)
 
 
-def test_tokens_differ(page):
-    PAGES.append(other := MeshcatPage())
-    assert other._gateway.token != page._gateway.token
-    assert len(other._gateway.token) >= 32
-    assert other.port() != page.port()
-    other.close()
+def test_two_pages_have_different_tokens_and_ports(page):
+    PAGES.append(second := MeshcatPage())
+    assert second._gateway.token != page._gateway.token
+    assert len(second._gateway.token) >= 32
+    assert second.port() != page.port()
+    second.close()
 
 
 @pytest.mark.parametrize("is_killed", [False, True])
-def test_ended_page_has_no_connections(is_killed):
+def test_page_has_no_connections_after_its_end(is_killed):
     PAGES.append(page := MeshcatPage())
     with browser(page):
         wait_until(lambda: page.GetNumActiveConnections() == 1)
-        assert page.GetNumActiveConnections() == 1  # without a new message
+        assert page.GetNumActiveConnections() == 1  # the gateway has printed no new count
         if is_killed:
             page._gateway._process.kill()
         else:
@@ -142,8 +144,8 @@ def test_ended_page_has_no_connections(is_killed):
     assert page.GetNumActiveConnections() == 0
 
 
-def test_meshcat_itself_accepts_no_connection():
-    """Only the gateway listens, because one malformed byte can end the server inside Meshcat."""
+def test_server_of_meshcat_accepts_no_connection():
+    """Only the gateway listens, because a malformed byte can end the server inside Meshcat."""
     PAGES.append(page := MeshcatPage(is_served=False))
     port = super(MeshcatPage, page).port()
     with pytest.raises(ConnectionRefusedError):
@@ -155,63 +157,64 @@ def test_meshcat_itself_accepts_no_connection():
 
 @pytest.mark.parametrize("message", [b"\xc1", b"", b"\x81", "text", b"\xdd\xff\xff\xff\xff", b"\x91" * 5_000])
 def test_malformed_message_is_ignored(page, message):
-    with browser(page) as one:
-        one.send(message)
-        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+    with browser(page) as client:
+        client.send(message)
+        client.send(msgpack.packb({"type": "button", "name": "keep"}))
         wait_until(lambda: inputs(page)[1] == 1)
     page.SetTransform("/a", np.eye(4))
     assert inputs(page) == (0.0, 1, [])
 
 
-def test_long_message_ends_its_connection_only(page):
-    with browser(page) as other, browser(page) as one:
-        one.send(b"\xc4" * (MAX_MESSAGE + 1))
+def test_too_long_message_ends_only_its_connection(page):
+    with browser(page) as second, browser(page) as client:
+        client.send(b"\xc4" * (MAX_MESSAGE + 1))
         with pytest.raises(ConnectionClosed):
-            list(one)
-        other.send(msgpack.packb({"type": "button", "name": "keep"}))
+            list(client)
+        second.send(msgpack.packb({"type": "button", "name": "keep"}))
         wait_until(lambda: inputs(page)[1] == 1)
 
 
 def test_page_ignores_bytes_that_are_not_websocket_frames(page):
     for data in (b"\xc1", b"GET / HTTP/1.1\r\n" + b"a" * 100_000, b"POST / HTTP/1.1\r\n\r\n", b"\0" * 1000):
-        with socket.create_connection(("127.0.0.1", page.port()), 5.0) as one:
-            one.sendall(data)
-    with browser(page) as one:
-        one.send(msgpack.packb({"type": "button", "name": "keep"}))
+        with socket.create_connection(("127.0.0.1", page.port()), 5.0) as connection:
+            connection.sendall(data)
+    with browser(page) as client:
+        client.send(msgpack.packb({"type": "button", "name": "keep"}))
         wait_until(lambda: inputs(page)[1] == 1)
 
 
-def received(one):
+def receive_all(client):
+    """Return the messages that arrive until there is none for 0.3 s."""
     messages = []
     try:
         while True:
-            messages.append(msgpack.unpackb(one.recv(timeout=0.3)))
+            messages.append(msgpack.unpackb(client.recv(timeout=0.3)))
     except TimeoutError:
         return messages
 
 
-def test_new_browser_receives_the_present_scene(page):
-    page.SetObject("/kept", Sphere(1.0))
-    page.SetTransform("/kept", np.eye(4))
-    page.SetTransform("/kept", 2.0 * np.eye(4))
-    page.SetObject("/gone/part", Sphere(1.0))
-    page.Delete("/gone")
+def test_new_browser_receives_the_current_scene(page):
+    page.SetObject("/present", Sphere(1.0))
+    page.SetTransform("/present", np.eye(4))
+    page.SetTransform("/present", 2.0 * np.eye(4))
+    page.SetObject("/deleted/part", Sphere(1.0))
+    page.Delete("/deleted")
     page.AddButton("end")
     page.DeleteButton("end")
     page.SetSliderValue("x", 1.5)
     with browser(page) as first:
-        received(first)  # afterwards the gateway has received every frame
-    with browser(page) as one, browser(page) as other:
-        messages = received(one)
-        assert {m["path"] for m in messages if m["type"] == "set_object"} == {"/kept"}
-        assert [m["matrix"][0] for m in messages if m.get("path") == "/kept" and "matrix" in m] == [2.0]
+        receive_all(first)  # until the gateway has received every frame
+    with browser(page) as client, browser(page) as second:
+        messages = receive_all(client)
+        assert {m["path"] for m in messages if m["type"] == "set_object"} == {"/present"}
+        assert [m["matrix"][0] for m in messages if m.get("path") == "/present" and "matrix" in m] == [2.0]
         assert {m["name"] for m in messages if m["type"] == "set_control"} == {"x", "keep"}
         assert [m["value"] for m in messages if m["type"] == "set_control_value"] == [1.5]
-        received(other)
-        one.send(msgpack.packb({"type": "slider", "name": "x", "value": -1.0}))
-        assert [(m["name"], m["value"]) for m in received(other)] == [("x", -1.0)]
-        page.SetTransform("/kept", 3.0 * np.eye(4))
-        assert [m["matrix"][0] for m in received(other)] == [3.0]
+        receive_all(second)
+        client.send(msgpack.packb({"type": "slider", "name": "x", "value": -1.0}))
+        assert [(m["name"], m["value"]) for m in receive_all(second)] == [("x", -1.0)]
+        page.SetTransform("/present", 3.0 * np.eye(4))
+        assert [m["matrix"][0] for m in receive_all(second)] == [3.0]
 
 
 def test_page_leaves_no_process_port_or_descriptor():
@@ -231,18 +234,18 @@ def frame(kind, path, **more):
     return msgpack.packb({"type": kind, "path": path, **more})
 
 
-def test_deletion_removes_what_is_below_it_only():
+def test_deletion_removes_only_the_path_and_its_subtree():
     cache = SceneCache()
     for path in ("/a", "/a/b", "/ab", "/c"):
         cache.add(frame("set_object", path, object={}))
         cache.add(frame("set_property", path, property="color", value=[1, 0, 0]))
         cache.add(frame("set_property", path, property="visible", value=True))
     cache.add(frame("delete", "/a"))
-    remaining = [msgpack.unpackb(one) for one in cache.frames()]
-    assert {one["path"] for one in remaining if one["type"] != "delete"} == {"/ab", "/c"}
+    remaining = [msgpack.unpackb(data) for data in cache.frames()]
+    assert {message["path"] for message in remaining if message["type"] != "delete"} == {"/ab", "/c"}
     assert len(remaining) == 7
     cache.add(frame("set_object", "/a", object={}))
-    order = [(one["type"], one["path"]) for one in map(msgpack.unpackb, cache.frames())]
+    order = [(message["type"], message["path"]) for message in map(msgpack.unpackb, cache.frames())]
     assert order.index(("delete", "/a")) < order.index(("set_object", "/a"))
 
 
@@ -269,7 +272,7 @@ def test_valid_event_is_parsed(event):
         {"type": "slider", "name": "x", "value": "1"},
         {"type": "slider", "name": "x"},
         {"type": "button", "name": "x"},
-        {"type": "button", "name": "other"},
+        {"type": "button", "name": "missing"},
         {"type": "button", "name": ["keep"]},
         {"type": ["button"], "name": "keep"},
         {"type": "camera_pose", "camera_pose": [0.0] * 16, "is_perspective": True},
@@ -285,7 +288,7 @@ def test_valid_event_is_parsed(event):
         {1: 2},
     ],
 )
-def test_other_event_is_ignored(event):
+def test_invalid_event_is_ignored(event):
     assert parse_event(msgpack.packb(event), CONTROLS) is None
 
 
@@ -296,6 +299,6 @@ def test_largest_gamepad_and_range_are_accepted():
 
 
 @given(st.binary(max_size=200))
-def test_any_bytes_give_a_valid_event_or_none(message):
+def test_random_bytes_are_parsed_to_a_valid_event_or_none(message):
     event = parse_event(message, CONTROLS)
     assert event is None or event["type"] in ("slider", "button", "gamepad")

@@ -1,3 +1,5 @@
+"""Cameras of a scene: poses, projection and rendering."""
+
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -11,7 +13,7 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail.diagrams.envs.scene import Camera, add_camera, look_at
 from guiderail.models.common.errors import InputError
 
-RENDERS = """
+SCRIPT = """
 import gymnasium, guiderail
 env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="kgrl", observation="image")
 env.reset(seed=0)
@@ -21,18 +23,18 @@ env.step(env.action_space.sample())
 
 
 @pytest.mark.parametrize("target", [[0.5, 0.0, 0.0], [0.5, 0.0, 2.0], [0.5, 0.0, 1.0], [np.nan, 0.0, 0.0]])
-def test_camera_without_a_level_horizon_is_refused(target):
+def test_look_at_is_refused_without_a_level_horizon(target):
     with pytest.raises(InputError, match="level horizon"):
         look_at(np.array([0.5, 0.0, 1.0]), np.array(target))
 
 
-def test_project_returns_pixels_when_camera_is_fixed_in_the_world():
+def test_project_returns_pixels_when_camera_is_fixed():
     camera = Camera((40, 20), np.deg2rad(90.0), look_at(np.zeros(3), np.array([1.0, 0.0, 0.0])))
     points = [[2.0, 0.0, 0.0], [2.0, 1.0, 0.0], [2.0, 0.0, 1.0]]
     np.testing.assert_allclose(camera.project(points), [[20.0, 10.0], [15.0, 10.0], [20.0, 5.0]])
 
 
-def test_project_is_refused_when_a_frame_carries_the_camera():
+def test_project_is_refused_when_camera_moves_with_a_frame():
     camera = Camera((40, 20), np.deg2rad(90.0), RigidTransform(), frame="wrist")
     with pytest.raises(InputError, match=r"'wrist'.*fixed in the world"):
         camera.project(np.ones((1, 3)))
@@ -49,6 +51,6 @@ def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
     assert sys.modules.pop("triton").__file__ == str(tmp_path / "triton.py")
 
 
-@pytest.mark.skipif(find_spec("triton") is None, reason="only PyTorch with CUDA brings Triton")
-def test_pytorch_can_import_its_compiler_after_a_render():
-    assert subprocess.run([sys.executable, "-c", RENDERS], timeout=300).returncode == 0
+@pytest.mark.skipif(find_spec("triton") is None, reason="Triton is installed only with PyTorch for CUDA")
+def test_pytorch_compiler_is_imported_after_rendering():
+    assert subprocess.run([sys.executable, "-c", SCRIPT], timeout=300).returncode == 0

@@ -1,4 +1,4 @@
-"""A learned skill as a plain diagram does bit for bit what the environment does with the same policy."""
+"""Skill diagrams of a policy: motion equal to that of the environment, observations and refused policies."""
 
 import numpy as np
 import pytest
@@ -15,11 +15,11 @@ CASES = {
     "GridClamp": {"guidance": "sct", "action_repeat": 5},
     "Pouring": {"guidance": "sct", "action_repeat": 10},
 }
-DECISIONS = 8
+NUM_ACTIONS = 8
 
 
 def policy(size):
-    """Depend on every observed number and on nothing else."""
+    """Return a deterministic policy with `size` actions, which depend on every observed number."""
     return lambda observation: np.tanh(np.outer(np.arange(1, size + 1), np.sin(observation)).sum(axis=1)).astype(float)
 
 
@@ -28,7 +28,7 @@ def test_skill_diagram_matches_the_environment_bit_for_bit(task):
     env = make_env(task, **CASES[task])
     act = policy(env.action_space.shape[0])
     observation, _ = env.reset(seed=3)
-    for _ in range(DECISIONS):
+    for _ in range(NUM_ACTIONS):
         observation, *_ = env.step(act(observation))
 
     skill = make_skill(task, act, **CASES[task])
@@ -37,7 +37,7 @@ def test_skill_diagram_matches_the_environment_bit_for_bit(task):
     skill.randomize(context, np.random.Generator(np.random.PCG64(np.random.SeedSequence(3))), {})
     simulator.Initialize()
     desired, measured = [], []
-    for step in range(1, DECISIONS * env.action_repeat + 1):
+    for step in range(1, NUM_ACTIONS * env.action_repeat + 1):
         simulator.AdvanceTo(step * skill.control_period)
         desired.append(skill.diagram.GetOutputPort("desired_pose").Eval(context).copy())
         measured.append(skill.diagram.GetOutputPort("pose").Eval(context).copy())
@@ -45,27 +45,27 @@ def test_skill_diagram_matches_the_environment_bit_for_bit(task):
     np.testing.assert_array_equal(measured[: len(env.trace)], env.trace.measured)
 
 
-def test_its_parts_have_names_and_it_needs_no_reward():
+def test_skill_diagram_has_named_parts_and_no_reward():
     skill = make_skill("NarrowPassage", policy(2), guidance="kgrl")
     assert all(skill.diagram.HasSubsystemNamed(name) for name in ("observation", "policy", "guidance", "station"))
     assert not skill.diagram.HasOutputPort("reward")
 
 
-def test_an_image_reaches_the_policy():
-    seen = []
+def test_policy_receives_the_image_of_the_camera():
+    shapes = []
 
     def act(image):
-        seen.append(image.shape)
+        shapes.append(image.shape)
         return np.zeros(2)
 
     skill = make_skill("NarrowPassage", act, guidance="kgrl", observation="image")
     simulator = Simulator(skill.diagram)
     skill.randomize(simulator.get_mutable_context(), np.random.default_rng(0), {})
     simulator.AdvanceTo(0.05)
-    assert seen == [(110, 144, 3)]
+    assert shapes == [(110, 144, 3)]
 
 
-def test_a_system_of_another_size_is_refused():
+def test_policy_diagram_is_refused_when_port_sizes_differ():
     builder = DiagramBuilder()
     system = builder.AddSystem(PassThrough(3))
     builder.ExportInput(system.get_input_port(), "observation")
@@ -75,15 +75,15 @@ def test_a_system_of_another_size_is_refused():
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("wrong", "message"),
     [
         (PassThrough(3), "needs an input 'observation' and an output 'action', unlike PassThrough"),
         (3, "a policy is a function from an observation to an action, not 3"),
     ],
 )
-def test_a_policy_of_another_kind_is_refused(given, message):
+def test_policy_is_refused_when_of_an_unknown_kind(wrong, message):
     with pytest.raises(InputError, match=message):
-        make_skill("NarrowPassage", given, guidance="kgrl")
+        make_skill("NarrowPassage", wrong, guidance="kgrl")
 
 
 @pytest.mark.parametrize(
@@ -94,6 +94,6 @@ def test_a_policy_of_another_kind_is_refused(given, message):
         ({"render_mode": "rgb_array", "station": "hardware", "robot_url": "memq://"}, "no scene to draw"),
     ],
 )
-def test_skill_refuses_a_view_that_it_cannot_draw(options, message):
+def test_skill_refuses_a_render_mode_that_is_not_available(options, message):
     with pytest.raises(InputError, match=message):
         make_skill("GridClamp", policy(3), **options)

@@ -1,3 +1,5 @@
+"""Signals and statistics of the control steps of an episode."""
+
 import numpy as np
 import pytest
 
@@ -5,19 +7,21 @@ from guiderail.diagrams.envs.trace import EpisodeTrace, mean_jerk
 from guiderail.models.common.errors import InputError
 
 SIGNALS = {"commanded_violation": 1, "measured_violation": 1, "collision": 1, "saturation": 2, "fallback": 1}
-QUIET = {"commanded_violation": -1.0, "measured_violation": -1.0}
+NO_VIOLATION = {"commanded_violation": -1.0, "measured_violation": -1.0}
 
 
 def trace_of(steps):
-    """Return a trace of control steps with the given signals, and a contact force if `force` is among them."""
+    """Return a trace of control steps with the signals and `force` [N] that `steps` has for each; default 0."""
     trace = EpisodeTrace(60, 2, 0.1, SIGNALS)
     for values in steps:
-        signals = {name: np.broadcast_to({**QUIET, **values}.get(name, 0.0), size) for name, size in SIGNALS.items()}
+        signals = {
+            name: np.broadcast_to({**NO_VIOLATION, **values}.get(name, 0.0), size) for name, size in SIGNALS.items()
+        }
         trace.append(np.zeros(2), np.zeros(2), values.get("force", 0.0), 0.0, signals)
     return trace
 
 
-def test_statistics_are_those_of_all_control_steps():
+def test_statistics_include_all_control_steps():
     rng = np.random.default_rng(0)
     forces, violations = rng.uniform(0, 9, 50), rng.normal(size=50)
     result = trace_of(
@@ -31,17 +35,17 @@ def test_statistics_are_those_of_all_control_steps():
     assert result["max_measured_violation"] == 2 * violations.max()
 
 
-def test_statistics_have_the_largest_violation_when_it_is_the_last():
+def test_largest_violation_includes_the_last_control_step():
     assert trace_of([{}, {"commanded_violation": 0.3}]).statistics()["max_commanded_violation"] == 0.3
 
 
-def test_collision_lasts_as_long_as_the_contact():
+def test_successive_contact_steps_are_one_collision():
     result = trace_of({"collision": touching} for touching in (0, 1, 1, 1, 0, 0, 1, 0, 1)).statistics()
     assert (result["collisions"], result["collision_steps"]) == (3, 5)
     assert trace_of([{"collision": 1.0}]).statistics()["collisions"] == 1
 
 
-def test_statistics_count_saturation_of_any_actuator_and_fallbacks():
+def test_saturated_steps_and_fallback_steps_are_counted():
     steps = (([0, 0], 1), ([0, -3], 0), ([1, 0], 1))
     result = trace_of(
         {"saturation": np.array(saturation, float), "fallback": fallback} for saturation, fallback in steps
@@ -50,7 +54,7 @@ def test_statistics_count_saturation_of_any_actuator_and_fallbacks():
 
 
 @pytest.mark.parametrize("last", [np.nan, 9.0])
-def test_nan_does_not_hide_behind_a_maximum(last):
+def test_largest_violation_is_nan_when_a_step_is_nan(last):
     steps = [{"measured_violation": value} for value in (5.0, np.nan, last)]
     assert np.isnan(trace_of(steps).statistics()["max_measured_violation"])
 
@@ -64,14 +68,14 @@ def test_clear_deletes_every_control_step():
     assert len(trace) == len(trace.force) == 0
 
 
-def test_signal_that_is_missing_is_named():
+def test_append_names_a_missing_signal():
     trace = EpisodeTrace(2, 2, 0.1, SIGNALS)
     with pytest.raises(InputError, match="lacks the signal 'collision'"):
         trace.append(np.zeros(2), np.zeros(2), 0.0, 0.0, {name: 0.0 for name in SIGNALS if name != "collision"})
     assert len(trace) == 0
 
 
-def test_mean_jerk_is_that_of_a_cubic():
+def test_mean_jerk_is_exact_for_a_cubic():
     times = 0.1 * np.arange(9)
     assert mean_jerk(np.column_stack([times**3, 0 * times]), 0.1) == pytest.approx(6.0, rel=1e-9)
     assert mean_jerk(np.zeros((3, 2)), 0.1) == 0.0

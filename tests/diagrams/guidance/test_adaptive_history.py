@@ -1,4 +1,4 @@
-"""SKGRL with a history that shrinks in contact: quicker there, and without a jump when it changes."""
+"""Guidance skgrl with a history that becomes shorter in contact: response time and continuity of the command."""
 
 from dataclasses import replace
 
@@ -10,7 +10,8 @@ from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 
-PERIOD, STEPS, TOUCH = 0.02, 60, slice(20, 40)
+PERIOD, STEPS = 0.02, 60
+CONTACT_STEPS = slice(20, 40)
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +24,7 @@ def skill():
 
 
 def rollout(skill, actions, forces, kind="skgrl"):
-    """Commands and history lengths of every control step; the robot is where it was commanded."""
+    """Return commands and history lengths of every control step; the measured pose is the commanded pose."""
     guidance = build_guidance(kind, PriorKnowledge(PERIOD, demonstrations=skill))
     simulator = Simulator(guidance)
     context = simulator.get_mutable_context()
@@ -41,24 +42,26 @@ def rollout(skill, actions, forces, kind="skgrl"):
         commands.append(guidance.GetOutputPort("desired_pose").Eval(context).copy())
         pose.GetMutableData().set_value(commands[-1])
         if schedule is not None:
-            own = schedule.GetMyContextFromRoot(context)
-            lengths.append(int(schedule.get_history_length_output_port().Eval(own)[0]))
+            port = schedule.get_history_length_output_port()
+            lengths.append(int(port.Eval(schedule.GetMyContextFromRoot(context))[0]))
     return np.array(commands), np.array(lengths)
 
 
-def touching():
+def contact_forces():
+    """Return the contact force [N] of every control step: 5 N during contact."""
     forces = np.zeros(STEPS)
-    forces[TOUCH] = 5.0
+    forces[CONTACT_STEPS] = 5.0
     return forces
 
 
-def late_step(at):
+def step_action(start):
+    """Return actions that are 0 before the control step `start` and (0, 1) from there on."""
     actions = np.zeros((STEPS, 2))
-    actions[at:, 1] = 1.0
+    actions[start:, 1] = 1.0
     return actions
 
 
-def test_without_contact_it_is_skgrl(skill):
+def test_history_has_full_length_without_contact(skill):
     actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, 2))
     plain, _ = rollout(skill, actions, np.zeros(STEPS))
     adaptive, lengths = rollout(replace(skill, adaptive_history=True), actions, np.zeros(STEPS))
@@ -66,31 +69,31 @@ def test_without_contact_it_is_skgrl(skill):
     assert set(lengths) == {10}
 
 
-def test_in_contact_it_answers_sooner(skill):
-    """Return how far a sudden action has moved the command after one and after four control steps."""
-    moved = {}
-    for name, one in (("plain", skill), ("adaptive", replace(skill, adaptive_history=True))):
-        still, _ = rollout(one, np.zeros((STEPS, 2)), touching())
-        acted, _ = rollout(one, late_step(30), touching())
-        moved[name] = np.abs(acted - still)[[30, 33], 1]
-    assert (moved["adaptive"] > 2.0 * moved["plain"]).all()
+def test_adaptive_history_responds_faster_in_contact(skill):
+    # Displacement of the command one and four control steps after a step of the action.
+    displacement = {}
+    for name, config in (("plain", skill), ("adaptive", replace(skill, adaptive_history=True))):
+        without_action, _ = rollout(config, np.zeros((STEPS, 2)), contact_forces())
+        with_action, _ = rollout(config, step_action(30), contact_forces())
+        displacement[name] = np.abs(with_action - without_action)[[30, 33], 1]
+    assert (displacement["adaptive"] > 2.0 * displacement["plain"]).all()
 
 
-def test_the_command_does_not_jump_when_the_history_changes(skill):
+def test_command_is_continuous_when_the_history_changes(skill):
     adaptive = replace(skill, adaptive_history=True)
     constant = np.tile([0.0, 1.0], (STEPS, 1))
-    commands, lengths = rollout(adaptive, constant, touching())
+    commands, lengths = rollout(adaptive, constant, contact_forces())
     assert set(lengths) == {10, 5, 2, 1}
     changes = np.flatnonzero(np.diff(lengths)) + 1
     assert len(changes) >= 4
-    moved = np.linalg.norm(np.diff(commands, axis=0), axis=1)  # moved[n - 1] leads to command n
-    assert (moved[changes - 1] < 1.1 * moved[changes - 2]).all()
-    # What it would be to switch to no history at all.
-    kgrl, _ = rollout(skill, constant, touching(), kind="kgrl")
-    assert (np.linalg.norm(kgrl - commands, axis=1)[changes[:2]] > 1.1 * moved[changes[:2] - 1]).all()
+    distances = np.linalg.norm(np.diff(commands, axis=0), axis=1)  # distances[n - 1]: from command n - 1 to command n
+    assert (distances[changes - 1] < 1.1 * distances[changes - 2]).all()
+    # A change to kgrl, which has no history, would move the command farther.
+    kgrl, _ = rollout(skill, constant, contact_forces(), kind="kgrl")
+    assert (np.linalg.norm(kgrl - commands, axis=1)[changes[:2]] > 1.1 * distances[changes[:2] - 1]).all()
 
 
-def test_constraints_hold_for_every_history_length(skill):
+def test_constraint_is_satisfied_for_every_history_length(skill):
     rng = np.random.default_rng(1)
     for _ in range(3):
         forces = 5.0 * (rng.random(STEPS) < 0.5)

@@ -1,4 +1,4 @@
-"""The sct guidance without an arm: a robot that is where it was commanded one period ago."""
+"""Guidance sct with a robot model that reaches each command one control period later."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,9 @@ MUG = {"mug_tip": RigidTransform()}
 START = np.array([0.0, -0.28, 0.12, 0.0, 0.0, 0.0])
 
 
-class Rig:
+class Loop:
+    """Closed loop of a guidance and a robot whose pose is the command of the control period before."""
+
     def __init__(self, guidance, start=START):
         self.guidance = guidance
         builder = DiagramBuilder()
@@ -59,7 +61,7 @@ def template():
     return load_template("pouring")
 
 
-def test_has_the_ports_of_all_guidance(template):
+def test_sct_has_the_common_ports(template):
     guidance = SctGuidance(template, MUG, PERIOD)
     inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
     outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
@@ -68,82 +70,84 @@ def test_has_the_ports_of_all_guidance(template):
     check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 
 
-def test_sct_stays_at_the_robots_pose_without_input(template):
-    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
+def test_command_stays_at_the_start_when_action_is_zero(template):
+    loop = Loop(SctGuidance(template, MUG, PERIOD)).initialize()
     for _ in range(5):
-        np.testing.assert_allclose(rig.step(np.zeros(3)), START, atol=1e-9)
+        np.testing.assert_allclose(loop.step(np.zeros(3)), START, atol=1e-9)
 
 
-def test_an_action_counts_from_the_next_instant_on_for_a_whole_period(template):
-    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
-    first = rig.step(np.array([0.0, 1.0, 0.0]))
+def test_action_displaces_the_command_for_a_whole_period(template):
+    loop = Loop(SctGuidance(template, MUG, PERIOD)).initialize()
+    first = loop.step(np.array([0.0, 1.0, 0.0]))
     np.testing.assert_allclose(first - START, [0, 0.15 * PERIOD, 0, 0, 0, 0], atol=1e-9)
     for k in range(2, 8):
-        moved = rig.step(np.array([0.0, 1.0, 0.0])) - START
-        np.testing.assert_allclose(moved[1], k * 0.15 * PERIOD, atol=1e-9)
+        displacement = loop.step(np.array([0.0, 1.0, 0.0])) - START
+        np.testing.assert_allclose(displacement[1], k * 0.15 * PERIOD, atol=1e-9)
 
 
-def test_sct_passes_all_states_and_reports_progress(template):
-    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
+def test_sct_reaches_all_states_and_reports_progress(template):
+    loop = Loop(SctGuidance(template, MUG, PERIOD)).initialize()
     states, progress, worst = [], [], 0.0
     for _ in range(600):
-        rig.step(np.array([0.0, 0.9, -0.3]))
-        states.append(int(rig.value("state")[0]))
-        progress.append(rig.value("progress")[0])
-        worst = max(worst, rig.value("constraint_violation")[0])
+        loop.step(np.array([0.0, 0.9, -0.3]))
+        states.append(int(loop.value("state")[0]))
+        progress.append(loop.value("progress")[0])
+        worst = max(worst, loop.value("constraint_violation")[0])
     assert sorted(set(states)) == [0, 1, 2]
     assert worst <= 1e-9
-    assert rig.value("transition_distance")[0] == pytest.approx(0.0, abs=0.02)
-    assert progress[-1] == pytest.approx(sum(s.weight * (s.starts_at - s.ends_at) for s in template.states), abs=0.02)
+    assert loop.value("transition_distance")[0] == pytest.approx(0.0, abs=0.02)
+    assert progress[-1] == pytest.approx(
+        sum(state.weight * (state.starts_at - state.ends_at) for state in template.states), abs=0.02
+    )
 
 
-def test_a_broken_device_repeats_the_last_safe_command(template):
-    rig = Rig(SctGuidance(template, MUG, PERIOD)).initialize()
-    before = rig.step(np.array([0.0, 1.0, 0.0]))
+def test_last_command_is_repeated_when_an_action_is_invalid(template):
+    loop = Loop(SctGuidance(template, MUG, PERIOD)).initialize()
+    before = loop.step(np.array([0.0, 1.0, 0.0]))
     for _ in range(3):
-        np.testing.assert_array_equal(rig.step(np.array([np.nan, 0.0, np.inf])), before)
-        assert rig.value("fallback")[0] == 1.0
-    assert rig.step(np.array([0.0, 1.0, 0.0]))[1] > before[1]
-    assert rig.value("fallback")[0] == 0.0
+        np.testing.assert_array_equal(loop.step(np.array([np.nan, 0.0, np.inf])), before)
+        assert loop.value("fallback")[0] == 1.0
+    assert loop.step(np.array([0.0, 1.0, 0.0]))[1] > before[1]
+    assert loop.value("fallback")[0] == 0.0
 
 
-def test_objects_can_be_moved_at_a_reset(template):
-    """Everything happens relative to the object: the same inputs draw the same path elsewhere."""
+def test_command_is_relative_to_the_frames_of_the_objects(template):
+    """Equal actions lead to an equal path relative to the mug."""
     paths = []
     for shift in (np.zeros(3), np.array([0.1, -0.2, 0.05])):
         guidance = SctGuidance(template, MUG, PERIOD)
-        rig = Rig(guidance, START + np.concatenate([shift, np.zeros(3)]))
-        guidance.set_frames(rig.context, {"mug_tip": RigidTransform(shift)})
-        rig.initialize()
-        path = np.array([rig.step(np.array([0.2, 0.9, -0.3])) for _ in range(300)])
+        loop = Loop(guidance, START + np.concatenate([shift, np.zeros(3)]))
+        guidance.set_frames(loop.context, {"mug_tip": RigidTransform(shift)})
+        loop.initialize()
+        path = np.array([loop.step(np.array([0.2, 0.9, -0.3])) for _ in range(300)])
         path[:, :3] -= shift
         paths.append(path)
     np.testing.assert_allclose(paths[0], paths[1], atol=1e-9)
 
 
-def test_sct_commands_the_request_without_constraints(template):
-    rig = Rig(SctGuidance(template, MUG, PERIOD, active_constraints=False)).initialize()
+def test_command_is_the_request_without_active_constraints(template):
+    loop = Loop(SctGuidance(template, MUG, PERIOD, active_constraints=False)).initialize()
     for _ in range(200):
-        desired = rig.step(np.array([0.0, 0.0, -1.0]))
-    assert desired[2] < 0.12 - 0.25  # through the table
+        desired = loop.step(np.array([0.0, 0.0, -1.0]))
+    assert desired[2] < 0.12 - 0.25  # [m]; below the surface of the table
 
 
-def test_velocity_input_is_filtered_by_the_constraints(template):
+def test_velocity_input_satisfies_the_constraints(template):
     velocity = load_template("end_effector_velocity")
-    rig = Rig(SctGuidance(template, MUG, PERIOD, input_mapping=velocity)).initialize()
+    loop = Loop(SctGuidance(template, MUG, PERIOD, input_mapping=velocity)).initialize()
     rng = np.random.default_rng(0)
     for _ in range(200):
-        rig.step(rng.choice([-1.0, 1.0], 6))
-        assert rig.value("constraint_violation")[0] <= 1e-9
+        loop.step(rng.choice([-1.0, 1.0], 6))
+        assert loop.value("constraint_violation")[0] <= 1e-9
 
 
-def test_the_filter_takes_requests_from_anyone(template):
-    """Behind a source that has nothing to do with a template: a constant pose inside the mug."""
+def test_filter_stops_at_the_mug_when_a_pose_is_requested(template):
+    """The filter alone, with a constant requested pose inside the mug."""
     builder = DiagramBuilder()
     safe = builder.AddSystem(ActiveConstraintFilter(template, MUG, PERIOD))
-    wish = builder.AddSystem(ConstantVectorSource(np.array([0.0, 0.0, -0.05, 0.0, 0.0, 2.0])))
+    request = builder.AddSystem(ConstantVectorSource(np.array([0.0, 0.0, -0.05, 0.0, 0.0, 2.0])))
     robot = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
-    builder.Connect(wish.get_output_port(), safe.GetInputPort("requested_pose"))
+    builder.Connect(request.get_output_port(), safe.GetInputPort("requested_pose"))
     builder.Connect(robot.get_output_port(), safe.GetInputPort("pose"))
     builder.Connect(safe.GetOutputPort("desired_pose"), robot.get_input_port())
     diagram = builder.Build()
@@ -155,23 +159,10 @@ def test_the_filter_takes_requests_from_anyone(template):
         simulator.AdvanceTo(k * PERIOD)
         assert safe.GetOutputPort("commanded_violation").Eval(safe.GetMyContextFromRoot(context))[0] <= 1e-9
     desired = safe.GetOutputPort("desired_pose").Eval(safe.GetMyContextFromRoot(context))
-    assert np.linalg.norm(desired[:3]) < 0.09  # as near as it is allowed
+    assert np.linalg.norm(desired[:3]) < 0.09  # [m]; the constraints keep the tip at about this distance
 
 
-def test_a_persons_device_and_a_policy_differ_in_one_connection(template):
-    """Figure 3.1: the source connected to `action` drives the robot."""
-    diagrams = []
-    for source in (ConstantVectorSource(np.array([0.0, 1.0, 0.0])), ZeroOrderHold(PERIOD, 3)):
-        builder = DiagramBuilder()
-        guidance = builder.AddSystem(SctGuidance(template, MUG, PERIOD))
-        device = builder.AddSystem(source)
-        builder.Connect(device.get_output_port(), guidance.GetInputPort("action"))
-        builder.ExportInput(guidance.GetInputPort("pose"), "pose")
-        diagrams.append(builder.Build())
-    assert all(diagram.HasInputPort("pose") for diagram in diagrams)
-
-
-def test_prior_knowledge_refuses_what_is_not_a_placed_template():
+def test_prior_knowledge_refuses_invalid_templates():
     with pytest.raises(InputError, match="a template is a SharedControlTemplate"):
         PlacedTemplate("grid_clamp.yaml", {"hole": RigidTransform()})
     with pytest.raises(InputError, match="poses by name"):

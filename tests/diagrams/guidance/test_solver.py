@@ -1,4 +1,4 @@
-"""The solver of the constrained primitive is an option of the environment, and of no consequence but its time."""
+"""Option `solver` of the constrained primitive: equal commands and refused names."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from guiderail.tools.environments import check_environment
 
 
 def commands(**options):
-    """Return commands and violations for actions towards the zone, where the constraint is active."""
+    """Return commands and violations [m] of 12 actions towards the zone, where the constraint is active."""
     env = make_env("NarrowPassage", guidance="skgrl", action_scale=3.0, **options)
     env.reset(seed=0)
     violations = []
@@ -22,16 +22,16 @@ def commands(**options):
     return path, np.array(violations)
 
 
-def test_every_solver_commands_the_same_and_keeps_the_constraint():
+def test_solvers_return_equal_commands_within_the_constraint():
     expected, violations = commands()
-    assert violations.max() > -1e-6, "the constraint is met"
+    assert violations.max() > -1e-6, "the constraint is not active"
     for solver in ("osqp", "piqp"):
         path, violations = commands(solver=solver)
         np.testing.assert_allclose(path, expected, atol=1e-5)
         assert violations.max() <= 1e-9
 
 
-def test_solver_option_is_parsed_and_unknown_ones_refused():
+def test_solver_option_is_parsed_or_refused_when_unknown():
     assert check_environment("BncConnector", parse_environment(["solver=osqp"]))["solver"] == "osqp"
     with pytest.raises(InputError, match="there is no solver 'osq': did you mean osqp"):
         check_environment("NarrowPassage", parse_environment(["solver=osq"]))

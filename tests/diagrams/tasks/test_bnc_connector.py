@@ -1,12 +1,10 @@
-"""The BNC task as a policy meets it."""
+"""Environment BncConnector: scripted policies, constraints, rewards, symmetry, demonstrations and images."""
 
 from functools import cache
 
-import gymnasium
 import numpy as np
 import pytest
 
-import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
 from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
 from guiderail.diagrams.tasks.bnc_connector.task import (
@@ -18,24 +16,24 @@ from guiderail.diagrams.tasks.insertion import ALIGNMENT_REWARD, DEPTH_REWARD, I
 from guiderail.diagrams.tasks.options import COLLISION_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector import demonstrations as inserting
+from guiderail.models.objects.bnc_connector import demonstrations as shipped_demonstrations
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
-NEW_RUN = {"new_run": True}  # every episode is a run of its own
+NEW_RUN = {"new_run": True}  # the hidden offsets are sampled again in every episode
 
 
 def play(env, policy, *, seed=None, options=None):
-    """Runs an episode; returns the reset's info, the last step's, the return and the observations."""
-    observation, first = env.reset(seed=seed, options=options)
+    """Run an episode; return the last info, the return, and all observations."""
+    observation, _ = env.reset(seed=seed, options=options)
     observations, total, finished, info = [observation], 0.0, False, {}
     while not finished:
         observation, reward, terminated, truncated, info = env.step(policy(observation))
         observations.append(observation)
         total += reward
         finished = terminated or truncated
-    return first, info, total, np.array(observations)
+    return info, total, np.array(observations)
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +51,7 @@ def skgrl():
     return make_env("BncConnector", guidance="skgrl", fixture_offset="per_run")
 
 
-def test_is_registered():
-    assert "guiderail/BncConnector-v0" in gymnasium.registry
-
-
-def test_spaces(skgrl):
+def test_spaces_have_the_documented_shapes(skgrl):
     assert skgrl.action_space.shape == (2,)
     assert skgrl.observation_space.shape == (13,)
     observation, _ = skgrl.reset(seed=0)
@@ -66,37 +60,32 @@ def test_spaces(skgrl):
 
 
 @pytest.mark.parametrize("offset", [(0.3, 0.0), (-0.2, -0.2)])
-def test_the_demonstration_alone_locks_where_the_jack_is_known(kmp, offset):
-    _, info, total, _ = play(kmp, zero_policy(kmp), seed=0, options={"offset": np.array(offset) * MM})
+def test_demonstration_locks_when_the_offset_is_small(kmp, offset):
+    info, total, _ = play(kmp, zero_policy(kmp), seed=0, options={"offset": np.array(offset) * MM})
     assert info["termination"] == "success"
     assert info["control_steps"] < NUM_STEPS
     assert total > 50.0
 
 
-def test_the_demonstration_alone_mostly_fails_where_it_is_not(skgrl):
-    """On the whole at most one in five; here, not once."""
+def test_demonstration_fails_when_the_offset_is_hidden(skgrl):
+    """Over many runs at most 20 % of the episodes succeed; the episode of this seed fails."""
     assert evaluate_policy(skgrl, zero_policy(skgrl), episodes=1, options=NEW_RUN)["success"].sum() == 0
 
 
-def test_torque_search_finds_a_hidden_jack(skgrl):
-    rows = evaluate_policy(skgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
-    assert rows["success"].sum() == 1
-    assert rows["max_commanded_violation"].max() <= 1e-9
-
-
-def test_torque_search_finds_the_jack_in_any_episode(kgrl):
-    rows = evaluate_policy(kgrl, scripted_torque_search, episodes=1, options=NEW_RUN)
+@pytest.mark.parametrize("guidance", ["skgrl", "kgrl"])  # offset sampled per run and per episode
+def test_torque_search_locks_when_the_offset_is_hidden(guidance, request):
+    rows = evaluate_policy(request.getfixturevalue(guidance), scripted_torque_search, episodes=1, options=NEW_RUN)
     assert rows["success"].sum() == 1
     assert rows["max_commanded_violation"].max() <= 1e-9
 
 
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl", "safe_residual"])
-def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
-    """Corner actions that change at every step, into every corner of the square."""
+def test_commands_satisfy_the_constraint_under_any_action(guidance, kgrl, skgrl):
+    """Random corners of the square of actions, which change at every step."""
     safe_residual = make_env("BncConnector", guidance="safe_residual", action_scale=3.0)
     env = {"kgrl": kgrl, "skgrl": skgrl, "safe_residual": safe_residual}[guidance]
     rng = np.random.default_rng(3)
-    _, info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
+    info, _, observations = play(env, lambda _: rng.choice([-1.0, 1.0], 2), seed=5)
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert np.abs(env.trace.commanded[:, :2]).max() <= ALIGNMENT + 1e-9
     assert np.isfinite(observations).all()
@@ -104,47 +93,47 @@ def test_no_action_commands_a_violation(guidance, kgrl, skgrl):
 
 
 @pytest.fixture(scope="module")
-def felt(kmp):
-    """Return the observation while the plug stands on the rim, by where the jack is [mm]."""
+def observe_on_rim(kmp):
+    """Return a function from the offset of the jack [mm] to the mean observation of a plug on the rim."""
 
     @cache
-    def felt(x_mm, y_mm):
+    def observe(x_mm, y_mm):
         observation, _ = kmp.reset(seed=0, options={"offset": (x_mm * MM, y_mm * MM)})
-        seen = [observation]
+        observations = [observation]
         for _ in range(13):
-            seen.append(kmp.step(np.zeros(2))[0])
-        return np.mean(seen[6:], axis=0)
+            observations.append(kmp.step(np.zeros(2))[0])
+        return np.mean(observations[6:], axis=0)
 
-    return felt
+    return observe
 
 
-def test_task_is_invariant_under_half_a_turn(kmp, felt):
+def test_contact_on_the_rim_is_invariant_under_a_half_turn(kmp, observe_on_rim):
     signs = np.diag(kmp.task.symmetry.observations[0])
-    across = signs < 0
-    seen, other = felt(1.0, 0.5), signs * felt(-1.0, -0.5)
+    is_reversed = signs < 0
+    direct, turned = observe_on_rim(1.0, 0.5), signs * observe_on_rim(-1.0, -0.5)
     torques = slice(10, 12)
-    towards = np.array([0.5, -1.0]) / np.hypot(0.5, 1.0)  # what a push from where the jack is turns about
-    # Not exactly the same: the demonstrations lean, and the crescent's end on that side bears the plug.
-    for torque in (seen[torques], other[torques]):
+    axis = np.array([0.5, -1.0]) / np.hypot(0.5, 1.0)  # of the torque of a contact force at the jack's offset
+    # The torques are not equal, because the demonstrated motion and the contact crescent are not symmetric.
+    for torque in (direct[torques], turned[torques]):
         assert np.linalg.norm(torque) > 0.3
-        assert torque @ towards > 0.7 * np.linalg.norm(torque)
-    np.testing.assert_allclose(seen[~across], other[~across], atol=0.1)
+        assert torque @ axis > 0.7 * np.linalg.norm(torque)
+    np.testing.assert_allclose(direct[~is_reversed], turned[~is_reversed], atol=0.1)
 
 
-def test_the_same_seed_is_the_same_episode(kgrl):
+def test_episode_repeats_when_the_seed_is_equal(kgrl):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (12, 2))
-    runs = []
+    episodes = []
     for _ in range(2):
         observation, info = kgrl.reset(seed=11)
-        steps = [observation] + [kgrl.step(action)[0] for action in actions]
-        runs.append((np.array(steps), info["jack_offset"]))
-    np.testing.assert_array_equal(runs[0][0], runs[1][0])
-    np.testing.assert_array_equal(runs[0][1], runs[1][1])
+        observations = [observation] + [kgrl.step(action)[0] for action in actions]
+        episodes.append((np.array(observations), info["jack_offset"]))
+    for first, second in zip(*episodes, strict=True):
+        np.testing.assert_array_equal(first, second)
 
 
-def test_a_hard_push_is_a_collision():
-    """A residual that commands 25 mm sideways against the jack's side, which no constraint keeps from it."""
+def test_episode_ends_by_collision_when_force_is_not_bounded():
+    """A residual commands the plug 24 mm down onto the rim of the jack, and neither pose nor force is bounded."""
     env = make_env(
         "BncConnector",
         guidance="residual",
@@ -153,45 +142,48 @@ def test_a_hard_push_is_a_collision():
         action_scale=20.0,
         bounded_force=False,
     )
-    _, info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
+    info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
     assert env.trace.statistics()["collisions"] == 1
     assert total < -45.0
 
 
-PRIOR = (1.73 * MM, 1.73 * MM, 0.5 * MM, 0.02, 0.005, 0.005)
+PRIOR_STD = (1.73 * MM, 1.73 * MM, 0.5 * MM, 0.02, 0.005, 0.005)
 
 
-def test_single_demonstration_needs_its_prior_std(tmp_path):
+def test_single_demonstration_requires_prior_std(tmp_path):
     with pytest.raises(InputError, match="give prior_std"):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=1)
     with pytest.raises(InputError, match="there are 5, which have"):
-        make_env("BncConnector", guidance="kgrl", prior_std=PRIOR)
+        make_env("BncConnector", guidance="kgrl", prior_std=PRIOR_STD)
     with pytest.raises(InputError, match="all 5 demonstrations, not 6"):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=6)
     with pytest.raises(InputError, match="give meters and radians"):
-        make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=(1.7, *PRIOR[1:]))
-    one = Demonstrations.load(inserting.PATH).first(1)
-    one.save(tmp_path / "one.npz")
-    shipped = make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR).demonstrations.reference
-    file = str(tmp_path / "one.npz")
-    stored = make_prior_knowledge("BncConnector", demonstrations=file, prior_std=PRIOR).demonstrations.reference
+        make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=(1.7, *PRIOR_STD[1:]))
+    single = Demonstrations.load(shipped_demonstrations.PATH).first(1)
+    single.save(tmp_path / "single.npz")
+    shipped = make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR_STD).demonstrations.reference
+    file = str(tmp_path / "single.npz")
+    stored = make_prior_knowledge("BncConnector", demonstrations=file, prior_std=PRIOR_STD).demonstrations.reference
     np.testing.assert_allclose(stored.means, shipped.means, atol=1e-6)
-    np.testing.assert_allclose(shipped.means[:, 2], one.outputs[0][:, 2], atol=2.5 * MM)
+    np.testing.assert_allclose(shipped.means[:, 2], single.outputs[0][:, 2], atol=2.5 * MM)
     assert (shipped.standard_deviations[:, :2] >= 1.73 * MM).all()
 
 
-def test_gap_of_a_recording_scales_its_reference(tmp_path):
-    """Both models interpolate the gap; `gap_scale` narrows the covariance there alone."""
-    loaded = Demonstrations.load(inserting.PATH)
-    kept = [(t - t[0] < 2.0) | (t - t[0] > 5.0) for t in loaded.times]
-    cut = [np.array([one[k] for one, k in zip(many, kept, strict=True)]) for many in (loaded.times, loaded.outputs)]
-    Demonstrations(*cut).save(tmp_path / "gap.npz")
+def test_gap_scale_narrows_the_covariance_in_a_gap(tmp_path):
+    """Recordings without samples from 2 s to 5 s: both models interpolate, and `gap_scale` applies only there."""
+    loaded = Demonstrations.load(shipped_demonstrations.PATH)
+    masks = [(t - t[0] < 2.0) | (t - t[0] > 5.0) for t in loaded.times]
+    times, outputs = (
+        np.array([samples[mask] for samples, mask in zip(arrays, masks, strict=True)])
+        for arrays in (loaded.times, loaded.outputs)
+    )
+    Demonstrations(times, outputs).save(tmp_path / "gap.npz")
     options = {"demonstrations": str(tmp_path / "gap.npz"), "reference_model": "promp"}
     plain, scaled = (
-        make_prior_knowledge("BncConnector", **options | further).demonstrations.reference
-        for further in ({}, {"gap_scale": 0.1})
+        make_prior_knowledge("BncConnector", **options | change).demonstrations.reference
+        for change in ({}, {"gap_scale": 0.1})
     )
     ratio = (scaled.standard_deviations / plain.standard_deviations)[:, :3]
     np.testing.assert_allclose(ratio[[10, 350]], 1.0, atol=0.05)
@@ -200,9 +192,9 @@ def test_gap_of_a_recording_scales_its_reference(tmp_path):
     assert np.abs(gmr.means - plain.means).max() > 1e-4
 
 
-def test_action_reaches_the_offset_that_the_prior_declares():
+def test_action_displaces_the_command_by_the_prior_std():
     """An action of 1 displaces the command by √3 standard deviations: 3 mm for a prior of 1.73 mm."""
-    env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR, bound=6.0 * MM)
+    env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR_STD, bound=6.0 * MM)
     commands = []
     for action in (0.0, 1.0):
         env.reset(seed=0)
@@ -221,7 +213,7 @@ def test_reward_is_the_sum_of_its_terms(kgrl):
     assert info["action_cost"] == pytest.approx(-0.01 * kgrl.action_repeat * action @ action)
 
 
-def test_shaped_reward_adds_the_depth_gained():
+def test_shaped_reward_is_proportional_to_the_depth():
     env = make_env("BncConnector", guidance="kmp", reward="shaped", fixture_offset="none", action_repeat=10)
     env.reset(seed=0)
     start = reference_trajectory("insert").means[0, 2]
@@ -231,23 +223,23 @@ def test_shaped_reward_adds_the_depth_gained():
     assert depth == pytest.approx(DEPTH_REWARD * (start - env.trace.measured[-1, 2]) / MM, abs=0.5)
 
 
-def test_aligned_reward_adds_distance_gained_to_the_jack():
-    """From 2 mm next to the jack to where a constant action leads."""
+def test_aligned_reward_is_proportional_to_the_approach():
+    """A constant action, from an initial distance of 2 mm between the axes of plug and jack."""
     env = make_env("BncConnector", guidance="kgrl", reward="aligned", fixture_offset="none", action_repeat=10)
     env.reset(seed=0, options={"offset": (2.0 * MM, 0.0)})
-    gained = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))
-    nearer = np.hypot(2.0 * MM, 0.0) - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
-    assert gained > 1.0
-    assert gained == pytest.approx(ALIGNMENT_REWARD * nearer / MM, abs=0.5)
+    reward = sum(env.step(np.array([1.0, 0.0]))[4]["alignment"] for _ in range(10))
+    approach = 2.0 * MM - np.linalg.norm(env.trace.measured[-1, :2] - [2.0 * MM, 0.0])
+    assert reward > 1.0
+    assert reward == pytest.approx(ALIGNMENT_REWARD * approach / MM, abs=0.5)
 
 
-def test_policy_of_the_gantry_drives_the_arm():
-    """The arm is slower to follow, and locks too."""
+def test_torque_search_locks_on_the_arm():
+    """The scripted policy was written for the gantry; the arm follows commands more slowly."""
     env = make_env("BncConnector", guidance="kgrl", fixture_offset="per_episode", station="arm")
-    assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[1]["is_success"]
+    assert play(env, scripted_torque_search, seed=4, options={"offset": (0.0009, -0.0008)})[0]["is_success"]
 
 
-def test_a_push_moves_the_robot(kgrl):
+def test_push_displaces_the_robot(kgrl):
     kgrl.reset(seed=0)
     kgrl.step(np.zeros(2))
     before = kgrl.trace.measured[-1].copy()
@@ -257,7 +249,7 @@ def test_a_push_moves_the_robot(kgrl):
 
 
 class TestUncertainty:
-    def test_calibration_keeps_its_hidden_offset_for_a_run(self):
+    def test_per_run_jack_offset_is_constant_during_a_run(self):
         fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
         draws = [fixture_offset.draw(rng, InsertionReset()) for _ in range(20)]
         jacks, grasps = (np.array(column) for column in zip(*draws, strict=True))
@@ -266,24 +258,24 @@ class TestUncertainty:
         assert len({tuple(grasp) for grasp in grasps}) == 20
         assert np.linalg.norm(grasps, axis=1).max() <= 0.3 * MM
 
-    def test_a_new_run_has_another_one(self):
+    def test_new_run_samples_another_jack_offset(self):
         fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
         first, _ = fixture_offset.draw(rng, InsertionReset())
         second, _ = fixture_offset.draw(rng, InsertionReset(new_run=True))
         assert (first != second).any()
 
-    def test_held_out_keeps_the_run_and_draws_apart(self):
+    def test_held_out_episode_differs_only_in_the_grasp_offset(self):
         fixture_offset = BncUncertainty("per_run")
         jack, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset())
         jack_held_out, grasp_held_out = fixture_offset.draw(np.random.default_rng(7), InsertionReset(held_out=True))
         np.testing.assert_array_equal(jack, jack_held_out)
         assert (grasp != grasp_held_out).any()
 
-    def test_disc_fills_the_disc(self):
+    def test_per_episode_jack_offset_is_uniform_in_a_disc(self):
         fixture_offset, rng = BncUncertainty("per_episode"), np.random.default_rng(1)
         radii = np.array([np.linalg.norm(fixture_offset.draw(rng, InsertionReset())[0]) for _ in range(2000)])
         assert radii.max() <= 1.5 * MM
-        # The density is the same everywhere: half the area lies within 1/√2 of the radius.
+        # A disc of 1/√2 of the radius has half the area.
         assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)
 
     @pytest.mark.parametrize(
@@ -293,11 +285,11 @@ class TestUncertainty:
             {"offset": (1, 2, 3)},
             {"offset": "far"},
             {"offset": (0, np.nan)},
-            {"offset": (1.5, 0.0)},  # meant in millimeters
+            {"offset": (1.5, 0.0)},  # millimeters instead of meters
             {"offset": (0.0, -0.5)},
         ],
     )
-    def test_refuses_options_that_make_no_sense(self, kmp, options):
+    def test_reset_option_is_refused_when_invalid(self, kmp, options):
         with pytest.raises(InputError):
             kmp.reset(options=options)
 
@@ -313,30 +305,30 @@ class TestUncertainty:
         {"action_dims": (0, 6)},
     ],
 )
-def test_refuses_what_makes_no_sense(wrong):
+def test_option_is_refused_when_invalid(wrong):
     with pytest.raises(InputError):
         make_env("BncConnector", **wrong)
 
 
-def test_contact_on_the_rim_is_invariant_under_quarter_turns(kmp, felt):
-    """Not exactly so: the demonstrations search the rim one way round."""
+def test_contact_on_the_rim_is_similar_after_a_quarter_turn(kmp, observe_on_rim):
+    """The contact is not equal, because the demonstrations search along the rim in one direction of rotation."""
     near = kmp.task.near_symmetry
     assert len(near.actions) == 7
     quarter = near.observations[0]
-    seen, turned = felt(1.0, 0.5), felt(-0.5, 1.0)
+    direct, turned = observe_on_rim(1.0, 0.5), observe_on_rim(-0.5, 1.0)
     torques = slice(10, 12)
-    expected = (quarter @ seen)[torques]
+    expected = (quarter @ direct)[torques]
     assert np.linalg.norm(expected - turned[torques]) < 0.5 * np.linalg.norm(expected)
 
 
-def test_the_near_symmetry_contains_the_exact_one(kmp):
+def test_near_symmetry_contains_the_exact_symmetry(kmp):
     exact, near = kmp.task.symmetry, kmp.task.near_symmetry
     sides = [k for k in range(7) if np.array_equal(near.actions[k], exact.actions[0])]
     assert any(np.array_equal(near.observations[k], exact.observations[0]) for k in sides)
 
 
 @pytest.mark.parametrize("station", ["gantry", "arm"])
-def test_wrist_camera_shows_the_jacks_offset_when_the_pose_does_not(station):
+def test_wrist_image_changes_with_the_offset_of_the_jack(station):
     images = {}
     for name in ("image", "image_and_state"):
         env = make_env("BncConnector", guidance="kgrl", station=station, observation=name)
@@ -344,9 +336,9 @@ def test_wrist_camera_shows_the_jacks_offset_when_the_pose_does_not(station):
             images[name, offset] = env.reset(seed=0, options={"offset": offset})[0]
             assert env.observation_space.contains(images[name, offset])
         assert env.task.symmetry is env.task.near_symmetry is None
-    seen, both = images["image", (0.0, 0.0)], images["image_and_state", (0.0, 0.0)]
-    np.testing.assert_allclose(both[:-13], np.moveaxis(seen, -1, 0).ravel() / 255, atol=1e-6)
+    image, both = images["image", (0.0, 0.0)], images["image_and_state", (0.0, 0.0)]
+    np.testing.assert_allclose(both[:-13], np.moveaxis(image, -1, 0).ravel() / 255, atol=1e-6)
     for offset in ((0.0015, 0.0), (0.0, 0.0015)):
-        changed = np.abs(images["image", offset].astype(int) - seen).max(-1) > 30
-        assert changed.sum() > 20
+        is_changed = np.abs(images["image", offset].astype(int) - image).max(-1) > 30
+        assert is_changed.sum() > 20
         np.testing.assert_allclose(images["image_and_state", offset][-13:-6], both[-13:-6], atol=1e-6)

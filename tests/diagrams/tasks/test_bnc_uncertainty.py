@@ -1,4 +1,4 @@
-"""Actual offsets of jack and plug."""
+"""Sampled offsets of jack and plug, and tilt of the plug in the tool."""
 
 import numpy as np
 import pytest
@@ -11,13 +11,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 
-def sample_offsets(uncertain, count, seed=0):
+def sample_offsets(uncertainty, count, seed=0):
+    """Return `count` samples of the offset of the jack, followed by offset and tilt of the plug."""
     rng = np.random.default_rng(seed)
-    return [np.concatenate(uncertain.draw(rng, InsertionReset())) for _ in range(count)]
+    return [np.concatenate(uncertainty.draw(rng, InsertionReset())) for _ in range(count)]
 
 
 @pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
-def test_tilt_is_sampled_within_bounds_without_side_effects(kind):
+def test_tilt_is_within_its_range_and_changes_no_offset(kind):
     straight, tilted = (
         sample_offsets(BncUncertainty(kind), 50),
         sample_offsets(BncUncertainty(kind, grasp_angle=1.0), 50),
@@ -29,19 +30,19 @@ def test_tilt_is_sampled_within_bounds_without_side_effects(kind):
     np.testing.assert_array_equal(np.array(tilted)[:, :4], straight)
 
 
-def test_a_given_offset_is_without_a_tilt():
+def test_tilt_is_zero_when_the_offset_is_given():
     reset = InsertionReset(offset=(0.0, 1e-3))
     _, plug = BncUncertainty("per_episode", grasp_angle=1.0).draw(np.random.default_rng(0), reset)
     np.testing.assert_array_equal(plug, 0.0)
 
 
 @pytest.mark.parametrize("angle", [-0.1, LARGEST_GRASP_ANGLE + 0.1, np.nan])
-def test_refuses_an_angle_that_is_none(angle):
+def test_grasp_angle_is_refused_when_out_of_range(angle):
     with pytest.raises(InputError, match="grasp_angle"):
         make_env("BncConnector", grasp_angle=angle)
 
 
-def test_the_plug_in_the_tool_is_tilted():
+def test_plug_is_tilted_in_the_tool():
     env = make_env("BncConnector", guidance="kmp", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=0)
     plant = env.task.diagram.GetSubsystemByName("station").plant

@@ -1,4 +1,4 @@
-"""No action ends an episode by force: the impedance is limited below the force limit."""
+"""Option `bounded_force`: the impedance limits the contact force below the force limit of the task."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.task import Threshold
 from guiderail.models.common.errors import InputError
 
-# Pushing down and sideways ends these by force if the impedance is not bounded.
-PUSHED = [
+# The action of `push` ends these episodes by collision if `bounded_force` is false.
+PUSHES = [
     ("BncConnector", {"guidance": "kgrl"}, "gantry"),
     ("BncConnector", {"guidance": "residual", "action_dims": (0, 1, 2), "action_scale": 5.0}, "arm"),
     ("BncConnector", {"guidance": "skgrl"}, "mujoco"),
@@ -21,7 +21,10 @@ PUSHED = [
 
 
 def push(task, **options):
-    """Press with the action (1, …, 1, −1) on a fixture that is 2.5 mm off, until the episode ends."""
+    """Press on a fixture with an offset of 2.5 mm; return the ending, the peak force [N], and the force limit [N].
+
+    The action is 1 in all directions except z, where it is −1.
+    """
     env = make_env(task, difficulty="hard", **options)
     env.reset(seed=0, options={"offset": (0.0025, 0.0)})
     action, over = np.ones(env.action_space.shape), False
@@ -34,21 +37,21 @@ def push(task, **options):
     return info["termination"], force, env.task.declaration.options.force_limit
 
 
-@pytest.mark.parametrize(("task", "options", "station"), PUSHED)
-def test_push_ends_no_episode_when_force_is_bounded(task, options, station):
+@pytest.mark.parametrize(("task", "options", "station"), PUSHES)
+def test_push_is_no_collision_when_force_is_bounded(task, options, station):
     termination, force, limit = push(task, station=station, **options)
     assert termination != "collision"
     assert 0.5 * limit < force < limit
 
 
-@pytest.mark.parametrize(("task", "options", "station"), [PUSHED[0], PUSHED[4]])
-def test_push_ends_episode_when_force_is_not_bounded(task, options, station):
+@pytest.mark.parametrize(("task", "options", "station"), [PUSHES[0], PUSHES[4]])
+def test_push_is_a_collision_when_force_is_not_bounded(task, options, station):
     termination, force, limit = push(task, station=station, bounded_force=False, **options)
     assert termination == "collision"
     assert force > limit
 
 
-def test_limits_lie_inside_ball_and_are_never_raised():
+def test_force_limits_are_within_the_ball_and_never_raised():
     for force in (8.0, 20.0, 35.0):
         limits = np.array(Impedance().with_max_force(force).limits)
         assert 0.95 * force < np.linalg.norm(limits[:3]) < force
@@ -57,7 +60,7 @@ def test_limits_lie_inside_ball_and_are_never_raised():
 
 
 @pytest.mark.parametrize("limit", [12.0, 30.0])
-def test_impedance_follows_force_limit(limit):
+def test_impedance_depends_on_the_force_limit_of_the_task(limit):
     task = EnvConfig.resolve("GridClamp", {"force_limit": limit}).make_task()
     expected = Impedance().with_max_force(limit)
     np.testing.assert_array_equal(task.impedance().bound.numbers, expected.bound.numbers)
@@ -67,7 +70,7 @@ def test_impedance_follows_force_limit(limit):
 
 @pytest.mark.parametrize("station", ["gantry", "arm", "mujoco"])
 def test_sampled_limit_is_observed_and_bounds_the_force(station):
-    """Bang-bang actions; the impedance of the station itself is bounded for the largest limit only."""
+    """Random corner actions; the station's own impedance is bounded only for the largest limit of the range."""
     env = make_env("BncConnector", difficulty="hard", guidance="kgrl", station=station, force_limit_range=(8.0, 25.0))
     rng, limits = np.random.default_rng(0), []
     for seed in (1, 5):
@@ -86,7 +89,7 @@ def test_sampled_limit_is_observed_and_bounds_the_force(station):
     assert max(limits) - min(limits) > 3.0
 
 
-def test_symmetries_leave_observed_limit_unchanged():
+def test_symmetry_leaves_the_observed_force_limit_unchanged():
     env = make_env("BncConnector", difficulty="hard", guidance="kgrl", force_limit_range=(8.0, 25.0))
     size = env.observation_space.shape[0]
     for symmetry in (env.task.symmetry, env.task.near_symmetry):
@@ -95,20 +98,20 @@ def test_symmetries_leave_observed_limit_unchanged():
             np.testing.assert_array_equal(matrix[:, -1], np.eye(size)[-1])
 
 
-@pytest.mark.parametrize("given", [(25.0, 8.0), (0.5, 8.0), (8.0, 61.0)])
-def test_range_of_limits_is_refused_when_invalid(given):
+@pytest.mark.parametrize("limits", [(25.0, 8.0), (0.5, 8.0), (8.0, 61.0)])
+def test_force_limit_range_is_refused_when_invalid(limits):
     with pytest.raises(InputError, match="two forces from 1 to 60 N"):
-        EnvConfig.resolve("GridClamp", {"force_limit_range": given})
+        EnvConfig.resolve("GridClamp", {"force_limit_range": limits})
 
 
-def test_task_without_a_force_limit_is_refused():
+def test_impedance_is_refused_without_a_force_limit():
     task = EnvConfig.resolve("BncConnector", {}).make_task()
     task.collision = Threshold()
     with pytest.raises(InputError, match="force limit of BncConnector must be positive, not 0"):
         task.impedance()
 
 
-def test_station_raises_when_it_takes_no_impedance():
+def test_station_is_refused_without_an_impedance():
     def build():
         raise AssertionError("must not be built")
 

@@ -1,4 +1,4 @@
-"""Difficulty of the connector and the clamp: `difficulty` and the options that it sets."""
+"""Option `difficulty` of BncConnector and GridClamp, and the options that `hard` sets."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
-FRESH = {"options": {"new_run": True}, "seed": 300_000}
+NEW_RUN = {"options": {"new_run": True}, "seed": 300_000}
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,8 @@ def clamp():
 
 
 @pytest.mark.parametrize("task", HARD)
-def test_hard_equals_its_options_given_one_by_one(task):
-    standard, hard = (EnvConfig.resolve(task, {"difficulty": word}).options for word in ("standard", "hard"))
+def test_hard_equals_its_options_set_separately(task):
+    standard, hard = (EnvConfig.resolve(task, {"difficulty": name}).options for name in ("standard", "hard"))
     assert {name for name in hard if hard[name] != standard[name]} == {"difficulty", *HARD[task]}
     assert {name: hard[name] for name in HARD[task]} == HARD[task]
     assert EnvConfig.resolve(task, HARD[task]).options == hard | {"difficulty": "standard"}
@@ -43,7 +43,7 @@ def test_hard_equals_its_options_given_one_by_one(task):
 
 
 @pytest.mark.parametrize("task", HARD)
-def test_standard_is_unchanged(task):
+def test_standard_has_the_default_dimensions_and_limits(task):
     declared = EnvConfig.resolve(task, {}).make_task()
     dimensions = {"BncConnector": BncDimensions(), "GridClamp": GridClampDimensions()}[task]
     assert declared.workcell() == type(declared.workcell())(dimensions)
@@ -55,18 +55,18 @@ def test_standard_is_unchanged(task):
         np.testing.assert_array_equal(declared.constraints().c, -2.0 * MM)
 
 
-JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.19223467197202893]  # [mm]
+JACK, PLUG = [0.08709568301284622, 1.0485589162894264], [0.12997660481050205, 0.19223467197202893]  # offsets [mm]
 
 
-def test_samples_of_a_seed_at_standard_are_unchanged():
-    """The samples of a random generator do not depend on the machine."""
+def test_seed_samples_the_same_offsets_in_every_version():
+    """The samples of a seed must not change, because stored results depend on them."""
     fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(3)
     jack, plug = fixture_offset.draw(rng, InsertionReset())
     np.testing.assert_allclose(1e3 * jack, JACK, atol=1e-12)
     np.testing.assert_allclose(1e3 * plug, PLUG, atol=1e-12)
 
 
-WRONG = [
+OUT_OF_RANGE = [
     ("BncConnector", {"force_limit": 4.0}, "force_limit must be at least 5"),
     ("BncConnector", {"offset_range": (0.003, 0.002)}, "the smaller one first"),
     ("BncConnector", {"offset_range": (0.0, 0.005)}, "two distances from 0 to 0.004 m"),
@@ -94,15 +94,15 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("task", "wrong", "words"), WRONG)
-def test_options_out_of_range_are_refused(task, wrong, words):
+@pytest.mark.parametrize(("task", "options", "words"), OUT_OF_RANGE)
+def test_option_is_refused_when_out_of_range(task, options, words):
     with pytest.raises(InputError) as refused:
-        EnvConfig.resolve(task, wrong)
+        EnvConfig.resolve(task, options)
     assert words in str(refused.value)
     assert "\n" not in str(refused.value)
 
 
-def test_hard_demonstrations_search_the_offset_range(connector):
+def test_hard_connector_has_its_dimensions_and_offsets(connector):
     declared = connector.unwrapped.task.declaration
     assert declared.workcell().dimensions.mouth_chamfer == 0.1 * MM
     assert declared.collision.above == 20.0
@@ -126,7 +126,7 @@ def test_jack_turns_within_its_range():
 
 
 def test_center_of_pressure_points_to_the_jack(connector):
-    """On the rim the observed center of pressure and the commanded position point to the jack."""
+    """The plug stands on the rim. The observation also contains the commanded position."""
     observation, info = connector.reset(seed=4)
     while observation[9] < 0.15:
         observation, _, _, _, _ = connector.step(np.zeros(2))
@@ -137,16 +137,16 @@ def test_center_of_pressure_points_to_the_jack(connector):
     )
 
 
-def test_scripted_policy_locks_at_hard_and_demonstrations_fail(connector):
-    row = evaluate_policy(connector, scripted_center_of_pressure, episodes=1, **FRESH).iloc[0]
+def test_scripted_policy_locks_at_hard_and_zero_policy_fails(connector):
+    row = evaluate_policy(connector, scripted_center_of_pressure, episodes=1, **NEW_RUN).iloc[0]
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
-    assert not evaluate_policy(connector, zero_policy(connector), episodes=1, **FRESH)["success"].any()
+    assert not evaluate_policy(connector, zero_policy(connector), episodes=1, **NEW_RUN)["success"].any()
 
 
 def test_gentle_search_succeeds_at_hard_and_descent_fails(clamp):
-    assert evaluate_policy(clamp, scripted_gentle_search, episodes=1, **FRESH)["success"].all()
-    assert not evaluate_policy(clamp, straight_descent, episodes=1, **FRESH)["success"].any()
+    assert evaluate_policy(clamp, scripted_gentle_search, episodes=1, **NEW_RUN)["success"].all()
+    assert not evaluate_policy(clamp, straight_descent, episodes=1, **NEW_RUN)["success"].any()
 
 
 def test_clamp_has_the_given_time_limit_and_start_height():

@@ -1,12 +1,10 @@
 """Environment GridClamp: scripted policies, constraints, rewards, observation and options."""
 
-import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
-import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.grid_clamp.options import COLLISION_FORCE
 from guiderail.diagrams.tasks.grid_clamp.task import (
@@ -54,10 +52,6 @@ def env_without_offsets():
     return make_env("GridClamp", fixture_offset="none")
 
 
-def test_is_registered():
-    assert "guiderail/GridClamp-v0" in gymnasium.registry
-
-
 @pytest.fixture(scope="module")
 def arm():
     return make_env("GridClamp", station="arm", fixture_offset="none")
@@ -74,7 +68,7 @@ def test_straight_descent_inserts_without_offsets(env_without_offsets, seed):
     assert 300.0 * 0.014 < terms["shaping"] < 300.0 * 0.0185
 
 
-def test_aligned_reward_pays_approach_and_costs_collisions():
+def test_aligned_reward_rewards_approach_not_collision():
     """A straight descent at an offset of 2 mm presses on the table until the force limit ends the episode."""
     env = make_env("GridClamp", reward="aligned", difficulty="hard", bounded_force=False)
     info, _, terms = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (2.0 * MM, 0.0)})
@@ -86,32 +80,32 @@ def test_aligned_reward_pays_approach_and_costs_collisions():
     assert sideways["alignment"] == pytest.approx(0.0, abs=1.5)
 
 
-def test_straight_descent_mostly_fails_with_offsets(env):
-    """The clamp is pressed on the table with at most 12 N until the time limit of 10 s."""
+def test_straight_descent_fails_with_offsets(env):
+    """The clamp presses on the table with at most 12 N until the time limit of 10 s."""
     rows = evaluate_policy(env, straight_descent, episodes=1, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 0
     assert rows["peak_force"].max() < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
-def test_search_inserts_where_the_descent_fails(env):
+def test_scripted_search_inserts_with_offsets(env):
     rows = evaluate_policy(env, scripted_search, episodes=2, seed=1, options=NEW_RUN)
     assert rows["success"].sum() == 2
     assert rows["peak_force"].max() < 15.0
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
-def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
+def test_commands_stay_in_the_cuboid_under_any_action(guidance):
     """Repeated corner actions reach every corner of the cuboid and the surface of the table."""
     env = make_env("GridClamp", guidance=guidance)
     size = env.action_space.shape
     rng = np.random.default_rng(3)
-    held = rng.choice([-1.0, 1.0], size)
+    corner = rng.choice([-1.0, 1.0], size)
 
     def adversary(_):
-        nonlocal held
+        nonlocal corner
         if rng.uniform() < 0.15:
-            held = rng.choice([-1.0, 1.0], size)
-        return held
+            corner = rng.choice([-1.0, 1.0], size)
+        return corner
 
     info, _, _ = play(env, adversary, seed=5)
     parameters = TEMPLATE.parameters
@@ -122,19 +116,18 @@ def test_no_action_commands_a_pose_outside_the_cuboid(guidance):
     assert np.abs(commanded[:, 3:]).max() <= 1e-9
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert info["termination"] != "collision"
-    if guidance != "residual":  # its command descends even if the clamp is blocked
+    if guidance != "residual":  # the command of a residual descends even if the clamp is blocked
         assert env.trace.statistics()["peak_force"] < 1.2 * MAX_TRACKING_ERROR * STIFFNESS
 
 
-def test_without_the_cuboid_a_push_is_a_collision():
+def test_push_is_a_collision_without_the_cuboid():
     env = make_env("GridClamp", guidance="none", active_constraints=False, bounded_force=False)
     info, _, _ = play(env, lambda _: np.array([0, 0, -0.5, 0, 0, 0]), seed=0, options={"offset": (0.003, 0.0)})
     assert info["termination"] == "collision"
     assert info["contact_force"] > COLLISION_FORCE
 
 
-def test_reward_without_force_cost_differs_by_the_cost(env_without_offsets):
-    """The returns of the same episode with both rewards differ by the force cost."""
+def test_returns_of_both_rewards_differ_by_the_force_cost(env_without_offsets):
     without = make_env("GridClamp", fixture_offset="none", reward="no_force")
     _, with_cost, terms = play(env_without_offsets, lambda _: DOWN, seed=1)
     _, without_cost, _ = play(without, lambda _: DOWN, seed=1)
@@ -142,8 +135,8 @@ def test_reward_without_force_cost_differs_by_the_cost(env_without_offsets):
     assert with_cost - without_cost == pytest.approx(terms["force_cost"])
 
 
-def test_an_observation_is_position_and_force(env):
-    """The clamp is pressed on the table next to the holes, with the pegs' tips at the table's surface."""
+def test_observation_has_position_and_force(env):
+    """The clamp presses on the table next to the holes; its pegs are 12 mm long."""
     env.reset(seed=0, options={"offset": (0.0025, 0.001)})
     for _ in range(8):
         observation, _, _, _, info = env.step(DOWN)
@@ -153,14 +146,14 @@ def test_an_observation_is_position_and_force(env):
     assert force > 5.0
 
 
-def test_the_same_seed_is_the_same_episode_bit_for_bit(env):
+def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(env):
     actions = np.random.default_rng(0).uniform(-1, 1, (12, 3)) - [0, 0, 0.3]
-    runs = []
+    episodes = []
     for _ in range(2):
         observation, info = env.reset(seed=12, options={"new_run": True})
-        steps = [observation] + [env.step(action)[0] for action in actions]
-        runs.append((np.array(steps), info["grasp_offset"], info["table_offset"]))
-    for first, second in zip(*runs, strict=True):
+        observations = [observation] + [env.step(action)[0] for action in actions]
+        episodes.append((np.array(observations), info["grasp_offset"], info["table_offset"]))
+    for first, second in zip(*episodes, strict=True):
         np.testing.assert_array_equal(first, second)
 
 
@@ -171,7 +164,7 @@ def test_environment_passes_the_checkers_of_gymnasium_and_sb3():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_arm_inserts_without_offsets(arm, seed):
-    """The descent is 12 mm/s; in a faster one the arm deviates sideways by more than the chamfer corrects."""
+    """The clamp descends at 12 mm/s; at a higher speed the arm's lateral error exceeds the chamfer."""
     info, _, _ = play(arm, lambda _: 0.3 * DOWN, seed=seed)
     assert info["is_success"]
     assert arm.trace.statistics()["peak_force"] <= 10.0
@@ -179,7 +172,7 @@ def test_arm_inserts_without_offsets(arm, seed):
 
 
 class TestUncertainty:
-    def test_a_run_has_six_grasps_and_one_error_of_the_table(self):
+    def test_run_has_six_grasp_offsets_and_one_table_offset(self):
         fixture_offset, rng = GridClampUncertainty("per_run"), np.random.default_rng(0)
         tables, grasps = (
             np.array(column)
@@ -187,7 +180,7 @@ class TestUncertainty:
         )
         assert (tables == tables[0]).all()
         assert 1.8 * MM <= np.linalg.norm(tables[0]) <= 2.2 * MM
-        # Grasp offsets of one place differ by its repeatability alone, so at most five gaps between places are larger.
+        # The six grasp offsets of a run vary only by the repeatability, so at most five gaps are larger.
         gaps = np.diff(np.sort(grasps[:, 0]))
         assert 0.8 * MM < np.ptp(grasps[:, 0]) < 2.4 * MM
         assert (gaps > 0.2 * MM).sum() <= 5
@@ -199,7 +192,7 @@ class TestUncertainty:
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
         assert worst < TEMPLATE.parameters["width_m"] / 2 - 0.2 * MM
 
-    def test_held_out_keeps_the_run_and_draws_apart(self):
+    def test_held_out_episode_differs_only_in_the_grasp_offset(self):
         fixture_offset = GridClampUncertainty("per_run")
         table, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset())
         table_held_out, grasp_held_out = fixture_offset.draw(np.random.default_rng(7), InsertionReset(held_out=True))
@@ -218,6 +211,6 @@ class TestUncertainty:
         {"action_repeat": 0},
     ],
 )
-def test_invalid_options_are_refused(wrong):
+def test_option_is_refused_when_invalid(wrong):
     with pytest.raises(InputError):
         make_env("GridClamp", **wrong)

@@ -1,6 +1,5 @@
-"""NarrowPassage as a user gets it: through `gymnasium.make`."""
+"""Environment NarrowPassage, made by `gymnasium.make`: constraints, rewards, pushes, images and options."""
 
-import gc
 import warnings
 from itertools import islice
 
@@ -13,12 +12,12 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 import guiderail
 from guiderail.diagrams.envs import scene
 from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage as Task
+from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 WORLD = PassageGeometry()
-GUIDANCE = possible_guidance(Task.provides())
+GUIDANCE = possible_guidance(NarrowPassage.provides())
 NULL_SPACE = ("kgrl", "skgrl")
 
 
@@ -27,7 +26,7 @@ def make(guidance="skgrl", **arguments):
 
 
 def play(env, policy, **reset):
-    """Rewards, observations and the last info of an episode; the policy is called with the number of the action."""
+    """Run an episode; return rewards, observations and all infos. `policy` depends on the number of the action."""
     observation, info = env.reset(**reset)
     observations, rewards, infos = [observation], [], [info]
     finished = False
@@ -40,26 +39,26 @@ def play(env, policy, **reset):
     return np.array(rewards), np.array(observations), infos
 
 
-def still(_):
+def zero_action(_):
     return np.zeros(2, np.float32)
 
 
 def adversaries():
-    """Largest actions: constant, alternating at several rates, and random.
+    """Yield policies with extreme actions: constant, alternating at several rates, and random.
 
-    No property here depends on which of them it is: where there are two cases, each takes every other one.
+    Where a test has two cases, each case uses every second policy.
     """
     rng = np.random.default_rng(0)
-    corners = [np.array(c, np.float32) for c in ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0))]
-    yield from (lambda k, c=c: c for c in corners)
-    yield from (lambda k, r=r: np.full(2, (-1.0) ** (k // r), np.float32) for r in (1, 4, 10))
+    corners = [np.array(corner, np.float32) for corner in ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0))]
+    yield from (lambda k, corner=corner: corner for corner in corners)
+    yield from (lambda k, steps=steps: np.full(2, (-1.0) ** (k // steps), np.float32) for steps in (1, 4, 10))
     for _ in range(2):
         yield lambda k: rng.uniform(-1, 1, 2).astype(np.float32)
         yield lambda k: rng.choice([-1.0, 1.0], 2).astype(np.float32)
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
-def test_both_env_checkers_pass_without_a_warning(guidance):
+def test_environment_passes_the_checkers_without_a_warning(guidance):
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         env = make(guidance)
@@ -68,8 +67,8 @@ def test_both_env_checkers_pass_without_a_warning(guidance):
     assert not [str(warning.message) for warning in warned]
 
 
-def test_both_env_checkers_pass_with_images(monkeypatch):
-    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")  # the checker also makes the other render mode
+def test_environment_with_images_passes_the_checkers(monkeypatch):
+    monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")  # Gymnasium's checker also makes render_mode="human"
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         env = make("kgrl", observation="image", render_mode="rgb_array")
@@ -79,7 +78,7 @@ def test_both_env_checkers_pass_with_images(monkeypatch):
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
-def test_same_seed_repeats_an_episode_bit_for_bit(guidance):
+def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(guidance):
     rng = np.random.default_rng(1)
     actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
 
@@ -98,9 +97,9 @@ def test_same_seed_repeats_an_episode_bit_for_bit(guidance):
 
 
 @pytest.mark.parametrize("guidance", GUIDANCE)
-def test_the_demonstrations_alone_pass_and_run_into_the_obstacle(guidance):
+def test_zero_action_succeeds_and_crosses_the_obstacle(guidance):
     env = make(guidance)
-    rewards, _, infos = play(env, still)
+    rewards, _, infos = play(env, zero_action)
     assert infos[-1]["is_success"]
     assert env.trace.statistics()["collisions"] == 0
     assert sum(info["obstacle_cost"] for info in infos) < -50
@@ -119,19 +118,19 @@ def test_null_space_guidance_withstands_adversaries(guidance, action_repeat, fir
         assert statistics["max_measured_violation"] <= 1e-9
         assert statistics["collisions"] == 0
         assert infos[-1]["is_success"]
-        # The trace and the info of every step are two accounts of the same episode.
+        # The trace and the infos of the steps have the same violations.
         assert statistics["max_commanded_violation"] == max(info["constraint_violation"] for info in infos[1:])
         assert statistics["max_measured_violation"] == max(info["measured_violation"] for info in infos[1:])
         assert statistics["steps"] == len(env.trace)
 
 
 @pytest.mark.parametrize("guidance", NULL_SPACE)
-def test_no_action_sequence_leads_into_the_walls(guidance):
-    """A bound instead of a sample: the sum of the absolute impulse responses, at hold 1 the worst that can be done."""
+def test_no_action_sequence_reaches_the_walls(guidance):
+    """The sum of absolute impulse responses bounds the reach of all sequences with an action per control step."""
     lc_ns_kmp = make(guidance).task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("lc_ns_kmp")
     primitive, gain = lc_ns_kmp.primitive, lc_ns_kmp.gain
     steps, history = primitive.num_steps, primitive.history
-    response = np.zeros((history + steps, 2, steps, 2))  # of output o at step n to action j at step k
+    response = np.zeros((history + steps, 2, steps, 2))  # [step n, output, step k, action]
     for n in range(steps):
         history_map, action_map, _ = primitive.linear_response(n)
         response[history + n, :, n] = action_map * gain
@@ -139,19 +138,19 @@ def test_no_action_sequence_leads_into_the_walls(guidance):
             past = response[n : n + history].reshape(history * 2, -1)
             response[history + n] += (history_map @ past).reshape(2, steps, 2)
     reach = np.abs(response[history:]).sum(axis=(2, 3))
-    still = make(guidance, action_repeat=1)
-    play(still, lambda k: np.zeros(2, np.float32))
-    path = still.trace.commanded
+    env = make(guidance, action_repeat=1)
+    play(env, zero_action)
+    path = env.trace.commanded
     bottom, top = WORLD.wall_y
     y_reach = reach[: len(path), 1]
-    beside_walls = (path[:, 1] + y_reach > bottom) & (path[:, 1] - y_reach < top)
-    assert beside_walls.sum() > 30
-    x, x_reach = path[beside_walls, 0], reach[: len(path)][beside_walls, 0]
+    is_between_walls = (path[:, 1] + y_reach > bottom) & (path[:, 1] - y_reach < top)
+    assert is_between_walls.sum() > 30
+    x, x_reach = path[is_between_walls, 0], reach[: len(path)][is_between_walls, 0]
     assert (x - x_reach > WORLD.gap_x[0]).all()
     assert (x + x_reach < WORLD.gap_x[1]).all()
 
 
-def test_residual_collides_and_violates_but_never_tunnels():
+def test_residual_collides_but_does_not_pass_through_walls():
     env = make("residual", action_scale=3.0)
     lower, upper = WORLD.walls
     endings, collisions, violation = set(), 0, -np.inf
@@ -160,7 +159,7 @@ def test_residual_collides_and_violates_but_never_tunnels():
         endings.add(infos[-1]["termination"])
         collisions += env.trace.statistics()["collisions"]
         violation = max(violation, env.trace.statistics()["max_measured_violation"])
-        # In a wall at most as deep as it gets in one plant step.
+        # A wall is penetrated by at most 21 mm, about the motion of the robot in one plant step.
         path = env.trace.measured[:, None]
         assert not ((path > lower + 0.021) & (path < upper - 0.021)).all(axis=2).any()
     assert "blocked" in endings
@@ -168,7 +167,7 @@ def test_residual_collides_and_violates_but_never_tunnels():
     assert violation > 0.01
 
 
-def test_safe_residual_gets_stuck_without_collisions():
+def test_safe_residual_is_blocked_without_collisions():
     endings = set()
     for first, action_scale in enumerate((1.0, 3.0)):
         env = make("safe_residual", action_scale=action_scale)
@@ -180,7 +179,7 @@ def test_safe_residual_gets_stuck_without_collisions():
     assert "blocked" in endings
 
 
-def test_smooth_guidance_jerks_far_less():
+def test_skgrl_has_less_jerk_than_kgrl():
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (80, 2)).astype(np.float32)
     jerk = {}
@@ -193,7 +192,7 @@ def test_smooth_guidance_jerks_far_less():
 
 def test_episode_has_the_length_of_the_thesis():
     env = make("kmp")
-    _, observations, _ = play(env, still)
+    _, observations, _ = play(env, zero_action)
     assert observations[0] == -1.0
     assert (np.diff(observations[:, 0]) > 0).all()
     assert env.task.num_steps == 400
@@ -201,8 +200,8 @@ def test_episode_has_the_length_of_the_thesis():
 
 
 def test_shaped_reward_adds_progress_towards_the_goal():
-    sparse, _, _ = play(make("kmp"), still)
-    shaped, _, infos = play(make("kmp", reward="shaped"), still)
+    sparse, _, _ = play(make("kmp"), zero_action)
+    shaped, _, infos = play(make("kmp", reward="shaped"), zero_action)
     progress = sum(info["progress"] for info in infos)
     assert shaped.sum() == pytest.approx(sparse.sum() + progress)
     start = np.linalg.norm(np.array(WORLD.goal) - infos[0]["start"])
@@ -211,10 +210,10 @@ def test_shaped_reward_adds_progress_towards_the_goal():
 
 @pytest.mark.parametrize("step", [10, 20, 45])
 @pytest.mark.parametrize("push", [(-0.1, 0.0), (0.1, 0.0), (0.0, 0.03)])
-def test_a_pushed_robot_keeps_its_course_without_a_jump(step, push):
-    """5.3.4: with P = 1 the measured pose is the past that the motion goes on from."""
+def test_command_continues_at_the_pushed_pose(step, push):
+    """Section 5.3.4: with P = 1 the history is the measured pose, so the command continues at the robot."""
     if step == 45 and push[1] == 0.0:
-        push = (0.01 * np.sign(push[0]), 0.0)  # in the passage there is no more room
+        push = (0.01 * np.sign(push[0]), 0.0)  # free space to the walls [m]
     env = make("skgrl", history=1, history_source="measured")
     env.reset()
     info = {"termination": ""}
@@ -223,7 +222,7 @@ def test_a_pushed_robot_keeps_its_course_without_a_jump(step, push):
         if k == step:
             before = env.trace.commanded[-1].copy()
             env.push(push)
-        *_, info = env.step(still(k))
+        *_, info = env.step(zero_action(k))
         if k >= step:
             worst_after = max(worst_after, info["constraint_violation"])
         if info["termination"]:
@@ -235,17 +234,17 @@ def test_a_pushed_robot_keeps_its_course_without_a_jump(step, push):
     assert env.trace.statistics()["collisions"] == 0
 
 
-def test_a_robot_pushed_out_of_the_allowed_region_is_led_back():
+def test_robot_returns_when_pushed_out_of_the_constraint():
     env = make("skgrl", history=1, history_source="measured", action_repeat=1)
     env.reset()
     for k in range(100):
-        env.step(still(k))
+        env.step(zero_action(k))
     env.push([WORLD.zone_x + 0.05 - env.trace.measured[-1, 0], 0.0])
-    *_, info = env.step(still(0))
+    *_, info = env.step(zero_action(0))
     assert info["constraint_violation"] <= 1e-9
     measured = []
     for k in range(30):
-        *_, info = env.step(still(k))
+        *_, info = env.step(zero_action(k))
         assert info["constraint_violation"] <= 1e-9
         measured.append(info["measured_violation"])
     assert max(measured[1:]) <= 1e-6
@@ -256,7 +255,7 @@ def test_reset_option_start_sets_the_start():
     env = make("skgrl")
     _, info = env.reset(options={"start": (0.27, 0.07)})
     np.testing.assert_allclose(info["start"], [0.27, 0.07])
-    env.step(still(0))
+    env.step(zero_action(0))
     assert np.linalg.norm(env.trace.commanded[0] - [0.27, 0.07]) < 0.005
     for options in ({"begin": 1}, {"start": (0, 0, 0)}, {"start": (np.nan, 0)}, {"start": "here"}):
         with pytest.raises(InputError, match="start"):
@@ -266,20 +265,20 @@ def test_reset_option_start_sets_the_start():
 def test_nan_in_the_plant_truncates_the_episode():
     env = make("kmp")
     env.reset()
-    observation, *_ = env.step(still(0))
+    observation, *_ = env.step(zero_action(0))
     plant = env.task.diagram.GetSubsystemByName("station").plant
     state = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context()).get_mutable_discrete_state_vector()
     state.SetAtIndex(0, np.nan)
-    last, _, terminated, truncated, info = env.step(still(0))
+    last, _, terminated, truncated, info = env.step(zero_action(0))
     assert (terminated, truncated) == (False, True)
     assert info["simulation_failure"]
     np.testing.assert_array_equal(last, observation)
-    _, _, infos = play(env, still)
+    _, _, infos = play(env, zero_action)
     assert infos[-1]["is_success"]
 
 
-def test_hundreds_of_resets_do_not_grow_memory(forks, tmp_path):
-    # In a process of its own, elsewhere: what other tests leave behind is none of its business.
+def test_memory_does_not_grow_with_resets(forks, tmp_path):
+    # A separate process, because memory of other tests would be part of the measurement.
     script = """
 import gymnasium, guiderail
 env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="skgrl", action_repeat=1).unwrapped
@@ -293,30 +292,30 @@ def run(resets):
     return int(open("/proc/self/statm").read().split()[1]) * resource.getpagesize()
 env.reset()
 for k in range(340):
-    env.step(np.zeros(2, np.float32))  # factors every step once
+    env.step(np.zeros(2, np.float32))  # computes the factorization of every step once
 before = run(100)
 print(run(400) - before)
 """
-    grown = forks.run("-c", script, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat", OMP_NUM_THREADS="1")
-    assert int(grown.stdout) < 400_000, grown.stderr
+    result = forks.run("-c", script, folder=tmp_path, DRAKE_ALLOW_NETWORK="meshcat", OMP_NUM_THREADS="1")
+    assert int(result.stdout) < 400_000, result.stderr
 
 
-def test_images_show_the_robot_moving():
+def test_image_shows_the_motion_of_the_robot():
     env = make("kmp", observation="image")
     first, _ = env.reset()
     assert (first.shape, first.dtype) == ((110, 144, 3), np.uint8)
     assert env.observation_space.contains(first)
     second = first
     for k in range(20):
-        second, *_ = env.step(still(k))
-    changed = np.abs(first.astype(int) - second).max(axis=2) > 40
-    # The robot is somewhere else, and nothing else moved: two small spots.
-    assert 5 < changed.sum() < 120
-    columns = np.flatnonzero(changed.any(axis=0))
+        second, *_ = env.step(zero_action(k))
+    is_changed = np.abs(first.astype(int) - second).max(axis=2) > 40
+    # Only pixels of the robot change, at its first and at its last position.
+    assert 5 < is_changed.sum() < 120
+    columns = np.flatnonzero(is_changed.any(axis=0))
     assert np.ptp(columns) > 10
 
 
-def test_the_picture_for_people_shows_the_plane():
+def test_render_returns_a_picture_of_the_plane():
     env = make("kmp", render_mode="rgb_array")
     env.reset()
     picture = env.render()
@@ -324,24 +323,24 @@ def test_the_picture_for_people_shows_the_plane():
     assert picture.std() > 10
 
 
-def test_a_forbidden_browser_view_is_one_clear_sentence(monkeypatch):
+def test_browser_view_is_refused_when_network_is_forbidden(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "none")
     with pytest.raises(InputError, match="DRAKE_ALLOW_NETWORK=meshcat"):
         make("kmp", render_mode="human")
 
 
-def test_the_browser_view_is_local(monkeypatch):
+def test_browser_view_has_a_local_address(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")
     monkeypatch.setattr("guiderail.diagrams.envs.env.Simulator.set_target_realtime_rate", lambda *_: None)
     env = make("kmp", render_mode="human")
     assert "localhost" in env.task.meshcat.web_url()
     env.reset()
-    env.step(still(0))
+    env.step(zero_action(0))
     env.render()
     assert env.task.meshcat.HasPath("/drake/visualizer/robot/ball")
 
 
-def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
+def test_missing_display_library_is_named(monkeypatch):
     load = scene.ctypes.CDLL
 
     def missing(name, *arguments, **named):
@@ -352,8 +351,8 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
     monkeypatch.setattr(scene.ctypes, "CDLL", missing)
     for arguments in ({"observation": "image"}, {"render_mode": "rgb_array"}):
         with pytest.raises(InputError, match=r"libEGL\.so\.1.*libegl1"):
-            make("kmp", horizon=17, **arguments)  # of which no diagram is there yet
-    make("kmp")  # needs no picture
+            make("kmp", horizon=17, **arguments)  # a horizon that no reused diagram has
+    make("kmp")  # without a camera
 
 
 @pytest.mark.parametrize(
@@ -364,30 +363,29 @@ def test_a_missing_display_library_is_one_clear_sentence(monkeypatch):
             "a shared control template.*use base_policy, kgrl, .*kmp, residual, .*residual_cbf",
         ),
         ({"guidance": "none"}, "use base_policy, kgrl, .*kmp, residual, .*residual_cbf, .*skgrl"),
-        ({"guidance": "magic"}, "there is no guidance 'magic'"),
+        ({"guidance": "unknown"}, "there is no guidance 'unknown'"),
         ({"reward": "dense"}, "no reward 'dense': choose one of shaped, sparse"),
-        ({"observation": "smell"}, "choose one of image, state"),
+        ({"observation": "sound"}, "choose one of image, state"),
         ({"stetion": "plane"}, "no option 'stetion' here: did you mean station"),
         ({"station": "gantry"}, "no station 'gantry'.*plane"),
-        ({"difficulty": "hopeless"}, "no difficulty 'hopeless'"),
+        ({"difficulty": "extreme"}, "no difficulty 'extreme'"),
         ({"render_mode": "ascii"}, "render mode"),
         ({"action_repeat": 0}, "action_repeat"),
         ({"action_scale": -1.0}, "action_scale"),
         ({"history": 0}, "history"),
         ({"history_variance": 0.0}, "history_variance"),
-        ({"history_source": "dreamt"}, "no history_source 'dreamt': choose one of commanded, measured"),
+        ({"history_source": "planned"}, "no history_source 'planned': choose one of commanded, measured"),
         ({"gains": (1.0,)}, "one per output"),
     ],
 )
-def test_invalid_options_are_refused_in_one_sentence(arguments, message):
+def test_option_is_refused_in_one_sentence_when_invalid(arguments, message):
     with pytest.raises(InputError, match=message) as error:
         make(**arguments)
     assert "\n" not in str(error.value)
-    gc.collect()
 
 
 @pytest.mark.parametrize("guidance", NULL_SPACE)
-def test_commands_stay_outside_of_an_obstacle_that_constrains(guidance):
+def test_commands_avoid_an_obstacle_that_is_a_constraint(guidance):
     options = {"obstacle_radius": 0.06, "max_speed": (0.5,), "max_acceleration": (4.0,)}
     env = make(guidance, obstacles_constrain=True, action_repeat=5, **options)
     rng = np.random.default_rng(0)
@@ -400,7 +398,7 @@ def test_commands_stay_outside_of_an_obstacle_that_constrains(guidance):
     assert np.abs(displacements).max() <= 0.5 * (1 + 1e-9)
 
 
-def test_guidance_without_constraints_reports_the_violation_of_a_shape():
+def test_unconstrained_guidance_reports_obstacle_violation():
     env = make("residual_covariance", obstacles_constrain=True, obstacle_radius=0.06, action_repeat=1)
     env.reset(seed=0)
     guidance, worst = env.task.diagram.GetSubsystemByName("guidance"), -np.inf
@@ -421,12 +419,12 @@ def test_guidance_without_constraints_reports_the_violation_of_a_shape():
         ({"max_acceleration": (0.1, 0.1, 0.1)}, "2 outputs"),
     ],
 )
-def test_constraints_of_the_motion_refuse_wrong_options(options, match):
+def test_motion_constraints_are_refused_when_invalid(options, match):
     with pytest.raises(InputError, match=match):
         make(**options)
 
 
-def test_observed_phase_is_that_of_the_motion_when_it_waits_for_the_robot():
+def test_observed_phase_stops_while_the_motion_waits():
     env = make("kgrl", progress="state", progress_tolerance=(1e-9, 0.1), max_lag=0.5, action_repeat=5)
     clock, times = make("kgrl", action_repeat=5), []
     assert env.task.num_steps == clock.task.num_steps + round(0.5 / env.task.control_period)
@@ -437,6 +435,6 @@ def test_observed_phase_is_that_of_the_motion_when_it_waits_for_the_robot():
         times.append(env.task.diagram.GetOutputPort("motion_time").Eval(env.simulator.get_context())[0])
         assert observation[0] == pytest.approx(2.0 * times[-1] / duration - 1.0, abs=1e-6)
     late = 60 * env.task.control_period - np.array(times[-1])
-    assert 0.3 < late <= 0.5 + 2 * env.task.control_period  # the robot is hardly ever within a nanometer
+    assert 0.3 < late <= 0.5 + 2 * env.task.control_period  # the position error is almost always above 1 nm
     with pytest.raises(InputError, match="progress_tolerance"):
         make("kgrl", progress="state", progress_tolerance=(0.0, 0.1))

@@ -1,4 +1,4 @@
-"""NarrowPassage at `hard`: half the gap width, and two obstacles whose contact ends the episode."""
+"""NarrowPassage at difficulty `hard`: half the gap width, and two obstacles whose contact ends the episode."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def env(request):
     return make_env("NarrowPassage", difficulty="hard", guidance=request.param)
 
 
-def test_scripted_policy_succeeds_and_demonstration_collides(env):
+def test_scripted_policy_succeeds_and_zero_policy_collides(env):
     row = rollout(env, scripted_slalom, seed=0, held_out=True)
     assert row["success"]
     assert row["max_commanded_violation"] <= 1e-9
@@ -38,7 +38,7 @@ def test_commands_satisfy_the_constraints_under_any_action(env, name):
         assert row["max_commanded_violation"] <= 1e-9
 
 
-def test_obstacle_sides_are_opposite_sampled_and_observed(env):
+def test_obstacles_are_on_opposite_sides_and_observed(env):
     nominal, sides = NarrowPassageOptions(**HARD).workcell().obstacles, []
     starts = []
     for seed in range(8):
@@ -56,11 +56,11 @@ def test_obstacle_sides_are_opposite_sampled_and_observed(env):
 @pytest.mark.parametrize("options", [{"start_deviation": 0.03}, HARD])
 def test_held_out_start_differs_from_training_start(options):
     env = make_env("NarrowPassage", **options)
-    starts = [env.reset(seed=5, options={"held_out": flag})[1]["start"] for flag in (False, True)]
+    starts = [env.reset(seed=5, options={"held_out": held_out})[1]["start"] for held_out in (False, True)]
     assert (starts[0] != starts[1]).all()
 
 
-def test_bodies_of_the_plant_are_at_the_sampled_obstacles(env):
+def test_plant_has_the_obstacles_at_their_sampled_positions(env):
     _, info = env.reset(seed=2)
     plant = env.task.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
@@ -69,7 +69,7 @@ def test_bodies_of_the_plant_are_at_the_sampled_obstacles(env):
         np.testing.assert_allclose(X_WO.translation()[:2], obstacle, atol=1e-12)
 
 
-def test_standard_geometry_is_unchanged():
+def test_standard_has_the_default_geometry_and_start():
     assert NarrowPassageOptions().workcell() == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
@@ -87,7 +87,7 @@ def test_standard_geometry_is_unchanged():
         ({"obstacles_end": "maybe"}, "obstacles_end cannot be 'maybe'"),
     ],
 )
-def test_options_out_of_range_are_refused(arguments, message):
+def test_option_is_refused_when_out_of_range(arguments, message):
     with pytest.raises(InputError, match=message) as error:
         make_env("NarrowPassage", **arguments)
     assert "\n" not in str(error.value)

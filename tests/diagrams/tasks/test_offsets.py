@@ -1,26 +1,26 @@
-"""Training and held-out random streams."""
+"""Random streams of training episodes and held-out episodes."""
 
 import numpy as np
 
 from guiderail.diagrams.tasks.offsets import episode_stream
 
 
-def test_held_out_starts_differ_from_training_and_repeat():
-    drawn = {
+def test_held_out_samples_differ_from_training_and_repeat():
+    samples = {
         held_out: np.array(
             [episode_stream(np.random.default_rng(seed), held_out).uniform(size=3) for seed in range(50)]
         )
         for held_out in (False, True)
     }
-    assert not np.isin(drawn[True], drawn[False]).any()
+    assert not np.isin(samples[True], samples[False]).any()
     second = episode_stream(np.random.default_rng(7), True).uniform(size=3)
-    np.testing.assert_array_equal(second, drawn[True][7])
+    np.testing.assert_array_equal(second, samples[True][7])
 
 
-def test_the_next_episode_is_the_same_whichever_this_one_was():
-    after = []
+def test_next_episode_is_independent_of_the_kind_of_episode():
+    next_samples = []
     for held_out in (False, True):
         rng = np.random.default_rng(3)
         episode_stream(rng, held_out).uniform(size=100)
-        after.append(episode_stream(rng, False).uniform())
-    assert after[0] == after[1]
+        next_samples.append(episode_stream(rng, False).uniform())
+    assert next_samples[0] == next_samples[1]

@@ -1,4 +1,4 @@
-"""Limits of force and speed that a state of a template adds to those of the task."""
+"""Limits of force, torque and speed in the states of a template, together with the limits of the task."""
 
 from dataclasses import replace
 from itertools import count
@@ -17,16 +17,17 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.templates import Transition, load_template
 
 NUMBERS = count()
-HEIGHT = 0.012  # height at which the second state of `two_states` begins [m]; below it the clamp reaches the table
+HEIGHT = 0.012  # height at which the second state of `two_states` begins [m], above contact with the table
 
 
 def with_limits(**limits):
+    """Return the clamp's template with limits in its state."""
     template = load_template("grid_clamp")
     return replace(template, states=(replace(template.states[0], **limits),))
 
 
 def two_states(above, below):
-    """Return the clamp's template in two states, each with its limits."""
+    """Return the clamp's template, split at `HEIGHT` into two states with limits."""
     template = load_template("grid_clamp")
     state = template.states[0]
     first = replace(state, name="above", transitions=(Transition("below", HEIGHT, 0.001),), ends_at=HEIGHT, **above)
@@ -34,13 +35,13 @@ def two_states(above, below):
 
 
 def make_clamp(template, **options):
-    """Make the clamp's environment with another template."""
+    """Return the clamp's environment with another template."""
 
-    def place(task):
+    def placed_template(task):
         return replace(GridClamp.template(task), template=template)
 
     name = f"lab/Phases{next(NUMBERS)}"
-    register_task(name)(type("Phases", (GridClamp,), {"template": place}))
+    register_task(name)(type("Phases", (GridClamp,), {"template": placed_template}))
     try:
         return make_env(name, **options)
     finally:
@@ -49,7 +50,7 @@ def make_clamp(template, **options):
 
 
 def press(env, steps=16, action=(1.0, 1.0, -1.0)):
-    """Press down and sideways on holes that are 2.5 mm off; return the force at every control step."""
+    """Press down and sideways on holes with an offset of 2.5 mm; return the force [N] of every control step."""
     env.reset(seed=0, options={"offset": (0.0025, 0.0)})
     over = False
     for _ in range(steps):
@@ -60,18 +61,19 @@ def press(env, steps=16, action=(1.0, 1.0, -1.0)):
 
 
 def phase_limit(env):
+    """Return the system that limits force and torque by state, or None."""
     diagram = env.task.diagram
     return diagram.GetSubsystemByName("phase_wrench_limit") if diagram.HasSubsystemNamed("phase_wrench_limit") else None
 
 
 @pytest.mark.parametrize("station", ["gantry", "arm"])
-def test_force_stays_below_limit_of_state(station):
+def test_force_is_below_the_limit_of_the_state(station):
     assert press(make_clamp(with_limits(), station=station)).max() > 8.0
     force = press(make_clamp(with_limits(max_force_n=6.0), station=station))
     assert 3.0 < force.max() < 6.0
 
 
-def test_task_limit_stays_in_force_when_it_is_lower():
+def test_lower_limit_of_task_and_state_is_enforced():
     force = press(make_clamp(with_limits(max_force_n=25.0), force_limit_range=(8.0, 8.0)))
     assert 4.0 < force.max() < 8.0
     force = press(make_clamp(with_limits(max_force_n=6.0), force_limit_range=(25.0, 25.0)))
@@ -98,7 +100,7 @@ def test_limit_changes_with_the_state_at_bounded_rate():
     assert env.trace.force[-1] < 6.0
 
 
-def test_command_is_slower_in_state_with_speed_limit():
+def test_command_satisfies_the_speed_limit_of_the_state():
     def speeds(template):
         env = make_clamp(template, action_repeat=1)
         press(env, 20, (0.3, 0.0, -1.0))
@@ -109,7 +111,7 @@ def test_command_is_slower_in_state_with_speed_limit():
     assert 0.0095 < slow.max() <= 0.01 * (1 + 1e-9)
 
 
-def test_diagram_is_the_same_without_limits():
+def test_phase_limit_is_absent_without_force_limits():
     env = make_clamp(with_limits(max_speed_m_per_s=0.01))
     assert phase_limit(env) is None
     assert phase_limit(make_clamp(with_limits(max_torque_nm=1.0))) is not None
@@ -117,13 +119,13 @@ def test_diagram_is_the_same_without_limits():
     assert names == [system.get_name() for system in make_clamp(with_limits()).task.diagram.GetSystems()]
 
 
-def test_limit_is_refused_when_impedance_has_no_bound():
+def test_force_limit_of_a_state_requires_bounded_force():
     with pytest.raises(InputError, match="state 'insert' of template 'grid_clamp' limits force or torque"):
         make_clamp(with_limits(max_torque_nm=1.0), bounded_force=False)
     make_clamp(with_limits(), bounded_force=False)
 
 
-def test_no_state_raises_the_bound_of_the_station():
+def test_state_does_not_raise_the_bound_of_the_station():
     bounded = Impedance().with_max_force(10.0)
     system = make_phase_wrench_limit(with_limits(max_force_n=100.0, max_torque_nm=100.0), bounded, 0.01)
     context = system.CreateDefaultContext()
@@ -132,20 +134,20 @@ def test_no_state_raises_the_bound_of_the_station():
     np.testing.assert_array_equal(bound, bounded.bound.numbers)
 
 
-def test_torque_limit_bounds_the_norm():
-    low = max_wrench(np.inf, 1.5)
-    assert np.linalg.norm(low[3:6]) == pytest.approx(1.5)
-    assert low[7] == pytest.approx(1.5)
-    np.testing.assert_array_equal(low[[0, 1, 2, 6]], max_wrench(np.inf)[[0, 1, 2, 6]])
+def test_torque_limit_bounds_the_norm_of_the_torque():
+    bound = max_wrench(np.inf, 1.5)
+    assert np.linalg.norm(bound[3:6]) == pytest.approx(1.5)
+    assert bound[7] == pytest.approx(1.5)
+    np.testing.assert_array_equal(bound[[0, 1, 2, 6]], max_wrench(np.inf)[[0, 1, 2, 6]])
     np.testing.assert_array_equal(max_wrench(20.0, 1e3), max_wrench(20.0))
 
 
 @pytest.mark.parametrize("limits", [(20.0, np.nan), (20.0, -1.0), (20.0, 0.0), (np.nan,), (-1.0,), (0.0,)])
-def test_limit_that_is_not_positive_is_refused(limits):
+def test_limit_is_refused_when_not_positive(limits):
     with pytest.raises(InputError, match=r"positive|negative"):
         max_wrench(*limits)
 
 
-def test_template_of_task_has_no_limits():
+def test_shipped_template_of_the_clamp_has_no_limits():
     task = EnvConfig.resolve("GridClamp", {}).make_task()
     assert make_phase_wrench_limit(task.template().template, None, 0.01) is None

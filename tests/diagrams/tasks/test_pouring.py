@@ -1,4 +1,4 @@
-"""Pouring by scripted policies, adversaries and unconstrained inputs."""
+"""Environment Pouring: scripted policies, adversaries, rewards, starts and options."""
 
 import gymnasium
 import numpy as np
@@ -21,29 +21,29 @@ def unconstrained():
     return make_env("Pouring", active_constraints=False)
 
 
-def run(env, inputs, seed=None, options=None, limit=150, watch=None):
-    """An episode: how it ended, its return, and its actions."""
+def run(env, policy, seed=None, options=None, max_actions=150, on_step=None):
+    """Run an episode; return the last info, the return and the actions."""
     observation, info = env.reset(seed=seed, options=options)
     total, actions = 0.0, []
-    for _ in range(limit):
-        action = inputs(observation)
+    for _ in range(max_actions):
+        action = policy(observation)
         actions.append(action)
         observation, reward, terminated, truncated, info = env.step(action)
         total += reward
-        if watch:
-            watch(env, info)
+        if on_step:
+            on_step(env, info)
         if terminated or truncated:
             break
     return info, total, actions
 
 
-def test_is_registered():
-    made = gymnasium.make("guiderail/Pouring-v0", guidance="none", reward="sparse")
-    assert made.action_space.shape == (6,)
-    assert made.observation_space.shape == (6,)
+def test_spaces_are_those_of_velocity_without_guidance():
+    env = gymnasium.make("guiderail/Pouring-v0", guidance="none", reward="sparse")
+    assert env.action_space.shape == (6,)
+    assert env.observation_space.shape == (6,)
 
 
-# The corners of where episodes start, and its middle.
+# Starts [m] at four corners of their range: azimuth [°], radius and height [m].
 STARTS = [
     (radius * np.cos(np.deg2rad(azimuth)), radius * np.sin(np.deg2rad(azimuth)), height)
     for azimuth, radius, height in [(-120, 0.24, 0.08), (-120, 0.30, 0.19), (-75, 0.24, 0.19), (-75, 0.30, 0.08)]
@@ -51,51 +51,51 @@ STARTS = [
 
 
 @pytest.mark.parametrize("start", STARTS)
-def test_scripted_policy_pours_because_of_the_constraints(env, unconstrained, start):
+def test_scripted_policy_pours_only_with_the_constraints(env, unconstrained, start):
     info, total, actions = run(env, scripted_pour, seed=1, options={"start": start})
     assert info["termination"] == "success"
     assert total > 200.0
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     assert env.trace.statistics()["collisions"] == 0.0
-    # The same inputs, or the same scripted policy, which reacts: the result does not depend on it.
-    replay = iter([*actions, *[actions[-1]] * 150])
-    second = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(replay)
-    info, _, _ = run(unconstrained, second, seed=1, options={"start": start})
+    # Without constraints: the scripted policy for two starts, its recorded actions for the others.
+    recorded = iter([*actions, *[actions[-1]] * 150])
+    policy = scripted_pour if STARTS.index(start) % 2 else lambda observation: next(recorded)
+    info, _, _ = run(unconstrained, policy, seed=1, options={"start": start})
     assert info["termination"] in ("collision", "spill")
 
 
 @pytest.mark.parametrize("adversary", ADVERSARIES)
-def test_adversaries_neither_collide_nor_leave_constraints(env, adversary):
+def test_adversary_neither_collides_nor_violates_constraints(env, adversary):
     rng = np.random.default_rng([7, list(ADVERSARIES).index(adversary)])
-    tilts, worst = [], []
+    tilts, violations = [], []
 
-    def watch(env, info):
+    def on_step(env, info):
         context = env.simulator.get_context()
         state = env.task.diagram.GetOutputPort("state").Eval(context)[0]
         turn = env.task.diagram.GetOutputPort("observation").Eval(context)[3:]
         tilts.append((state, np.hypot(turn[0], turn[1])))
-        worst.append(info["constraint_violation"])
+        violations.append(info["constraint_violation"])
 
-    info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), limit=35, watch=watch)
+    info, _, _ = run(env, ADVERSARIES[adversary](rng), seed=int(rng.integers(2**31)), max_actions=35, on_step=on_step)
     assert info["termination"] not in ("collision", "spill")
-    assert max(worst) <= 1e-9
-    # Upright until the tilt is allowed, as far as the arm's drives track.
+    assert max(violations) <= 1e-9
+    # The thermos is upright in state 0, up to the tracking error of the arm.
     assert max((tilt for state, tilt in tilts if state == 0), default=0.0) < np.deg2rad(3.0)
 
 
-def test_unguided_velocity_reaches_collisions():
+def test_velocity_ends_in_a_collision_without_guidance():
     env = make_env("Pouring", guidance="none", reward="hand_shaped")
     info, total, _ = run(env, lambda observation: np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0]), seed=0)
     assert info["termination"] in ("collision", "spill")
     assert total < 0.0
 
 
-def test_the_constraints_are_a_safety_filter_behind_a_velocity():
+def test_active_constraints_filter_a_velocity():
     env = make_env("Pouring", guidance="none", reward="sparse", active_constraints=True)
     rng = np.random.default_rng(0)
     for seed in range(2):
-        held = np.sign(rng.normal(size=6))
-        info, _, _ = run(env, lambda observation, held=held: held, seed=seed, limit=30)
+        corner = np.sign(rng.normal(size=6))
+        info, _, _ = run(env, lambda observation, corner=corner: corner, seed=seed, max_actions=30)
         assert info["termination"] not in ("collision", "spill")
         assert info["constraint_violation"] <= 1e-9
 
@@ -104,56 +104,56 @@ def test_the_constraints_are_a_safety_filter_behind_a_velocity():
     ("mug", "position"),
     [({"mug_inner_diameter": 0.10, "mug_depth": 0.075}, (0.03, -0.03)), ({"mug_inner_diameter": 0.07}, (-0.03, 0.02))],
 )
-def test_template_follows_the_objects_of_each_episode(mug, position):
+def test_scripted_policy_pours_into_other_mugs_and_positions(mug, position):
     env = make_env("Pouring", **mug)
     info, _, _ = run(env, scripted_pour, seed=1, options={"mug_position": position})
     assert info["termination"] == "success"
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
 
 
-def test_faster_inputs_are_as_safe():
+def test_constraints_are_satisfied_with_a_higher_action_repeat():
     env = make_env("Pouring", reward="sparse", action_repeat=20)
     info, _, _ = run(env, scripted_pour, seed=3)
     assert info["termination"] == "success"
     assert info["control_steps"] < 250
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
     rng = np.random.default_rng(0)
-    info, _, _ = run(env, ADVERSARIES["noisy_pour"](rng), seed=3, limit=15)
+    info, _, _ = run(env, ADVERSARIES["noisy_pour"](rng), seed=3, max_actions=15)
     assert info["termination"] not in ("collision", "spill")
 
 
-def test_starts_are_drawn_and_repeat_with_the_seed(env):
+def test_starts_are_sampled_and_repeat_with_the_seed(env):
     first = env.reset(seed=3)[1]["start"]
     second = env.reset()[1]["start"]
     assert not np.allclose(first, second)
     np.testing.assert_array_equal(env.reset(seed=3)[1]["start"], first)
 
 
-def test_held_out_starts_are_none_of_trainings(env):
-    trained = [env.reset(seed=seed)[1]["start"] for seed in range(5)]
+def test_held_out_starts_differ_from_training_starts(env):
+    training = [env.reset(seed=seed)[1]["start"] for seed in range(5)]
     held_out = [env.reset(seed=seed, options={"held_out": True})[1]["start"] for seed in range(5)]
-    assert not np.isin(held_out, trained).any()
+    assert not np.isin(held_out, training).any()
     np.testing.assert_array_equal(env.reset(seed=4, options={"held_out": True})[1]["start"], held_out[4])
-    # From the same places nevertheless: `held_out` is about which starts, not about harder ones.
+    # Held-out starts have the same range as training starts.
     radii, heights = np.hypot(*np.transpose(held_out)[:2]), np.transpose(held_out)[2]
     np.testing.assert_array_equal(np.clip(radii, *START_RADIUS), radii)
     np.testing.assert_array_equal(np.clip(heights, *START_HEIGHT), heights)
 
 
-def test_an_episode_repeats_to_the_last_bit(env):
+def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(env):
     def episode():
         observation, _ = env.reset(seed=5)
-        seen = [observation]
+        observations = [observation]
         for _ in range(12):
-            seen.append(env.step(scripted_pour(seen[-1]))[0])
-        return np.array(seen)
+            observations.append(env.step(scripted_pour(observations[-1]))[0])
+        return np.array(observations)
 
     first = episode()
-    run(env, scripted_pour, seed=9, limit=12)
+    run(env, scripted_pour, seed=9, max_actions=12)
     np.testing.assert_array_equal(episode(), first)
 
 
-def test_the_balls_stay_in_the_thermos_until_it_is_poured(env):
+def test_balls_rest_in_the_thermos_when_the_action_is_zero(env):
     env.reset(seed=0)
     station = env.task.diagram.GetSubsystemByName("station")
     for _ in range(10):
@@ -162,41 +162,41 @@ def test_the_balls_stay_in_the_thermos_until_it_is_poured(env):
     balls = station.GetOutputPort("balls_in_thermos").Eval(context).reshape(2, 6)
     thermos = station.config.thermos
     assert all(thermos.contains(p) for p in balls[:, :3])
-    # And they lie there: the lower one on the bottom.
+    # The lower ball rests on the bottom: its center is 20 mm, one radius, above.
     assert balls[:, 2].min() == pytest.approx(-thermos.depth + 0.02, abs=2e-3)
 
 
-def test_shaping_is_the_progress_of_the_template(env):
-    """Equation 3.7: over an episode the shaping adds up, whatever the way."""
+def test_sum_of_shaping_is_the_progress_of_the_template(env):
+    """Equation 3.7: the sum of the shaping over an episode depends only on the first and the last pose."""
     sums = {"shaping": 0.0, "action_cost": 0.0, "terminal_reward": 0.0}
 
-    def watch(env, info):
+    def on_step(env, info):
         for name in sums:
             sums[name] += info[name]
 
-    _, total, actions = run(env, scripted_pour, seed=2, watch=watch)
+    _, total, actions = run(env, scripted_pour, seed=2, on_step=on_step)
     assert sums["terminal_reward"] == 200.0
     assert total == pytest.approx(sum(sums.values()))
-    # The last action's cost counts for as long as it lasted.
-    cost = [float(a @ a) for a in np.clip(actions, -1.0, 1.0)]
-    assert -sum(cost) - 1e-9 <= sums["action_cost"] <= -sum(cost[:-1]) + 1e-9
-    # From the start's distance to wherever the tilt ended, 5 a meter and 0.0175 a degree, times 200.
+    # The last action may cost less than the others, because the episode ends before its last control step.
+    costs = [float(action @ action) for action in np.clip(actions, -1.0, 1.0)]
+    assert -sum(costs) - 1e-9 <= sums["action_cost"] <= -sum(costs[:-1]) + 1e-9
+    # The progress is 5 per meter of approach and 0.0175 per degree of tilt; the shaping is 200 times the progress.
     assert 200.0 * 1.2 < sums["shaping"] < 200.0 * 2.8
 
 
-def test_hand_shaped_reward_is_the_thesiss():
+def test_hand_shaped_reward_is_that_of_the_thesis():
     env = make_env("Pouring", guidance="none", reward="hand_shaped")
     observation, _ = env.reset(seed=0)
-    j = np.linalg.norm(observation[:3] / 5.0)
+    distance = np.linalg.norm(observation[:3] / 5.0)
     observation, reward, *_, info = env.step(np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0]))
-    j_after = np.linalg.norm(observation[:3] / 5.0)
-    assert info["approach"] == pytest.approx(15.0 * (j - j_after), abs=1e-5)  # float32 observations
+    distance_after = np.linalg.norm(observation[:3] / 5.0)
+    assert info["approach"] == pytest.approx(15.0 * (distance - distance_after), abs=1e-5)  # float32 observations
     assert info["tilting"] <= 0.0
     assert reward == pytest.approx(info["approach"] + info["tilting"] - 1.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"guidance": "kgrl"}, "needs demonstrations, which Pouring doesn't have: use none, sct"),
         ({"reward": "dense"}, "hand_shaped"),
@@ -207,8 +207,8 @@ def test_hand_shaped_reward_is_the_thesiss():
         ({"input_speed": 5.0}, "at most 2"),
     ],
 )
-def test_refuses_what_makes_no_sense(arguments, said):
-    with pytest.raises(InputError, match=said):
+def test_option_is_refused_when_invalid(arguments, message):
+    with pytest.raises(InputError, match=message):
         make_env("Pouring", **arguments)
 
 
@@ -223,14 +223,14 @@ def test_refuses_what_makes_no_sense(arguments, said):
         {"mug_position": (0.5, 0.0)},
     ],
 )
-def test_refuses_reset_options_that_make_no_sense(env, options):
+def test_reset_option_is_refused_when_invalid(env, options):
     with pytest.raises(InputError):
         env.reset(options=options)
 
 
-def test_unreachable_start_is_resampled_or_refused_when_given():
+def test_unreachable_start_is_resampled_or_refused_if_given():
     env = gymnasium.make("guiderail/Pouring-v0", guidance="sct", mug_offset=0.04)
-    _, info = env.reset(seed=11)  # whose first draw is beyond a joint's limit
+    _, info = env.reset(seed=11)  # the first sample of this seed exceeds a joint limit
     far = {"start": [-0.15, -0.26, 0.19], "mug_position": [-0.04, -0.04]}
     with pytest.raises(InputError, match="joint's limit"):
         env.reset(seed=11, options=far)

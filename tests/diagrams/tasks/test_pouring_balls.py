@@ -11,13 +11,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 
 OPTIONS = {"balls": 6, "balls_in": 5, "ball_diameter": 0.026}
-IN, FALLEN, KEPT = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]  # in the frame of the mug's tip
+# Positions of a ball [m] in the frame of the mug's tip.
+IN_MUG, FALLEN, IN_THERMOS = [0.0, 0.0, -0.05], [0.3, 0.0, -0.2], [0.3, 0.0, 0.1]
 
 
 def outcome(in_mug, fallen):
-    """Return success and spill if five of six balls are needed; the others are in the thermos."""
-    places = [IN] * in_mug + [FALLEN] * fallen + [KEPT] * (6 - in_mug - fallen)
-    balls = np.array([[*place, 0.0, 0.0, 0.0] for place in places]).ravel()
+    """Return success and spill of the task with six balls, of which five are required; the rest are in the thermos."""
+    positions = [IN_MUG] * in_mug + [FALLEN] * fallen + [IN_THERMOS] * (6 - in_mug - fallen)
+    balls = np.array([[*position, 0.0, 0.0, 0.0] for position in positions]).ravel()
     _, success, spill = Pouring(EnvConfig.resolve("Pouring", OPTIONS)).termination_terms()
     return success.condition(balls), spill.condition(balls, balls)
 
@@ -34,40 +35,40 @@ def outcome(in_mug, fallen):
         (0, 6, (False, True)),
     ],
 )
-def test_five_of_six_are_enough_and_two_that_fell_are_too_many(in_mug, fallen, expected):
+def test_five_balls_are_a_success_and_two_fallen_are_a_spill(in_mug, fallen, expected):
     assert outcome(in_mug, fallen) == expected
 
 
 @pytest.mark.parametrize(("number", "diameter"), [(2, 0.04), (3, 0.04), (6, 0.026), (8, 0.02)])
-def test_balls_lie_in_the_thermos_and_not_in_each_other(number, diameter):
+def test_balls_start_inside_the_thermos_without_overlap(number, diameter):
     config = PouringConfig(ball=Ball(diameter=diameter), num_balls=number)
-    places = config.stack()
-    apart = np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(number, dtype=bool)]
-    assert apart.min() >= diameter - 1e-9
-    assert all(config.thermos.contains(place) for place in places)
-    assert np.abs(places[:, 0]).max() + diameter / 2 <= config.thermos.inner_diameter / 2 + 1e-9
+    positions = config.stack()
+    distances = np.linalg.norm(positions[:, None] - positions, axis=2)[~np.eye(number, dtype=bool)]
+    assert distances.min() >= diameter - 1e-9
+    assert all(config.thermos.contains(position) for position in positions)
+    assert np.abs(positions[:, 0]).max() + diameter / 2 <= config.thermos.inner_diameter / 2 + 1e-9
 
 
 @pytest.mark.parametrize("control_period", [0.01, 0.02, 0.05])
-def test_balls_stay_in_the_mug_for_a_tenth_of_a_second(control_period):
+def test_success_requires_balls_in_the_mug_for_0_1_s(control_period):
     task = Pouring(EnvConfig.resolve("Pouring", {"control_period": control_period}))
     _, success, _ = task.termination_terms()
     assert success.steps * control_period == pytest.approx(0.1)
 
 
-def test_options_that_do_not_go_together_are_refused():
+def test_numbers_of_balls_are_refused_when_too_large():
     with pytest.raises(InputError, match="balls_in must be at most balls, which is 2, not 3"):
         EnvConfig.resolve("Pouring", {"balls_in": 3})
     with pytest.raises(InputError, match="6 balls of 0\\.04 m do not fit into the thermos"):
         EnvConfig.resolve("Pouring", {"balls": 6})
 
 
-def test_aimed_policy_pours_enough_balls():
+def test_aimed_policy_pours_five_of_six_balls():
     env = make_env("Pouring", difficulty="hard", **OPTIONS)
     observation, _ = env.reset(seed=1, options={"mug_error": (0.045, 0.0)})
-    ended = False
-    while not ended:
+    is_over = False
+    while not is_over:
         observation, _, terminated, truncated, info = env.step(scripted_pour_aimed(observation))
-        ended = terminated or truncated
+        is_over = terminated or truncated
     assert info["termination"] == "success"
     assert env.trace.statistics()["max_commanded_violation"] <= 1e-9

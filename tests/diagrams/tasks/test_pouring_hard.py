@@ -1,4 +1,4 @@
-"""Pouring with a mug at an offset that the template does not contain."""
+"""Pouring at difficulty `hard`: the template has an estimate of the mug's position with an error."""
 
 import numpy as np
 import pytest
@@ -11,10 +11,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
 
-PERIOD = 0.01  # [s] between control steps
-# Where seed 3 started before there were difficulties.
-START_OF_SEED_3 = [-0.05165154964949667, -0.27188929363368947, 0.12006535135237559]
-ERROR = (0.045, 0.0)  # [m] estimated position of the mug, from the mug
+PERIOD = 0.01  # control period [s]
+START_OF_SEED_3 = [-0.05165154964949667, -0.27188929363368947, 0.12006535135237559]  # at difficulty `standard` [m]
+ERROR = (0.045, 0.0)  # estimated position of the mug minus its position [m]
 
 
 @pytest.fixture(scope="module")
@@ -22,26 +21,27 @@ def env():
     return make_env("Pouring", difficulty="hard")
 
 
-def run(env, inputs, limit=60, **options):
-    observation, drawn = env.reset(seed=1, options=options)
-    for _ in range(limit):
-        observation, _, terminated, truncated, info = env.step(inputs(observation))
+def run(env, policy, **options):
+    """Run an episode of up to 60 actions; return the infos of the reset and of the last step."""
+    observation, reset_info = env.reset(seed=1, options=options)
+    for _ in range(60):
+        observation, _, terminated, truncated, info = env.step(policy(observation))
         if terminated or truncated:
             break
-    return drawn, info
+    return reset_info, info
 
 
 def test_aimed_policy_pours_and_blind_policy_spills(env):
-    for inputs, ending in ((scripted_pour_aimed, "success"), (scripted_pour_blind, "spill")):
-        drawn, info = run(env, inputs, mug_error=ERROR)
-        np.testing.assert_array_equal(drawn["mug_error"], ERROR)
-        assert info["termination"] == ending
+    for policy, termination in ((scripted_pour_aimed, "success"), (scripted_pour_blind, "spill")):
+        reset_info, info = run(env, policy, mug_error=ERROR)
+        np.testing.assert_array_equal(reset_info["mug_error"], ERROR)
+        assert info["termination"] == termination
         assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
         assert env.trace.statistics()["collisions"] == 0.0
 
 
-def guided(template, frames, actions, X_TP):
-    """The states and commands of an episode without an arm, as pose coordinates carry them from step to step."""
+def command_states(template, frames, actions, X_TP):
+    """Yield state and command of every control step from the pose `X_TP` on, where every command is reached."""
     state = template.state_at(X_TP, frames)
     for action in actions:
         request = template.displace(X_TP, template.map(state, action, X_TP, frames, PERIOD))
@@ -52,26 +52,26 @@ def guided(template, frames, actions, X_TP):
 
 
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
-def test_no_command_ever_leaves_the_constraints(env, name):
-    """Through all three states and along every edge: without the arm, hundreds of control steps take no time."""
+def test_commands_satisfy_the_constraints_in_all_states(env, name):
+    """The template without the simulated arm, for hundreds of control steps in all three states."""
     template = make_template(env.task.declaration.workcell(), aim_speed=1.0, pour_speed=0.3)
     frames = frames_of(template, RigidTransform([0.02, -0.01, 0.0]))
     start = template.project(template.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
     worst, reached = 0.0, set()
     for seed in range(2):
         act = BASELINES[name](np.random.default_rng(seed), 3)
-        # Half of them lean forwards until they are in Pour, and then do what they want.
-        lean = [np.array([0.0, 2.0 * (seed % 2 == 0 and k < 25), 0.0]) for k in range(45)]
-        actions = np.repeat([np.clip(act(None) + forwards, -1.0, 1.0) for forwards in lean], 10, axis=0)
-        for state, X_TP in guided(template, frames, actions, start):
+        # With the first seed, 25 actions move forwards in addition, which reaches the state Pour.
+        forwards = [np.array([0.0, 2.0 * (seed % 2 == 0 and k < 25), 0.0]) for k in range(45)]
+        actions = np.repeat([np.clip(act(None) + bias, -1.0, 1.0) for bias in forwards], 10, axis=0)
+        for state, X_TP in command_states(template, frames, actions, start):
             reached.add(state)
             worst = max(worst, template.violation(state, X_TP, frames))
     assert worst <= 1e-9
     assert reached == {0, 1, 2}
 
 
-def test_recomputed_commands_are_inside_the_constraints(env):
-    """Also where the arm and the template's diagram take part, and at every control step, not only at actions."""
+def test_commands_on_the_arm_satisfy_the_constraints():
+    """The violation is computed from the command of every control step, without the diagram's own output."""
     stepwise = make_env("Pouring", difficulty="hard", action_repeat=1)
     diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
@@ -87,19 +87,19 @@ def test_recomputed_commands_are_inside_the_constraints(env):
         assert template.violation(state, desired, frames) <= 1e-9
 
 
-def test_mug_error_is_resampled_in_its_ring_and_observed(env):
+def test_mug_error_is_sampled_in_its_range_and_observed(env):
     errors = []
     for held_out in (False, True) * 4:
         observation, info = env.reset(options={"held_out": held_out})
         errors.append(info["mug_error"])
         np.testing.assert_allclose(observation[6:8] * MAX_MUG_ERROR, info["mug_error"], atol=1e-8)
-        assert observation[8] == -1.0  # not pouring yet
+        assert observation[8] == -1.0  # the state is not Pour
     lengths = np.linalg.norm(errors, axis=1)
     np.testing.assert_array_equal(np.clip(lengths, HARD["mug_error_least"], HARD["mug_error_most"]), lengths)
     assert len(np.unique(lengths)) == len(lengths)
 
 
-def test_observation_and_samples_at_standard_are_unchanged():
+def test_standard_has_its_observation_and_start():
     standard = make_env("Pouring")
     assert standard.observation_space.shape == (6,)
     assert standard.task.num_steps == 1500
@@ -109,7 +109,7 @@ def test_observation_and_samples_at_standard_are_unchanged():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"difficulty": "harder"}, "Pouring has no difficulty 'harder': did you mean hard"),
         ({"mug_error_most": 0.2}, "mug_error_most must be at most 0.06, not 0.2"),
@@ -119,12 +119,12 @@ def test_observation_and_samples_at_standard_are_unchanged():
         ({"time_limit": 0.1}, "time_limit must be at least 3"),
     ],
 )
-def test_refuses_numbers_out_of_range(arguments, said):
-    with pytest.raises(InputError, match=said) as error:
+def test_option_is_refused_when_out_of_range(arguments, message):
+    with pytest.raises(InputError, match=message) as error:
         make_env("Pouring", **arguments)
     assert "\n" not in str(error.value)
 
 
-def test_refuses_an_error_beyond_where_pour_leads(env):
+def test_mug_error_is_refused_when_too_long(env):
     with pytest.raises(InputError, match=r"'mug_error' is at most 0\.06 m long"):
         env.reset(options={"mug_error": (0.1, 0.0)})

@@ -1,3 +1,5 @@
+"""Scripted policies of BncConnector and GridClamp as functions of the observation."""
+
 import numpy as np
 import pytest
 
@@ -17,7 +19,8 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import RIM
 
 
-def seen_plug(**values):
+def observe_plug(**values):
+    """Return an observation of the connector during the search on the rim, with given values."""
     names = {
         "time": connector.TIME,
         "z": connector.Z,
@@ -33,86 +36,89 @@ def seen_plug(**values):
 
 
 def test_torque_search_moves_against_the_torque():
-    """Off by +x, the rim pushes up at −x of the center: that turns the plug about +y."""
-    assert scripted_torque_search(seen_plug(torque_y=0.4))[0] < 0.0
-    assert scripted_torque_search(seen_plug(torque_x=0.4))[1] > 0.0
+    """With an offset of the plug along +x, the rim pushes up at −x of its center, which is a torque about +y."""
+    assert scripted_torque_search(observe_plug(torque_y=0.4))[0] < 0.0
+    assert scripted_torque_search(observe_plug(torque_x=0.4))[1] > 0.0
 
 
-@pytest.mark.parametrize("elsewhere", [{"time": -0.9}, {"time": 0.5}, {"z": 0.3}, {"force_z": 0.0}])
-def test_torque_search_stands_still_off_the_rim(elsewhere):
+@pytest.mark.parametrize("values", [{"time": -0.9}, {"time": 0.5}, {"z": 0.3}, {"force_z": 0.0}])
+def test_torque_search_is_zero_when_not_on_the_rim(values):
     np.testing.assert_array_equal(
-        scripted_torque_search(seen_plug(torque_x=1.0, torque_y=1.0, **elsewhere)), np.zeros(2)
+        scripted_torque_search(observe_plug(torque_x=1.0, torque_y=1.0, **values)), np.zeros(2)
     )
 
 
-def test_torque_search_stays_within_bounds():
-    assert np.abs(scripted_torque_search(seen_plug(torque_x=3.0, torque_y=-3.0))).max() == 1.0
+def test_torque_search_is_within_the_action_bounds():
+    assert np.abs(scripted_torque_search(observe_plug(torque_x=3.0, torque_y=-3.0))).max() == 1.0
 
 
-def seen_pressure(time=1.6, z=RIM, lever=(0.0, 0.0), command=(0.0, 0.0)):
+def observe_pressure(time=1.6, z=RIM, center=(0.0, 0.0), command=(0.0, 0.0)):
+    """Return an observation with center of pressure and command [m], during the search on the rim."""
     result = np.zeros(17)
     result[0], result[3] = time / 4.0 - 1.0, (z - POSE_CENTER[2]) / POSE_SCALE[2]
-    result[13:15], result[15:17] = np.array(lever) / CENTER_OF_PRESSURE_SCALE, np.array(command) / COMMAND_SCALE
+    result[13:15], result[15:17] = np.array(center) / CENTER_OF_PRESSURE_SCALE, np.array(command) / COMMAND_SCALE
     return result
 
 
 @pytest.mark.parametrize("length", [1.5 * MM, 5.0 * MM])
-def test_center_of_pressure_policy_steps_towards_it(length):
-    action = scripted_center_of_pressure(seen_pressure(lever=(0.0, -length), command=(1.0 * MM, 0.5 * MM)))
+def test_pressure_policy_steps_to_the_center_of_pressure(length):
+    action = scripted_center_of_pressure(observe_pressure(center=(0.0, -length), command=(1.0 * MM, 0.5 * MM)))
     np.testing.assert_allclose(action * REACH, [1.0 * MM, 0.5 * MM - STEP])
 
 
-def test_center_of_pressure_policy_stays_after_the_drop():
+def test_pressure_policy_is_constant_when_below_the_rim():
     action = scripted_center_of_pressure(
-        seen_pressure(z=RIM - 2.0 * MM, lever=(5.0 * MM, 0.0), command=(1.0 * MM, 2.0 * MM))
+        observe_pressure(z=RIM - 2.0 * MM, center=(5.0 * MM, 0.0), command=(1.0 * MM, 2.0 * MM))
     )
     np.testing.assert_allclose(action * REACH, [1.0 * MM, 2.0 * MM])
 
 
 @pytest.mark.parametrize("time", [0.5, 3.8])
-def test_center_of_pressure_policy_waits_outside_the_search(time):
-    np.testing.assert_array_equal(scripted_center_of_pressure(seen_pressure(time, lever=(5.0 * MM, 0.0))), np.zeros(2))
+def test_pressure_policy_is_zero_before_and_after_the_search(time):
+    np.testing.assert_array_equal(
+        scripted_center_of_pressure(observe_pressure(time, center=(5.0 * MM, 0.0))), np.zeros(2)
+    )
 
 
-def test_center_of_pressure_policy_stays_within_bounds():
-    assert np.abs(scripted_center_of_pressure(seen_pressure(command=(6.0 * MM, -6.0 * MM)))).max() == 1.0
+def test_pressure_policy_is_within_the_action_bounds():
+    assert np.abs(scripted_center_of_pressure(observe_pressure(command=(6.0 * MM, -6.0 * MM)))).max() == 1.0
 
 
-def test_center_of_pressure_policy_refuses_another_observation():
+def test_pressure_policy_refuses_another_observation():
     with pytest.raises(InputError, match="observation"):
         scripted_center_of_pressure(np.zeros(13))
 
 
-def seen_clamp(x_mm=0.0, y_mm=0.0, z_mm=12.0, fx=0.0, fy=0.0, fz=4.0):
-    seen = np.array([x_mm * MM, y_mm * MM, z_mm * MM, fx, fy, fz])
-    return (seen - CENTER) / SCALE
+def observe_clamp(x_mm=0.0, y_mm=0.0, z_mm=12.0, fx=0.0, fy=0.0, fz=4.0):
+    """Return the observation of a position [mm] and a force [N], by default on the table with 4 N."""
+    return (np.array([x_mm * MM, y_mm * MM, z_mm * MM, fx, fy, fz]) - CENTER) / SCALE
 
 
-def test_search_goes_to_its_start_before_it_descends():
-    inputs = scripted_search(seen_clamp(z_mm=15.0, fz=0.0))
-    assert inputs[0] < -0.3
-    assert inputs[2] == 0.0
-    there = scripted_search(seen_clamp(-LANE_ENDS / MM, LANES[0] / MM, 15.0, fz=0.0))
-    np.testing.assert_allclose(there, [0.0, 0.0, -1.0], atol=1e-9)
+def test_search_moves_to_its_start_before_the_descent():
+    action = scripted_search(observe_clamp(z_mm=15.0, fz=0.0))
+    assert action[0] < -0.3
+    assert action[2] == 0.0
+    at_start = scripted_search(observe_clamp(-LANE_ENDS / MM, LANES[0] / MM, 15.0, fz=0.0))
+    np.testing.assert_allclose(at_start, [0.0, 0.0, -1.0], atol=1e-9)
 
 
 def test_search_alternates_the_direction_of_lanes():
-    along = [np.sign(scripted_search(seen_clamp(0.0, y / MM))[0]) for y in LANES]
-    assert along == [1.0, -1.0, 1.0]
-    assert scripted_search(seen_clamp(LANE_ENDS / MM, LANES[0] / MM))[1] > 0.0
+    directions = [np.sign(scripted_search(observe_clamp(0.0, y / MM))[0]) for y in LANES]
+    assert directions == [1.0, -1.0, 1.0]
+    assert scripted_search(observe_clamp(LANE_ENDS / MM, LANES[0] / MM))[1] > 0.0
 
 
-def test_search_that_missed_all_lanes_lifts_and_starts_again():
-    lifts = scripted_search(seen_clamp(LANE_ENDS / MM, LANES[-1] / MM + 0.4))
-    np.testing.assert_allclose(lifts, [0.0, 0.0, 1.0])
-    assert scripted_search(seen_clamp(LANE_ENDS / MM - 0.5, LANES[-1] / MM))[0] > 0.0
+def test_search_restarts_after_the_last_lane():
+    action = scripted_search(observe_clamp(LANE_ENDS / MM, LANES[-1] / MM + 0.4))
+    np.testing.assert_allclose(action, [0.0, 0.0, 1.0])
+    assert scripted_search(observe_clamp(LANE_ENDS / MM - 0.5, LANES[-1] / MM))[0] > 0.0
 
 
-def test_search_presses_lightly_and_yields_in_a_hole():
-    assert scripted_search(seen_clamp(fz=8.0))[2] > 0.0 > scripted_search(seen_clamp(fz=1.0))[2]
-    np.testing.assert_array_less(0.0, scripted_search(seen_clamp(z_mm=8.0, fx=2.0, fy=1.0))[:2])
+def test_search_limits_its_force_and_yields_in_a_hole():
+    assert scripted_search(observe_clamp(fz=8.0))[2] > 0.0 > scripted_search(observe_clamp(fz=1.0))[2]
+    np.testing.assert_array_less(0.0, scripted_search(observe_clamp(z_mm=8.0, fx=2.0, fy=1.0))[:2])
 
 
-def test_search_stays_within_bounds():
+def test_search_is_within_the_action_bounds():
     for fz in (-30.0, 30.0):
-        assert np.abs(scripted_search(seen_clamp(4.0, 4.0, 5.0, 20.0, -20.0, fz))).max() <= 1.0
+        assert np.abs(scripted_search(observe_clamp(4.0, 4.0, 5.0, 20.0, -20.0, fz))).max() <= 1.0

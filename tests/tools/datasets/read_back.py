@@ -1,8 +1,8 @@
 """Read exported demonstrations with the libraries of the formats: LeRobot's, and MCAP's for ROS 2.
 
-`python tests/tools/datasets/read_back.py --environment FOLDER [--interpreter python3.12]` creates an environment
-there with both libraries, which cannot be installed together with this package (5 GB), or uses an existing one. The
-exit code is 1 if a number differs by more than the rounding of its format.
+Run `python tests/tools/datasets/read_back.py --environment FOLDER [--interpreter python3.12]`. If FOLDER has no virtual
+environment, the program creates one with both libraries (5 GB), which cannot be installed together with this package.
+The exit code is 1 if a number differs by more than the rounding of its format.
 """
 
 import argparse
@@ -24,7 +24,7 @@ def read_lerobot(folder: Path) -> list[list[list[float]]]:
     """Return the rows of each episode."""
     from lerobot.datasets import LeRobotDataset
 
-    dataset = LeRobotDataset("guiderail/shown", root=folder)
+    dataset = LeRobotDataset("guiderail/exported", root=folder)
     rows: dict[int, list[list[float]]] = {}
     for number in range(dataset.num_frames):
         frame = dataset[number]
@@ -46,7 +46,7 @@ READERS = {"lerobot": read_lerobot, "mcap": read_mcap}
 
 
 def environment(folder: Path, interpreter: str) -> Path:
-    """Return the interpreter of an environment with the libraries."""
+    """Return the interpreter of the virtual environment with the libraries; create the environment if missing."""
     python = folder / "bin" / "python"
     if not python.exists():
         subprocess.run([interpreter, "-m", "venv", folder], check=True)
@@ -64,7 +64,7 @@ def differences(python: Path) -> dict[str, float]:
     outputs = [0.2 * np.cumsum(rng.standard_normal((len(t), 6)), axis=0) / len(t) for t in times]
     result = {}
     with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "shown.npz")
+        file = Path(folder, "exported.npz")
         Demonstrations(times, outputs, NAMES).save(file)
         for kind in READERS:
             export_demonstrations(file, Path(folder, kind), kind)
@@ -75,27 +75,27 @@ def differences(python: Path) -> dict[str, float]:
             if [len(rows) for rows in loaded] != [len(rows) for rows in outputs]:
                 raise SystemExit(f"{kind}: the number or the lengths of the demonstrations changed")
             result[kind] = max(
-                float(np.max(np.abs(np.array(one) - other) / np.abs(other)))
-                for one, other in zip(loaded, outputs, strict=True)
+                float(np.max(np.abs(np.array(read) - written) / np.abs(written)))
+                for read, written in zip(loaded, outputs, strict=True)
             )
     return result
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--environment", type=Path, help="folder of the libraries' own environment")
-    parser.add_argument("--interpreter", default=sys.executable, help="interpreter of a new environment")
-    parser.add_argument("--read", choices=READERS, help="print the contents of a folder (internal)")
+    parser.add_argument("--environment", type=Path, help="folder of the virtual environment with the libraries")
+    parser.add_argument("--interpreter", default=sys.executable, help="interpreter of a new virtual environment")
+    parser.add_argument("--read", choices=READERS, help="print the demonstrations in --folder as JSON (internal)")
     parser.add_argument("--folder", type=Path)
     arguments = parser.parse_args()
     if arguments.read:
         print(json.dumps(READERS[arguments.read](arguments.folder)))
         return 0
     if arguments.environment is None:
-        parser.error("name a folder for the libraries' environment with --environment")
+        parser.error("name the folder of a virtual environment with --environment")
     result = differences(environment(arguments.environment, arguments.interpreter))
     for kind, difference in result.items():
-        print(f"{kind}: largest relative difference {difference:.1e}, of which rounding explains {ROUNDING[kind]:.1e}")
+        print(f"{kind}: largest relative difference {difference:.1e}, largest rounding error {ROUNDING[kind]:.1e}")
     return int(any(difference > ROUNDING[kind] for kind, difference in result.items()))
 
 

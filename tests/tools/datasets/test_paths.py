@@ -1,4 +1,4 @@
-"""Tests of paths: they are checked before any work, and a failure leaves nothing behind."""
+"""Output paths: checks before any work, and folders that exist only when complete."""
 
 import pytest
 
@@ -13,17 +13,17 @@ def test_check_new_accepts_missing_parent_folders(tmp_path):
 
 
 def test_check_new_refuses_an_existing_file(tmp_path):
-    (tmp_path / "file.npz").write_text("mine")
+    (tmp_path / "file.npz").write_text("text")
     with pytest.raises(InputError, match="already exists: name another file"):
         check_new(tmp_path / "file.npz", "file")
 
 
-@pytest.mark.parametrize("place", ["file/below", "file/below/deep"])
-def test_check_new_refuses_a_path_below_a_file(place, tmp_path):
-    (tmp_path / "file").write_text("mine")
+@pytest.mark.parametrize("path", ["file/below", "file/below/deep"])
+def test_check_new_refuses_a_path_below_a_file(path, tmp_path):
+    (tmp_path / "file").write_text("text")
     with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"):
-        check_new(tmp_path / place, "folder")
-    with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"), atomic_folder(tmp_path / place):
+        check_new(tmp_path / path, "folder")
+    with pytest.raises(InputError, match=r"cannot be written \(Not a directory\)"), atomic_folder(tmp_path / path):
         pass
 
 
@@ -33,6 +33,7 @@ def test_path_exists_refuses_a_name_that_is_too_long(tmp_path):
 
 
 def fail_while_writing(folder, error):
+    """Raise an error after half of the folder is written."""
     with atomic_folder(folder) as part:
         (part / "half").write_text("half")
         raise error
@@ -40,27 +41,27 @@ def fail_while_writing(folder, error):
 
 def test_atomic_folder_exists_only_when_complete(tmp_path):
     with pytest.raises(OverflowError):
-        fail_while_writing(tmp_path / "made", OverflowError())
+        fail_while_writing(tmp_path / "folder", OverflowError())
     assert list(tmp_path.iterdir()) == []
-    with atomic_folder(tmp_path / "made") as part:
+    with atomic_folder(tmp_path / "folder") as part:
         (part / "all").write_text("all")
-        assert not (tmp_path / "made").exists()
-    assert [one.relative_to(tmp_path).as_posix() for one in tmp_path.rglob("*")] == ["made", "made/all"]
+        assert not (tmp_path / "folder").exists()
+    assert [path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*")] == ["folder", "folder/all"]
 
 
-def test_error_of_another_file_is_not_one_of_the_folder(tmp_path):
-    with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "made"):
+def test_atomic_folder_keeps_the_error_of_another_file(tmp_path):
+    with pytest.raises(FileNotFoundError), atomic_folder(tmp_path / "folder"):
         (tmp_path / "input.obj").read_bytes()
     assert not list(tmp_path.iterdir())
 
 
 def test_atomic_folder_leaves_nothing_when_the_disk_is_full(tmp_path):
     with pytest.raises(InputError, match="No space left"):
-        fail_while_writing(tmp_path / "made", OSError(28, "No space left on device"))
+        fail_while_writing(tmp_path / "folder", OSError(28, "No space left on device"))
     assert list(tmp_path.iterdir()) == []
 
 
-def test_evaluate_checks_its_save_file_before_it_reads_the_run(tmp_path):
-    (tmp_path / "file").write_text("mine")
+def test_evaluate_checks_its_output_before_reading_the_run(tmp_path):
+    (tmp_path / "file").write_text("text")
     with pytest.raises(InputError, match="cannot be written"):
         evaluate(tmp_path / "none", save=tmp_path / "file" / "demonstrations.npz")

@@ -1,3 +1,5 @@
+"""Files and folders of demonstrations: reading, remarks of the validation, and refused tables."""
+
 import numpy as np
 import pytest
 
@@ -10,30 +12,32 @@ CLOCK = np.linspace(0, 1, 30)
 
 
 def motion(index=0):
+    """Return the outputs (30, 3) of demonstration `index`."""
     return np.column_stack([np.sin(3 * CLOCK + 0.1 * index), CLOCK * index, CLOCK**2])
 
 
 def write(path, index=0, header="t,x,y,z"):
+    """Write demonstration `index` as a CSV table; return its path."""
     rows = [",".join(map(repr, map(float, row))) for row in np.column_stack([CLOCK, motion(index)])]
     path.write_text("\n".join([header, *rows]) + "\n")
     return path
 
 
 def test_csv_file_is_one_demonstration(tmp_path):
-    read = load_demonstrations(write(tmp_path / "one.csv"))
-    assert read.names == ("x", "y", "z")
-    np.testing.assert_array_equal(read.times[0], CLOCK)
-    np.testing.assert_array_equal(read.outputs[0], motion())
+    loaded = load_demonstrations(write(tmp_path / "a.csv"))
+    assert loaded.names == ("x", "y", "z")
+    np.testing.assert_array_equal(loaded.times[0], CLOCK)
+    np.testing.assert_array_equal(loaded.outputs[0], motion())
 
 
 def test_folder_contains_the_demonstrations_of_all_files(tmp_path):
     for index in (2, 0, 1):
         write(tmp_path / f"{index}.csv", index)
     Demonstrations(CLOCK, [motion(3), motion(4)], ["x", "y", "z"]).save(tmp_path / "3.npz")
-    (tmp_path / "notes.txt").write_text("mine")
-    read = load_demonstrations(tmp_path)
-    assert read.num_demonstrations == 5
-    for index, outputs in enumerate(read.outputs):
+    (tmp_path / "notes.txt").write_text("text")
+    loaded = load_demonstrations(tmp_path)
+    assert loaded.num_demonstrations == 5
+    for index, outputs in enumerate(loaded.outputs):
         np.testing.assert_array_equal(outputs, motion(index))
 
 
@@ -49,7 +53,7 @@ def test_folder_is_read_without_hidden_files(ending, tmp_path):
         load_demonstrations(tmp_path)
 
 
-def test_saved_csv_file_is_read_again(tmp_path):
+def test_saved_csv_file_can_be_read(tmp_path):
     Demonstrations(CLOCK, [motion(0), motion(1)]).save(tmp_path / "two.csv")
     assert load_demonstrations(tmp_path / "two.csv").num_demonstrations == 2
 
@@ -57,13 +61,13 @@ def test_saved_csv_file_is_read_again(tmp_path):
 def test_byte_order_mark_is_not_part_of_the_first_name(tmp_path):
     rows = [f"{m},{t},{m + t}" for m in range(2) for t in range(3)]
     text = "\n".join(["demonstration,time,x", *rows])
-    (tmp_path / "marked.csv").write_text(text, encoding="utf-8-sig")  # as Excel writes it
+    (tmp_path / "marked.csv").write_text(text, encoding="utf-8-sig")  # the encoding of Excel
     assert load_demonstrations(tmp_path / "marked.csv").num_demonstrations == 2
 
 
 def test_validate_names_the_demonstration_in_another_unit(tmp_path):
     t = np.linspace(0.0, 2.0, 50)
-    for index, unit in enumerate((1.0, 1000.0, 1.0)):  # the second one in mm
+    for index, unit in enumerate((1.0, 1000.0, 1.0)):  # demonstration 1 in millimeters
         rows = unit * np.column_stack([t, np.sin(t) + 0.01 * index])
         np.savetxt(tmp_path / f"{index}.csv", np.column_stack([t, rows]), delimiter=",", header="time,x,y", comments="")
     assert "demonstration 1 extends over 2.24e+03 and the median" in validate_demonstrations(tmp_path)["remark"]
@@ -93,7 +97,7 @@ def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("text", "message"),
     [
         ("", "first line must be"),
         ("t\n0\n1\n", "first line must be"),
@@ -105,15 +109,15 @@ def test_readers_refuse_a_name_that_is_too_long(read, ending, tmp_path):
         ("t,x\n1,1\n0,2\n", "does not increase"),
     ],
 )
-def test_load_demonstrations_refuses_invalid_tables(tmp_path, text, words):
+def test_load_demonstrations_refuses_invalid_tables(tmp_path, text, message):
     (tmp_path / "wrong.csv").write_text(text)
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         load_demonstrations(tmp_path / "wrong.csv")
-    with pytest.raises(InputError, match=words):
+    with pytest.raises(InputError, match=message):
         Demonstrations.load(tmp_path / "wrong.csv")  # the same message as in training
 
 
-def test_folder_without_files_or_of_mixed_outputs_is_refused(tmp_path):
+def test_folder_is_refused_when_empty_or_of_mixed_outputs(tmp_path):
     with pytest.raises(InputError, match="no file"):
         load_demonstrations(tmp_path)
     write(tmp_path / "a.csv")
@@ -126,8 +130,8 @@ def test_folder_without_files_or_of_mixed_outputs_is_refused(tmp_path):
 def test_picture_has_the_format_of_its_ending(tmp_path, ending, magic):
     for index in range(3):
         write(tmp_path / f"{index}.csv", index)
-    picture = tmp_path / f"drawn{ending}"
+    picture = tmp_path / f"picture{ending}"
     assert validate_demonstrations(tmp_path, picture)["picture"] == str(picture)
     assert picture.read_bytes().startswith(magic)
     with pytest.raises(InputError, match="a picture is"):
-        validate_demonstrations(tmp_path, tmp_path / "drawn.gif")
+        validate_demonstrations(tmp_path, tmp_path / "picture.gif")

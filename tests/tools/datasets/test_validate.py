@@ -1,4 +1,4 @@
-"""Tests of the warning about a primitive whose motion without actions leaves the demonstrations."""
+"""Warnings and remarks about demonstrations, and orders of angles and quaternions at import."""
 
 import numpy as np
 import pytest
@@ -9,23 +9,22 @@ from guiderail.tools.datasets.validate import fit_bounds, warn_of_deviation
 from guiderail.tools.files import load_demonstrations
 
 
-def test_strong_regularization_is_warned_about_with_a_remedy():
+def test_strong_regularization_causes_a_warning():
     assert warn_of_deviation("NarrowPassage", {}) is None
     warning = warn_of_deviation("NarrowPassage", {"lambda_": 1e4, "beta": 1e4})
     assert warning.startswith("without actions, ")
     assert "dataset validate FILE --fit" in warning
 
 
-def test_no_warning_for_a_task_without_demonstrations():
+def test_task_without_demonstrations_causes_no_warning():
     assert warn_of_deviation("Pouring", {}) is None
 
 
-@pytest.mark.parametrize("length_scale", [50.0])
-def test_long_length_scale_is_warned_about(length_scale):
-    assert "standard deviation" in warn_of_deviation("NarrowPassage", {"length_scale": length_scale})
+def test_long_length_scale_causes_a_warning():
+    assert "standard deviation" in warn_of_deviation("NarrowPassage", {"length_scale": 50.0})
 
 
-def test_recording_in_another_unit_is_remarked_when_used(tmp_path):
+def test_recording_in_another_unit_causes_a_remark(tmp_path):
     folder, times = tmp_path / "recorded", np.linspace(0.0, 1.0, 20)
     folder.mkdir()
     for index, scale in enumerate((1.0, 1.0, 1000.0)):
@@ -46,7 +45,7 @@ def test_import_converts_zyx_angles_named_as_outputs(unit, tmp_path):
     np.testing.assert_allclose(load_demonstrations(tmp_path / "out.npz").outputs[0][:, 3:], angles, atol=1e-12)
 
 
-def test_import_refuses_an_order_that_contradicts_names(tmp_path):
+def test_import_refuses_a_quaternion_order_unlike_its_names(tmp_path):
     rows = np.column_stack([np.linspace(0.0, 1.0, 20)] * 4 + [np.ones(20)] + [np.zeros(20)] * 3)
     np.savetxt(tmp_path / "a.csv", rows, delimiter=",", header="t [s],x [m],y [m],z [m],qw,qx,qy,qz", comments="")
     with pytest.raises(InputError, match="contradicts --quaternion xyzw: leave it out"):

@@ -1,4 +1,4 @@
-"""Two meshes become a task by the command alone: it is checked, inserted, trained, evaluated and replayed."""
+"""Command `create-task`: task folders of two meshes, their checks, difficulties, search and fitted bounds."""
 
 import json
 from contextlib import nullcontext
@@ -9,15 +9,33 @@ import numpy as np
 import pytest
 import yaml
 
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
-from guiderail.diagrams.tasks.part.file import PartTaskFile
+from guiderail.diagrams.tasks.insertion import InsertionReset
+from guiderail.diagrams.tasks.part.file import Bounds, MotionNumbers, PartTaskFile, read_task_file
+from guiderail.diagrams.tasks.part.task import (
+    BLOCKED,
+    CENTER_OF_PRESSURE,
+    COMMAND,
+    FOLLOWING,
+    TIME,
+    ScriptedSearch,
+    Z,
+    load_task_folder,
+)
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.models.common import files as writing
+from guiderail.models.common import files as common_files
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
+from guiderail.tools.environments import task_named
+from guiderail.tools.experiments.declaration import load_study
+from guiderail.tools.learning.train import configure, with_defaults
+from guiderail.tools.parts import create_task as create_task_module
+from guiderail.tools.parts import trial
 from guiderail.tools.parts.contact import rank
-from guiderail.tools.parts.create_task import ask_unit, create_task
+from guiderail.tools.parts.create_task import ask_unit, create_task, read_parts
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -26,6 +44,7 @@ from oracles.parts import PARTS, screw
 
 
 def call(*arguments, code=0):
+    """Run the command line, and assert its exit code."""
     with pytest.raises(SystemExit) as end:
         main([str(argument) for argument in arguments])
     assert end.value.code == code
@@ -33,18 +52,18 @@ def call(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Task folder of the simplest of the six parts of `learn_parts.py`."""
-    where = tmp_path_factory.mktemp("parts")
-    plug, socket = PARTS["square_peg"]().write(where)
-    call("create-task", plug, socket, "--unit", "mm", "--out", where / "peg", "--hard-episodes", 1, "--json")
-    yield where / "peg"
-    # Other tests must not see the registered task.
+    """Return the task folder of a square peg, the part of `learn_parts.py` that is simulated fastest."""
+    parent = tmp_path_factory.mktemp("parts")
+    plug, socket = PARTS["square_peg"]().write(parent)
+    call("create-task", plug, socket, "--unit", "mm", "--out", parent / "peg", "--hard-episodes", 1, "--json")
+    yield parent / "peg"
+    # The task must not be registered in other tests.
     for name in [name for name in TASKS.names() if name.startswith("parts/")]:
         del TASKS._entries[name]
         gymnasium.registry.pop(environment_id(name), None)
 
 
-def test_measured_properties_are_those_of_the_drawing(folder):
+def test_measured_properties_agree_with_the_drawing(folder):
     measured = yaml.safe_load((folder / "task.yaml").read_text())["measured"]
     assert measured["clearance_mm"] == pytest.approx(0.1, abs=1e-3)
     assert measured["inserted"] is True
@@ -68,14 +87,14 @@ def test_scenarios_with_conflicting_names_are_refused(tmp_path):
     ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("directives: []\n")
-    for names, words in (
+    for names, message in (
         (("a/table.dmd.yaml", "b/table.dmd.yaml"), "two scenarios are called table.dmd.yaml"),
         (("a/table.yaml",), "is not a scenario: name a .dmd.yaml file"),
         (("a/plug.obj",), "is not a scenario"),
         (("a/b,c.dmd.yaml",), "has a comma in its name"),
         (("a/b#c.dmd.yaml",), "a scenario's name is letters, digits, .* and not 'b#c.dmd.yaml'"),
     ):
-        with pytest.raises(InputError, match=words):
+        with pytest.raises(InputError, match=message):
             create_task(plug, socket, tmp_path / "peg", unit="mm", scenario=[tmp_path / name for name in names])
     assert not (tmp_path / "peg").exists()
 
@@ -90,39 +109,38 @@ def test_create_task_refuses_a_folder_below_a_file(tmp_path):
 def test_unit_is_asked_for_on_standard_error(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.stdin", SimpleNamespace(isatty=lambda: True, readline=lambda: "cm\n"))
     files = [tmp_path / "plug.stl", tmp_path / "socket.stl"]
-    assert ask_unit(files, None) is None, "of files that are missing nothing is asked"
+    assert ask_unit(files, None) is None, "the unit is asked for missing files"
     for file in files:
         file.touch()
     assert ask_unit(files, None) == "cm"
     assert capsys.readouterr().out == ""
 
 
-def test_rank_prefers_seating_then_shallow_then_fast_contacts():
+def test_rank_prefers_seating_then_allowed_depth_then_speed():
     def key(seats, deepest, speed):
         return rank(SimpleNamespace(aligned=SimpleNamespace(success=seats), deepest=deepest, speed=speed), 1e-4)
 
-    tried = {
-        "fast": key(True, 0.9e-4, 3.0),
-        "shallow and slow": key(True, 0.2e-4, 2.5),
-        "a little too deep": key(True, 1.1e-4, 2.1),
-        "far too deep, and fast": key(True, 2.3e-4, 4.4),
-        "not too deep, and unbearably slow": key(True, 1.05e-4, 1.4),
-        "does not seat": key(False, 0.1e-4, 9.0),
+    # From the best to the worst, with an allowed penetration of 0.1 mm.
+    keys = {
+        "allowed and fast": key(True, 0.9e-4, 3.0),
+        "allowed and slow": key(True, 0.2e-4, 2.5),
+        "10 % too deep": key(True, 1.1e-4, 2.1),
+        "130 % too deep and fast": key(True, 2.3e-4, 4.4),
+        "5 % too deep and too slow": key(True, 1.05e-4, 1.4),
+        "not seated": key(False, 0.1e-4, 9.0),
     }
-    assert sorted(tried, key=tried.get, reverse=True) == list(tried)
+    assert sorted(keys, key=keys.get, reverse=True) == list(keys)
 
 
-def test_study_takes_a_task_folder_as_its_task(folder, tmp_path, monkeypatch):
-    from guiderail.tools.experiments.declaration import load_study
-
+def test_task_of_a_study_may_be_a_task_folder(folder, tmp_path, monkeypatch):
     file = tmp_path / "study.yaml"
-    file.write_text("{name: few, task: ./peg, methods: {random: {policy: uniform_random}}, seeds: [0]}")
+    file.write_text("{name: short, task: ./peg, methods: {random: {policy: uniform_random}}, seeds: [0]}")
     monkeypatch.chdir(folder.parent)
     study = load_study(file)
     assert (study.task, study.imports) == ("parts/peg", (str(folder.resolve()),))
 
 
-def test_created_folder_is_a_task(folder, tmp_path, capsys):
+def test_created_task_can_be_trained_and_evaluated(folder, tmp_path, capsys):
     call("train", folder, "--episodes", 1, "--out", tmp_path / "run", "--json")
     capsys.readouterr()
     call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "none", "--json")
@@ -131,11 +149,7 @@ def test_created_folder_is_a_task(folder, tmp_path, capsys):
     assert (tmp_path / "run/replay.html").is_file()
 
 
-def test_created_task_trains_with_its_own_learner(folder):
-    from guiderail.diagrams.envs.config import EnvConfig
-    from guiderail.tools.environments import task_named
-    from guiderail.tools.learning.train import configure, with_defaults
-
+def test_created_task_has_its_own_learner_and_symmetry(folder):
     name, _ = task_named(str(folder))
     recommended = yaml.safe_load((folder / "task.yaml").read_text())["recommended"]
     config = configure(name, {}, **with_defaults(name, {"settings": {"batch_size": 32}}))
@@ -143,36 +157,31 @@ def test_created_task_trains_with_its_own_learner(folder):
         assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
     assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
     task = EnvConfig.resolve(name, {}).make_task()
-    assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight sides
+    assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight symmetries, one of which is the identity
     changed = yaml.safe_load((folder / "task.yaml").read_text())
     for wrong in ({"sides": ["upside down"]}, {"time_step": 0.003}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             validate_options(PartTaskFile, changed | wrong, "task.yaml")
 
 
-def test_difficulties_of_a_created_task_bound_the_offset_and_the_command(folder):
-    from guiderail.diagrams.envs.config import EnvConfig
-
+def test_difficulties_of_a_created_task_bound_offset_command(folder):
     hard = yaml.safe_load((folder / "task.yaml").read_text())["hard"]
-    low, high = hard["offset_range"]
-    turn = hard["fixture_turn"]
-    assert 0.0 < turn < 2.0  # 0.1 mm of clearance on 7 mm of radius
+    (low, high), turn = hard["offset_range"], hard["fixture_turn"]
+    assert 0.0 < turn < 2.0  # [°]; 0.1 mm of clearance at a radius of 7 mm is 0.8°
     for difficulty, is_inside, bound in (
         ("hard", lambda x, y, z: low <= np.hypot(x, y) <= high and abs(z) <= np.deg2rad(turn), hard["bound"]),
         ("automate", lambda x, y, z: max(abs(x), abs(y)) <= 2e-3 and abs(z) <= np.deg2rad(5.0), 3.5e-3),
     ):
         task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).make_task()
-        options = SimpleNamespace(held_out=False, new_run=False, offset=None)
         rng = np.random.default_rng(0)
-        offsets = np.array([task.offsets.draw(rng, options)[0] for _ in range(200)])
+        offsets = np.array([task.offsets.draw(rng, InsertionReset())[0] for _ in range(200)])
         assert all(is_inside(*offset) for offset in offsets)
         assert (np.ptp(offsets[:, :2], axis=0) > 0.9 * 2.0 * min(high, 2e-3)).all()
         np.testing.assert_allclose(task.constraints().nearest(np.full(6, 9e-3))[:3], [bound, bound, 9e-3])
-    corners = [offset for offset in offsets if np.hypot(*offset[:2]) > 2e-3]
-    assert corners, "a square, not a disc"
+    assert np.hypot(*offsets[:, :2].T).max() > 2e-3, "no sample in the corners of the square"
 
 
-def test_hard_is_calibrated_with_few_episodes(folder):
+def test_hard_is_calibrated_with_a_single_episode(folder):
     tree = yaml.safe_load((folder / "task.yaml").read_text())
     result, hard = tree["measured"]["hard"], tree["hard"]
     assert (
@@ -184,19 +193,15 @@ def test_hard_is_calibrated_with_few_episodes(folder):
         assert 0 <= successes <= episodes <= 1
 
 
-def test_parts_of_convex_pieces_are_offered_in_mujoco(folder):
-    from guiderail.diagrams.envs.make import make_env
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.diagrams.tasks.part.task import load_task_folder
-    from guiderail.tools.parts.trial import insert_in_mujoco
-
+def test_parts_of_convex_pieces_are_simulated_in_mujoco(folder):
     pytest.importorskip("mujoco")
     file = read_task_file(folder)
     assert "mujoco" in load_task_folder(folder).stations()
-    assert (len(file.plug.convex), len(file.socket.convex)) >= (1, 5)  # four walls and the bottom
-    assert insert_in_mujoco(folder, file) == (True, False)
-    assert insert_in_mujoco(folder, file, 2e-3) == (False, True)
-    assert insert_in_mujoco(folder, with_floor_only(folder, file), 2e-3) == (False, False)
+    assert len(file.plug.convex) >= 1
+    assert len(file.socket.convex) >= 5  # four walls and the bottom
+    assert trial.insert_in_mujoco(folder, file) == (True, False)
+    assert trial.insert_in_mujoco(folder, file, 2e-3) == (False, True)
+    assert trial.insert_in_mujoco(folder, with_floor_only(folder, file), 2e-3) == (False, False)
     env = make_env(str(folder), station="mujoco", guidance="kgrl")
     env.reset(seed=0, options={"offset": (0.0, 0.0)})
     done = False
@@ -220,31 +225,25 @@ def with_floor_only(folder, file):
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.5e-3])
-def test_plug_beside_the_target_is_not_blocked_without_walls(folder, offset):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.tools.parts.trial import insert
-
+def test_offset_plug_is_blocked_only_by_the_walls(folder, offset):
     file = read_task_file(folder)
-    with_walls = insert(folder, file, offset=(offset, 0.0))
+    with_walls = trial.insert(folder, file, offset=(offset, 0.0))
     assert (with_walls.success, with_walls.is_blocked) == (offset == 0.0, offset > 0.0)
-    without = insert(folder, with_floor_only(folder, file), offset=(offset, 0.0))
-    assert (without.success, without.is_blocked) == (offset == 0.0, False)
+    without_walls = trial.insert(folder, with_floor_only(folder, file), offset=(offset, 0.0))
+    assert (without_walls.success, without_walls.is_blocked) == (offset == 0.0, False)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1.5e-3])
 def test_real_time_factor_counts_only_simulated_time(folder, monkeypatch, offset):
-    """With a clock that shows the simulated time instead of the CPU time, the factor is one."""
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.tools.parts import trial
-
+    """The factor is 1 if the CPU time is replaced by the simulated time."""
     contexts = []
 
-    class Driven(trial.DrivenStation):
+    class RecordedStation(trial.DrivenStation):
         def __init__(self, *arguments, **keywords):
             super().__init__(*arguments, **keywords)
             contexts.append(self.context)
 
-    monkeypatch.setattr(trial, "DrivenStation", Driven)
+    monkeypatch.setattr(trial, "DrivenStation", RecordedStation)
     monkeypatch.setattr(trial, "time", SimpleNamespace(process_time=lambda: contexts[0].get_time()))
     file = read_task_file(folder)
     result = trial.insert(folder, file, offset=(offset, 0.0))
@@ -253,34 +252,24 @@ def test_real_time_factor_counts_only_simulated_time(folder, monkeypatch, offset
     assert result.real_time_factor == pytest.approx(1.0)
 
 
-def test_turned_socket_accepts_a_turned_plug_without_a_turn_at_the_end(folder):
-    from guiderail.diagrams.envs.config import EnvConfig
-
+def test_seated_plug_may_be_turned_by_up_to_20_degrees(folder):
     task = EnvConfig.resolve(str(folder), {}).make_task()
-    seated = [
-        task.file.tolerance.accepts(np.array([0.0, 0.0, 0.0, 0.0, 0.0, np.deg2rad(turn)])) for turn in (19.0, 21.0)
-    ]
-    assert seated == [True, False]
+    turned = [task.file.tolerance.accepts(np.array([*[0.0] * 5, np.deg2rad(turn)])) for turn in (19.0, 21.0)]
+    assert turned == [True, False]
 
 
-def test_bound_is_refused_when_the_bounds_of_the_file_change(folder):
-    from guiderail.diagrams.envs.config import EnvConfig
-    from guiderail.diagrams.tasks.part.file import Bounds
-
+def test_bound_is_refused_when_the_file_has_phases(folder):
     task = EnvConfig.resolve(str(folder), {"bound": 3e-3}).make_task()
-    row = (-1e-3, -1e-3, *[None] * 4), (1e-3, 1e-3, *[None] * 4)
-    phases = Bounds.model_validate({"lower": (row[0],) * 2, "upper": (row[1],) * 2, "phases": (0.0, 0.5)})
+    lower, upper = ((x, x, *[None] * 4) for x in (-1e-3, 1e-3))
+    phases = Bounds.model_validate({"lower": (lower,) * 2, "upper": (upper,) * 2, "phases": (0.0, 0.5)})
     task.file = task.file.model_copy(update={"bounds": phases})
     with pytest.raises(InputError, match="bound replaces constant bounds"):
         task.constraints()
 
 
 def test_scripted_search_integrates_the_center_of_pressure(folder):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, TIME, ScriptedSearch, Z
-
     file = read_task_file(folder)
-    assert file.search.lever_sign == -1  # a peg stands on its outer side
+    assert file.search.lever_sign == -1  # the rim supports the outer edge of a peg
     search, observation = ScriptedSearch(file, lambda: 2.0), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
 
@@ -297,29 +286,20 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
         (0.3, inserted, -2 * step),
     ):
         np.testing.assert_allclose(act(time, height), [x, 0.0], atol=1e-12)
-    np.testing.assert_array_equal(act(1.9, on_rim), [-1.0, 0.0])  # limited
-    np.testing.assert_array_equal(act(0.0, on_rim), [0.0, 0.0])  # another episode
+    np.testing.assert_array_equal(act(1.9, on_rim), [-1.0, 0.0])  # limit of an action
+    np.testing.assert_array_equal(act(0.0, on_rim), [0.0, 0.0])  # a new episode
     with pytest.raises(InputError, match="needs the center of pressure"):
         search(observation[:13])
 
 
-def test_scripted_search_below_the_rim(folder):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.diagrams.tasks.part.task import (
-        BLOCKED,
-        CENTER_OF_PRESSURE,
-        COMMAND,
-        FOLLOWING,
-        TIME,
-        ScriptedSearch,
-        Z,
-    )
-
+def test_scripted_search_follows_the_plug_below_the_rim(folder):
     file = read_task_file(folder)
     times, poses = file.motion.plan_search()
     inserted, duration = 0.5 * file.motion.rim, times[-1]
     grid = np.arange(0.0, duration, 0.01)
-    time = grid[np.argmax(np.interp(grid, times, poses[:, 2]) < inserted)]  # the demonstrated command is there then
+    time = grid[
+        np.argmax(np.interp(grid, times, poses[:, 2]) < inserted)
+    ]  # [s] when the demonstrated command is below the rim
     search, observation = ScriptedSearch(file, lambda: duration), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
 
@@ -330,42 +310,35 @@ def test_scripted_search_below_the_rim(folder):
     act(0.0, file.motion.travel)
     act(time - 0.1, inserted)
     start = act(time - 0.05, inserted)
-    observation[COMMAND] = 0.5, 0.0  # the command is to the right of the plug
-    assert act(time, inserted) - start == pytest.approx(-0.05 * FOLLOWING * 0.5)  # back to the plug
+    observation[COMMAND] = 0.5, 0.0  # the position of the plug is 0
+    assert act(time, inserted) - start == pytest.approx(-0.05 * FOLLOWING * 0.5)  # towards the plug
     start = act(time, inserted)
     assert act(time + 0.05, inserted + BLOCKED + 1e-3) - start == pytest.approx(-0.05 * file.search.speed)  # blocked
 
 
 @pytest.fixture(scope="module")
 def turning(tmp_path_factory):
-    """Task folder of the same part whose socket is turned by up to 4.5°."""
-    where = tmp_path_factory.mktemp("turning")
-    plug, socket = PARTS["square_peg"]().write(where)
-    create_task(plug, socket, where / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
-    return where / "turning_peg"
+    """Return the task folder of the square peg with an unknown turn of the socket of up to 4.5°."""
+    parent = tmp_path_factory.mktemp("turning")
+    plug, socket = PARTS["square_peg"]().write(parent)
+    create_task(plug, socket, parent / "turning_peg", unit="mm", search_turn=4.5, hard_episodes=1)
+    return parent / "turning_peg"
 
 
-def test_unknown_turn_of_the_socket_is_demonstrated_and_within_reach_of_actions(turning):
-    from guiderail.diagrams.envs.config import EnvConfig
-    from guiderail.models.primitives import Demonstrations
-
+def test_unknown_turn_is_demonstrated_and_reached_by_actions(turning):
     task = EnvConfig.resolve(str(turning), {"difficulty": "hard"}).make_task()
-    options = SimpleNamespace(held_out=False, new_run=False, offset=None)
     rng = np.random.default_rng(0)
-    turns = np.rad2deg([task.offsets.draw(rng, options)[0][2] for _ in range(200)])
+    turns = np.rad2deg([task.offsets.draw(rng, InsertionReset())[0][2] for _ in range(200)])
     assert 4.3 < np.abs(turns).max() <= 4.5
     assert list(task.action_dims()) == [0, 1, 3]
     limit = np.rad2deg(task.constraints().nearest(np.full(6, 1.0))[3])
-    assert limit == pytest.approx(6.75)  # beyond the turn, because the grip is elastic
+    assert limit == pytest.approx(6.75)  # [°]; 1.5 times the unknown turn
     outputs = np.array(Demonstrations.load(turning / "demonstrations.npz").outputs)
     assert np.rad2deg(outputs[:, -1, 3].std()) > 2.5
     assert task.symmetry() is None  # a reflection would reverse the turn
 
 
-def test_scripted_search_turns_a_blocked_plug_to_and_fro(turning):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.diagrams.tasks.part.task import CENTER_OF_PRESSURE, TIME, ScriptedSearch, Z
-
+def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
     file = read_task_file(turning)
     search, observation = ScriptedSearch(file, lambda: 20.0), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
@@ -377,12 +350,10 @@ def test_scripted_search_turns_a_blocked_plug_to_and_fro(turning):
     assert (min(turns), max(turns)) == (-1.0, 1.0)
     assert np.abs(np.diff(turns)).max() <= 0.1 * file.search.turn_speed + 1e-9
     observation[TIME] = -1.0
-    np.testing.assert_array_equal(search(observation), np.zeros(3))  # another episode
+    np.testing.assert_array_equal(search(observation), np.zeros(3))  # a new episode
 
 
-def test_screw_is_inserted_by_its_turn(tmp_path, capsys):
-    from guiderail.diagrams.tasks.part.file import MotionNumbers, read_task_file
-
+def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
     part = screw()
     arguments = [*part.write(tmp_path), "--unit", "mm", "--hard-episodes", "0", "--out", tmp_path / "screw"]
     call("create-task", *arguments, *part.options)
@@ -395,20 +366,20 @@ def test_screw_is_inserted_by_its_turn(tmp_path, capsys):
         MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
 
 
-def test_unknown_turn_beyond_the_range_is_refused(tmp_path):
+def test_search_turn_is_refused_when_out_of_range(tmp_path):
     for turn in (-1.0, 10.1, np.nan):
         with pytest.raises(InputError, match="--search-turn is from 0 to 10 degrees"):
             create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", search_turn=turn)
 
 
 @pytest.mark.parametrize("pose", [(0.0, 0.0, 1.0), (0.0,) * 7, (np.nan,) * 6, ()])
-def test_plug_pose_is_refused_when_it_is_not_six_numbers(pose, tmp_path):
+def test_plug_pose_is_refused_when_not_six_numbers(pose, tmp_path):
     with pytest.raises(InputError, match="--plug-pose is 6 finite numbers"):
         create_task(tmp_path / "a.stl", tmp_path / "b.stl", tmp_path / "peg", unit="mm", plug_pose=pose)
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("arguments", "message"),
     [
         ({"turn": "a"}, "--turn must be a number, not 'a'"),
         ({"shrink": None}, "--shrink must be a number, not None"),
@@ -420,27 +391,22 @@ def test_plug_pose_is_refused_when_it_is_not_six_numbers(pose, tmp_path):
         ({}, "there is no mesh .*a.stl"),
     ],
 )
-def test_arguments_of_wrong_types_are_refused_and_paths_may_be_text(given, message, tmp_path):
+def test_argument_is_refused_when_its_type_is_wrong(arguments, message, tmp_path):
     paths = {name: str(tmp_path / name) for name in ("plug", "socket", "out")} | {"plug": str(tmp_path / "a.stl")}
     with pytest.raises(InputError, match=message):
-        create_task(**(paths | {"socket": str(tmp_path / "b.stl"), "unit": "mm"} | given))
+        create_task(**(paths | {"socket": str(tmp_path / "b.stl"), "unit": "mm"} | arguments))
 
 
-def test_task_file_has_the_number_of_components_that_the_criterion_selects(folder):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-
+def test_task_file_has_the_selected_number_of_components(folder):
     stored = read_task_file(folder).demonstrations
-    searched = stored.model_copy(update={"components": None}).reference(folder)
+    selected = stored.model_copy(update={"components": None}).reference(folder)
     assert stored.components > 1
-    np.testing.assert_array_equal(stored.reference(folder).covariances, searched.covariances)
+    np.testing.assert_array_equal(stored.reference(folder).covariances, selected.covariances)
 
 
 @pytest.mark.parametrize(("seats", "expected"), [(True, (4, 4)), (False, (0, 2))])
-def test_demonstrations_that_are_not_checked_in_time_are_not_counted(seats, expected, folder, tmp_path, monkeypatch):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.tools.parts import trial
-
-    clock = iter(range(0, 1000, 9))  # the fifth check would begin after 45 s
+def test_demonstrations_are_not_counted_after_the_time_limit(seats, expected, folder, tmp_path, monkeypatch):
+    clock = iter(range(0, 1000, 9))  # CPU time [s]; the fifth check would begin after the limit of 45 s
     monkeypatch.setattr(trial, "time", SimpleNamespace(process_time=lambda: next(clock)))
     monkeypatch.setattr(trial, "_seats", lambda *arguments: seats)
     assert trial.demonstrate(tmp_path, read_task_file(folder)) == expected
@@ -456,21 +422,26 @@ def test_demonstrations_that_are_not_checked_in_time_are_not_counted(seats, expe
     ],
 )
 def test_unchecked_demonstrations_are_not_reported_as_failed(counts, stored, sentences, folder, tmp_path, monkeypatch):
-    from guiderail.diagrams.tasks.part.file import read_task_file
-    from guiderail.tools.parts import create_task as module
-    from guiderail.tools.parts import trial
-
     monkeypatch.setattr(trial, "demonstrate", lambda folder, file: counts)
     monkeypatch.setattr(trial, "num_components", lambda folder, file: 3)
     monkeypatch.setattr(trial, "write_preview", lambda *arguments: None)
     file, choice, logged = read_task_file(folder), SimpleNamespace(aligned=None), []
     refusal = pytest.raises(InputError, match="none of the 3 checked demonstrations seats the plug")
     with refusal if stored is None else nullcontext():
-        measured = module._write_task(tmp_path, file, choice, {"real_time_factor": 1.0}, 0, 0.0, logged.append)
+        measured = create_task_module._write_task(
+            tmp_path, file, choice, {"real_time_factor": 1.0}, 0, 0.0, logged.append
+        )
         assert measured["demonstrations_seated"] == stored
-    assert [text.startswith(start) for text, start in zip(logged[1:], sentences, strict=True)] == [True] * len(
-        sentences
-    )
+    assert all(text.startswith(start) for text, start in zip(logged[1:], sentences, strict=True))
+
+
+@pytest.fixture
+def task_file(folder):
+    """Yield the task file, and restore its text after the test."""
+    file = folder / "task.yaml"
+    text = file.read_text()
+    yield file
+    file.write_text(text)
 
 
 def test_options_of_a_created_task_are_listed(folder, capsys):
@@ -478,33 +449,24 @@ def test_options_of_a_created_task_are_listed(folder, capsys):
     assert "offset_range" in capsys.readouterr().out
 
 
-def test_fitted_bounds_become_those_of_the_task(folder, capsys):
-    from guiderail.diagrams.envs.config import EnvConfig
-    from guiderail.diagrams.envs.make import make_env
-
-    before = (folder / "task.yaml").read_text()
-    try:
-        call(
-            "dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder
-        )
-        assert str(folder / "task.yaml") in capsys.readouterr().out.splitlines()[-1]
-        constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
-        assert constraints.G.shape[0] > 1
-        np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
-        env = make_env(str(folder), horizon=4)
-        env.reset(seed=0)
-        env.step(env.action_space.sample())
-        env.close()
-    finally:
-        (folder / "task.yaml").write_text(before)
+def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
+    call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
+    assert str(task_file) in capsys.readouterr().out.splitlines()[-1]
+    constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
+    assert constraints.G.shape[0] > 1
+    np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
+    env = make_env(str(folder), horizon=4)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
 
 
-def test_fitted_bounds_that_exclude_the_target_are_refused(folder, tmp_path, capsys):
+def test_fitted_bounds_are_refused_when_excluding_the_target(folder, tmp_path, capsys):
     before = (folder / "task.yaml").read_text()
     demonstrations = Demonstrations.load(folder / "demonstrations.npz")
-    aside = [outputs + [0.005, *[0.0] * 5] for outputs in demonstrations.outputs]
-    Demonstrations(demonstrations.times, aside).save(tmp_path / "aside.npz")
-    call("dataset", "fit-bounds", tmp_path / "aside.npz", "--outputs", "0,1", "--task", folder, code=2)
+    shifted = [outputs + [0.005, *[0.0] * 5] for outputs in demonstrations.outputs]
+    Demonstrations(demonstrations.times, shifted).save(tmp_path / "shifted.npz")
+    call("dataset", "fit-bounds", tmp_path / "shifted.npz", "--outputs", "0,1", "--task", folder, code=2)
     assert "exclude the pose of the seated plug" in capsys.readouterr().err
     assert (folder / "task.yaml").read_text() == before
 
@@ -514,7 +476,7 @@ def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, ca
         raise OSError(28, "No space left on device")
 
     before = (folder / "task.yaml").read_text()
-    monkeypatch.setattr(writing.os, "replace", fail)
+    monkeypatch.setattr(common_files.os, "replace", fail)
     call("dataset", "fit-bounds", folder / "demonstrations.npz", "--task", folder, code=2)
     assert "cannot be written" in capsys.readouterr().err
     assert (folder / "task.yaml").read_text() == before
@@ -533,7 +495,7 @@ def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (lambda text: text.replace("force_limit: 35.0", "force_limit: -3"), "force_limit must be at least 1"),
         (lambda text: text.replace("file: plug_0.obj", "file: gone.obj"), "names gone.obj"),
@@ -541,19 +503,15 @@ def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeyp
         (lambda text: "format: other\n", "is no task"),
     ],
 )
-def test_edited_task_file_is_validated(change, says, folder, capsys):
-    before = (folder / "task.yaml").read_text()
-    try:
-        (folder / "task.yaml").write_text(change(before))
-        call("list", folder, code=2)
-        assert says in capsys.readouterr().err
-    finally:
-        (folder / "task.yaml").write_text(before)
+def test_task_file_is_refused_when_edited_incorrectly(change, message, folder, task_file, capsys):
+    task_file.write_text(change(task_file.read_text()))
+    call("list", folder, code=2)
+    assert message in capsys.readouterr().err
 
 
 def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
     plug, socket = PARTS["bayonet"]().write(tmp_path)
-    for arguments, says in (
+    for arguments, message in (
         ((), "does not say its unit"),
         (("--unit", "ell"), "there is no unit"),
         (("--unit", "mm"), "does not pass the socket"),
@@ -577,44 +535,38 @@ def test_create_task_refuses_wrong_arguments(folder, tmp_path, capsys):
     ):
         out = () if "--out" in arguments else ("--out", tmp_path / "task")
         call("create-task", plug, socket, *out, *arguments, code=2)
-        assert says in capsys.readouterr().err
+        assert message in capsys.readouterr().err
         assert sorted(path.name for path in tmp_path.iterdir()) == ["plug.stl", "socket.stl"]
 
 
-def test_parts_drawn_in_another_pose_give_the_same_task(tmp_path):
-    """Parts along x, the plug apart from its socket: --axis and --plug-pose bring both to the target frame."""
-    from guiderail.tools.parts.create_task import read_parts
-
+def test_axis_and_plug_pose_transform_the_parts(tmp_path):
+    """Parts drawn along x, with a distance between plug and socket, have the same bounds in the target frame."""
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     upright = read_parts(plug, socket, "mm", (0,) * 6, "+z", None)
     import trimesh
 
-    turn = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    rotation = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
     for path in (plug, socket):
-        trimesh.load(path).apply_transform(turn).export(path)
+        trimesh.load(path).apply_transform(rotation).export(path)
     trimesh.load(plug).apply_translation([-30.0, 0, 0]).export(plug)
     lying = read_parts(plug, socket, "mm", (30.0, 0, 0, 0, 0, 0), "+x", None)
-    for one, other in zip(lying, upright, strict=True):
-        np.testing.assert_allclose(one.bounds, other.bounds, atol=1e-8)
+    for transformed, expected in zip(lying, upright, strict=True):
+        np.testing.assert_allclose(transformed.bounds, expected.bounds, atol=1e-8)
     with pytest.raises(InputError, match="--axis"):
         read_parts(plug, socket, "mm", (0,) * 6, "up", None)
 
 
-@pytest.mark.parametrize(("apart", "is_accepted"), [(0.9, True), (1.1, False)])
-def test_assembled_parts_are_not_apart(apart, is_accepted, tmp_path):
-    from guiderail.tools.parts.create_task import read_parts
-
+@pytest.mark.parametrize(("distance", "is_accepted"), [(0.9, True), (1.1, False)])
+def test_parts_are_refused_when_more_than_1_mm_apart(distance, is_accepted, tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     first, second = read_parts(plug, socket, "mm", (0,) * 6, "+z", None)
-    beside = 1e3 * (second.bounds[1, 0] - first.bounds[0, 0]) + apart
+    x = 1e3 * (second.bounds[1, 0] - first.bounds[0, 0]) + distance
     with nullcontext() if is_accepted else pytest.raises(InputError, match=r"the parts are 1\.1 mm apart"):
-        read_parts(plug, socket, "mm", (beside, 0, 0, 0, 0, 0), "+z", None)
+        read_parts(plug, socket, "mm", (x, 0, 0, 0, 0, 0), "+z", None)
 
 
 @pytest.mark.parametrize(("distance", "is_accepted"), [(999.0, True), (1001.0, False)])
-def test_axis_is_near_the_plug(distance, is_accepted, tmp_path):
-    from guiderail.tools.parts.create_task import read_parts
-
+def test_center_is_refused_when_over_1_m_from_the_plug(distance, is_accepted, tmp_path):
     plug, socket = PARTS["square_peg"]().write(tmp_path)
     with nullcontext() if is_accepted else pytest.raises(InputError, match="is not near the plug"):
         read_parts(plug, socket, "mm", (0,) * 6, "+z", (distance, 0, 0))

@@ -1,3 +1,5 @@
+"""Frames that show an episode in a picture."""
+
 import numpy as np
 import pytest
 

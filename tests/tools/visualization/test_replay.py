@@ -1,4 +1,4 @@
-"""Tests of the page of episodes: its numbers are those of the episodes, from the same conditions on both sides."""
+"""Page of episodes: signals, equal starts of demonstration and policy, links, and refused arguments."""
 
 import base64
 import json
@@ -28,11 +28,12 @@ ENVIRONMENT = {"guidance": "kgrl", "action_repeat": 10}
 BALL = f"{VISUALIZER_PATH}/robot/ball"
 
 
-def _to_the_right(env):
+def constant_x_action(env):
     return constant_policy(env, np.array([1.0, 0.0]))
 
 
 def poses(text):
+    """Return the positions and quaternions (N, 7) of a body from the data of the page."""
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 7)
 
 
@@ -43,44 +44,45 @@ def page(tmp_path_factory):
     (study / "run").mkdir()
     file = study / "run" / "replay.html"
     arguments = check_environment("NarrowPassage", ENVIRONMENT)
-    shown = EpisodeSpec("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=file.parent)
-    row = write_page(file, shown, episodes=2)
+    spec = EpisodeSpec("NarrowPassage", arguments, constant_x_action, "action (1, 0)", "constant", run=file.parent)
+    row = write_page(file, spec, episodes=2)
     return file.read_text(encoding="utf-8"), row
 
 
-def data(text):
+def page_data(text):
+    """Return the data of the page's script."""
     return json.loads(re.search(r"const data = (\{.*\});\n", text).group(1))
 
 
-def test_page_has_all_signals_of_both_sides_on_one_time_axis(page):
-    before, after = data(page[0])["sides"]
-    for episode in (*before["episodes"], *after["episodes"]):
+def test_page_has_equal_times_for_all_signals_of_both_sides(page):
+    demonstration, policy = page_data(page[0])["sides"]
+    for episode in (*demonstration["episodes"], *policy["episodes"]):
         n = len(episode["times"])
         assert all(len(episode[name]) == n for name in ("force", "commanded", "measured", "time"))
         assert [len(values) for values in episode["action"]] == [n, n]
         assert len(poses(episode["frames"][BALL])) == n
-    assert len(before["episodes"]) == len(after["episodes"]) == 2
+    assert len(demonstration["episodes"]) == len(policy["episodes"]) == 2
 
 
-def test_before_is_the_demonstration_from_the_same_start(page):
-    before, after = data(page[0])["sides"]
-    for one, other in zip(before["episodes"], after["episodes"], strict=True):
-        np.testing.assert_array_equal(poses(one["frames"][BALL])[0], poses(other["frames"][BALL])[0])
-        assert np.ptp(one["action"]) == 0.0
-        assert max(other["action"][0]) == 1.0
-    first, second = (poses(episode["frames"][BALL])[0] for episode in after["episodes"])
+def test_demonstration_and_policy_have_the_same_starts(page):
+    demonstration, policy = page_data(page[0])["sides"]
+    for reference, learned in zip(demonstration["episodes"], policy["episodes"], strict=True):
+        np.testing.assert_array_equal(poses(reference["frames"][BALL])[0], poses(learned["frames"][BALL])[0])
+        assert np.ptp(reference["action"]) == 0.0
+        assert max(learned["action"][0]) == 1.0
+    first, second = (poses(episode["frames"][BALL])[0] for episode in policy["episodes"])
     assert not np.array_equal(first, second)
 
 
 def test_page_has_the_largest_violation_and_force(page):
     text, row = page
-    (episode, _) = data(text)["sides"][1]["episodes"]
+    (episode, _) = page_data(text)["sides"][1]["episodes"]
     assert max(episode["commanded"]) == pytest.approx(row["max_commanded_violation"], abs=1e-9)
     assert max(episode["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
-    assert data(text)["violation"] == {"unit": "mm", "scale": 1000.0}
+    assert page_data(text)["violation"] == {"unit": "mm", "scale": 1000.0}
 
 
-def test_page_is_self_contained_and_fits_a_phone(page):
+def test_page_is_self_contained_with_a_layout_for_phones(page):
     text = page[0]
     assert '<meta name="viewport" content="width=device-width' in text
     assert "<title>NarrowPassage · kgrl · constant" in text
@@ -104,9 +106,9 @@ def test_motion_keeps_the_peak_force_when_it_is_resampled(monkeypatch):
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 10}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
-    watching = Motion(env)
-    row = rollout(env, constant_policy(env, np.array([1.0, 0.0])), watching, seed=1_000_000, held_out=True)
-    recorded, trace = watching.data(), env.unwrapped.trace
+    motion = Motion(env)
+    row = rollout(env, constant_policy(env, np.array([1.0, 0.0])), motion, seed=1_000_000, held_out=True)
+    recorded, trace = motion.data(), env.unwrapped.trace
     assert len(recorded["times"]) <= 8
     assert recorded["times"][-1] == pytest.approx(len(trace) * trace.period)
     assert max(recorded["force"]) == pytest.approx(row["peak_force"], rel=1e-4)
@@ -115,7 +117,7 @@ def test_motion_keeps_the_peak_force_when_it_is_resampled(monkeypatch):
     env.close()
 
 
-def test_motion_has_one_sample_when_no_control_step_was_done(tmp_path):
+def test_motion_has_one_sample_without_a_control_step():
     env = make_environment("NarrowPassage", {"guidance": "kgrl"}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
@@ -129,21 +131,21 @@ def test_motion_has_one_sample_when_no_control_step_was_done(tmp_path):
     env.close()
 
 
-def test_page_of_a_task_folder_is_in_the_current_folder(tmp_path):
+def test_default_page_is_not_written_to_a_task_folder(tmp_path):
     assert default_page(tmp_path, {}) == tmp_path / "replay.html"
     (tmp_path / "task.yaml").touch()
     assert default_page(tmp_path, {"station": "arm"}) == Path("replay-arm.html")
 
 
-def test_page_names_the_report_command_with_the_folder_of_the_run(tmp_path):
+def test_page_has_the_report_command_of_its_run(tmp_path):
     run = tmp_path / "runs" / "passage"
     run.mkdir(parents=True)
     arguments = check_environment("NarrowPassage", ENVIRONMENT)
-    spec = EpisodeSpec("NarrowPassage", arguments, _to_the_right, "to the right", "constant", run=run)
+    spec = EpisodeSpec("NarrowPassage", arguments, constant_x_action, "action (1, 0)", "constant", run=run)
     write_page(run / "replay.html", spec, episodes=1)
-    page = (run / "replay.html").read_text(encoding="utf-8")
-    assert f"guiderail report {run} --out {run}/report.html" in page
-    assert "largest constraint violation: commanded" in page
+    text = (run / "replay.html").read_text(encoding="utf-8")
+    assert f"guiderail report {run} --out {run}/report.html" in text
+    assert "largest constraint violation: commanded" in text
 
 
 @pytest.mark.parametrize(
@@ -155,24 +157,24 @@ def test_page_names_the_report_command_with_the_folder_of_the_run(tmp_path):
         (None, 6, "m or rad"),
     ],
 )
-def test_violation_unit_is_that_of_the_bounded_outputs(constraints, outputs, unit):
+def test_violation_unit_depends_on_the_bounded_outputs(constraints, outputs, unit):
     assert violation_unit(constraints, outputs)[0] == unit
 
 
 def test_write_page_refuses_zero_episodes(tmp_path):
-    shown = EpisodeSpec(
+    spec = EpisodeSpec(
         "NarrowPassage", {}, lambda env: BaselinePolicy(uniform_random, env), "uniform_random", "uniform_random"
     )
     with pytest.raises(InputError, match="at least one episode"):
-        write_page(tmp_path / "replay.html", shown, episodes=0)
+        write_page(tmp_path / "replay.html", spec, episodes=0)
 
 
 @pytest.mark.parametrize("name", ["policy.safetensors", "."])
-def test_write_page_refuses_another_ending_before_it_runs(name, tmp_path):
+def test_write_page_refuses_an_ending_before_the_episodes(name, tmp_path):
     (tmp_path / "policy.safetensors").write_text("weights")
-    shown = EpisodeSpec(
+    spec = EpisodeSpec(
         "NarrowPassage", {}, lambda env: pytest.fail("an episode is run"), "uniform_random", "uniform_random"
     )
     with pytest.raises(InputError, match="a page is"):
-        write_page(tmp_path / name, shown)
+        write_page(tmp_path / name, spec)
     assert (tmp_path / "policy.safetensors").read_text() == "weights"

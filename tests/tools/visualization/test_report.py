@@ -1,3 +1,5 @@
+"""Reports of runs and studies: tables, intervals, commands, figures and refused inputs."""
+
 import html
 import itertools
 import math
@@ -31,92 +33,91 @@ SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient
 
 
 @pytest.fixture(scope="module")
-def studied(tmp_path_factory):
-    """Two methods, two seeds, and the table that a study of them leaves."""
+def study_folder(tmp_path_factory):
+    """Return a folder with the runs of two methods with two seeds, and the table of a study."""
     folder = tmp_path_factory.mktemp("beads")
     for guidance in ("skgrl", "kmp"):
         for seed in (1, 2):
             config = configure("Bead", {"guidance": guidance}, settings=SETTINGS, episodes=3, seed=seed)
             run_training(RunFolder(folder / f"{guidance}-{seed}"), config)
     rows = [("learner", "learned", seed, 3, 10, rate) for seed, rate in ((1, 0.9), (2, 0.7))]
-    rows.append(("nothing", "zero", 1, 0, 10, 0.1))
+    rows.append(("no action", "zero", 1, 0, 10, 0.1))
     table = pd.DataFrame(rows, columns=["method", "policy", "seed", "after_episodes", "episodes", "success_rate"])
     write_table(folder / "beads", table.assign(eval_set="held out"))
     return folder
 
 
 def text_of(page):
+    """Return the text of an HTML page without figures and styles."""
     return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
 
 
-def test_report_of_a_study_is_one_self_contained_page(studied, tmp_path):
-    page = write_report([studied], tmp_path / "report.html").read_text()
+def test_report_of_a_study_is_one_self_contained_page(study_folder, tmp_path):
+    page = write_report([study_folder], tmp_path / "report.html").read_text()
     assert page.count("<svg") >= 4
-    assert write_report([studied], tmp_path / "again.html").read_text() == page
-    outside = re.findall(r"(?:src|href)=\"(?!#)[^\"]*\"", page)
-    assert outside == []
+    assert write_report([study_folder], tmp_path / "again.html").read_text() == page
+    assert re.findall(r"(?:src|href)=\"(?!#)[^\"]*\"", page) == []
     assert "<script" not in page
     text = text_of(page)
     assert "sKGRL" in text
-    assert "16/20 80.0%" in text, "successes of all seeds together"
-    assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "and of each"
-    assert "58.4%" not in text, "of all together there is no interval: their episodes are not independent"
-    assert "nothing: zero" in text
+    assert "16/20 80.0%" in text, "successes of all seeds"
+    assert "9/10 (59.6% to 98.2%), 7/10 (39.7% to 89.2%)" in text, "successes and interval of each seed"
+    assert "58.4%" not in text, "no interval of all seeds, because the episodes of a seed are not independent"
+    assert "no action: zero" in text
     assert "Differs from the thesis in" not in text
     assert "guiderail study beads.yaml --out studies" in text
-    assert RunFolder(studied / "kmp-1").config().versions["drake"] in text
+    assert RunFolder(study_folder / "kmp-1").config().versions["drake"] in text
 
 
-def test_report_states_differences_when_asked(studied, tmp_path):
+def test_report_states_differences_when_asked(study_folder, tmp_path):
     page = tmp_path / "report.html"
-    write_report([studied], page, describe_differences=lambda config: ["the task", config.environment["guidance"]])
+    write_report([study_folder], page, describe_differences=lambda config: ["the task", config.environment["guidance"]])
     assert "Differs from the thesis in the task" in text_of(page.read_text())
     assert "demonstration alone also in kmp" in text_of(page.read_text())
 
 
-def test_methods_are_named_after_differing_settings(studied):
-    data = gather([studied / "skgrl-1", studied / "kmp-1"])
+def test_methods_are_named_after_differing_settings(study_folder):
+    data = gather([study_folder / "skgrl-1", study_folder / "kmp-1"])
     assert [run.method for run in data.runs] == ["sKGRL", "demonstration alone"]
     assert not data.is_study
     assert len(data.held_out) == 0
-    second = gather([studied / "skgrl-1", studied / "skgrl-2"])
+    second = gather([study_folder / "skgrl-1", study_folder / "skgrl-2"])
     assert {run.method for run in second.runs} == {"sKGRL"}
     assert [len(runs) for runs in second.methods("Bead").values()] == [2]
 
 
-def test_report_evaluates_a_run_and_baselines_once(studied):
-    run = studied / "skgrl-1"
-    judged = gather([run], episodes=2).held_out
-    assert set(judged["policy"]) == {"learned", "demonstration", "uniform_random", "constant"}
-    assert judged["episodes"].eq(2).all()
+def test_report_evaluates_a_run_and_baselines_once(study_folder):
+    run = study_folder / "skgrl-1"
+    held_out = gather([run], episodes=2).held_out
+    assert set(held_out["policy"]) == {"learned", "demonstration", "uniform_random", "constant"}
+    assert held_out["episodes"].eq(2).all()
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     gather([run], episodes=2)
     assert before == {path: path.stat().st_mtime_ns for path in run.rglob("*")}
 
 
-def test_report_uses_episodes_of_the_runs_own_environment(studied, tmp_path):
-    run = shutil.copytree(studied / "skgrl-2", tmp_path / "run")
-    others = {"uniform_random": partial(BaselinePolicy, uniform_random)}
-    evaluate(run, episodes=4, environment={"wall": -0.5}, baselines=others)
-    evaluate(run, episodes=4, seed=7, baselines=others)
+def test_report_ignores_evaluations_of_other_conditions(study_folder, tmp_path):
+    run = shutil.copytree(study_folder / "skgrl-2", tmp_path / "run")
+    baselines = {"uniform_random": partial(BaselinePolicy, uniform_random)}
+    evaluate(run, episodes=4, environment={"wall": -0.5}, baselines=baselines)
+    evaluate(run, episodes=4, seed=7, baselines=baselines)
     assert len(gather([run]).held_out) == 0
-    evaluate(run, episodes=2, baselines=others)
-    judged = gather([run]).held_out
-    assert judged[["policy", "episodes"]].to_numpy().tolist() == [
+    evaluate(run, episodes=2, baselines=baselines)
+    held_out = gather([run]).held_out
+    assert held_out[["policy", "episodes"]].to_numpy().tolist() == [
         ["demonstration", 2],
         ["uniform_random", 2],
         ["learned", 2],
     ]
 
 
-def test_rows_of_a_partial_study_are_counted_once(studied, tmp_path):
+def test_rows_of_a_partial_study_are_counted_once(study_folder, tmp_path):
     folder = tmp_path / "tables"
     folder.mkdir()
-    shutil.copy(studied / "beads.csv", folder)
-    rows = read_table(studied / "beads.csv")
-    part = rows.iloc[[0]]
-    more = part.assign(seed=5, success_rate=0.2)
-    write_table(folder / "beads-learner-1-5", pd.concat([part, more]))
+    shutil.copy(study_folder / "beads.csv", folder)
+    rows = read_table(study_folder / "beads.csv")
+    row = rows.iloc[[0]]
+    write_table(folder / "beads-learner-1-5", pd.concat([row, row.assign(seed=5, success_rate=0.2)]))
     page = write_report([folder], tmp_path / "page.html").read_text()
     text = text_of(page)
     assert "beads: learner 3 held out 16/20" in text
@@ -141,8 +142,8 @@ def test_rows_of_a_partial_study_are_counted_once(studied, tmp_path):
         ("success_rate", -0.1, "not 10 and -0.1"),
     ],
 )
-def test_damaged_table_of_a_study_is_refused(name, value, message, studied, tmp_path):
-    rows = read_table(studied / "beads.csv").astype({name: object})
+def test_study_table_is_refused_when_damaged(name, value, message, study_folder, tmp_path):
+    rows = read_table(study_folder / "beads.csv").astype({name: object})
     rows.loc[0, name] = value
     write_table(tmp_path / "beads", rows)
     with pytest.raises(InputError, match=message):
@@ -150,41 +151,41 @@ def test_damaged_table_of_a_study_is_refused(name, value, message, studied, tmp_
 
 
 @pytest.mark.parametrize("text", [b"a,b\n1\n", b"", b"\xff\n", b'a,"b\n', b"a,a\n1,2\n"])
-def test_other_files_in_the_folder_of_a_study_are_left_alone(text, studied, tmp_path):
-    shutil.copy(studied / "beads.csv", tmp_path)
+def test_report_ignores_other_files_in_a_study_folder(text, study_folder, tmp_path):
+    shutil.copy(study_folder / "beads.csv", tmp_path)
     (tmp_path / "other.csv").write_bytes(text)
     assert "16/20" in write_report([tmp_path], tmp_path / "page.html").read_text()
-    table = (studied / "beads.csv").read_text()
+    table = (study_folder / "beads.csv").read_text()
     (tmp_path / "beads.csv").write_text(table + "1,2\n")
     with pytest.raises(InputError, match=r"beads\.csv is not a table of episodes: restore it"):
         gather([tmp_path])
 
 
-def test_report_of_nothing_is_refused():
+def test_report_is_refused_without_folders():
     with pytest.raises(InputError, match="at least one run or study"):
         gather([])
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "arguments"),
     [
         ('{"file": "my studies/first.yaml", "imports": true}', "'my studies/first.yaml' --trust-imports"),
         ('{"file": "first.yaml", "imports": false}', "first.yaml"),
         ("[1]", "beads.yaml"),
     ],
 )
-def test_command_of_a_study_names_its_file(content, words, studied, tmp_path):
-    shutil.copy(studied / "beads.csv", tmp_path)
+def test_command_of_a_study_names_its_file(content, arguments, study_folder, tmp_path):
+    shutil.copy(study_folder / "beads.csv", tmp_path)
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "beads.json").write_text(content)
     text = html.unescape(text_of(write_report([tmp_path], tmp_path / "page.html").read_text()))
-    assert f"guiderail study {words} --out studies" in text
+    assert f"guiderail study {arguments} --out studies" in text
 
 
-def test_study_named_like_another_one_is_whole(studied, tmp_path):
+def test_studies_with_similar_names_are_separate(study_folder, tmp_path):
     folder = tmp_path / "tables"
     folder.mkdir()
-    rows = read_table(studied / "beads.csv")
+    rows = read_table(study_folder / "beads.csv")
     for name in ("beads", "beads-hard", "beads-3"):
         write_table(folder / name, rows)
     text = text_of(write_report([folder], tmp_path / "page.html").read_text())
@@ -193,34 +194,34 @@ def test_study_named_like_another_one_is_whole(studied, tmp_path):
         assert f"guiderail study {name}.yaml --out studies" in text
 
 
-def test_own_seeds_of_a_method_are_not_in_the_name(studied, tmp_path):
+def test_partial_study_is_omitted_when_its_rows_are_known(study_folder, tmp_path):
     folder = tmp_path / "tables"
     folder.mkdir()
-    shutil.copy(studied / "beads.csv", folder)
-    rows = read_table(studied / "beads.csv")
-    write_table(folder / "beads-2", rows.iloc[1:])  # the method "nothing" has the seed 1
+    shutil.copy(study_folder / "beads.csv", folder)
+    rows = read_table(study_folder / "beads.csv")
+    write_table(folder / "beads-2", rows.iloc[1:])  # of `--seeds 2`; the method "no action" declares the seed 1
     text = text_of(write_report([folder], tmp_path / "page.html").read_text())
     assert "beads-2" not in text
 
 
-def test_runs_with_one_folder_name_get_different_ones(studied, tmp_path):
+def test_runs_with_equal_folder_names_are_numbered(study_folder, tmp_path):
     for name in ("a", "b"):
-        shutil.copytree(studied / "skgrl-1", tmp_path / name / "same")
+        shutil.copytree(study_folder / "skgrl-1", tmp_path / name / "same")
     text = text_of(write_report([tmp_path / "a/same", tmp_path / "b/same"], tmp_path / "page.html").read_text())
     assert "--out runs/same-1" in text
     assert "--out runs/same-2" in text
 
 
-def test_report_checks_its_page_before_it_evaluates(studied, tmp_path):
+def test_report_checks_its_path_before_the_evaluation(study_folder, tmp_path):
     (tmp_path / "file").touch()
-    before = sorted(studied.rglob("*"))
+    before = sorted(study_folder.rglob("*"))
     with pytest.raises(InputError, match="cannot be written"):
-        write_report([studied / "skgrl-1"], tmp_path / "file" / "page.html", episodes=5)
-    assert sorted(studied.rglob("*")) == before
+        write_report([study_folder / "skgrl-1"], tmp_path / "file" / "page.html", episodes=5)
+    assert sorted(study_folder.rglob("*")) == before
 
 
-def test_report_leaves_out_the_figure_of_a_missing_column(studied, tmp_path):
-    run = shutil.copytree(studied / "skgrl-1", tmp_path / "run")
+def test_report_leaves_out_the_figure_of_a_missing_column(study_folder, tmp_path):
+    run = shutil.copytree(study_folder / "skgrl-1", tmp_path / "run")
     table = pd.read_csv(run / "episodes.csv")
     table.drop(columns="mean_squared_force").to_csv(run / "episodes.csv", index=False)
     assert "success rate over" in write_report([run], tmp_path / "page.html").read_text()
@@ -229,11 +230,11 @@ def test_report_leaves_out_the_figure_of_a_missing_column(studied, tmp_path):
         write_report([run], tmp_path / "page.html")
     with pytest.raises(InputError, match="no max_commanded_violation; train again"):
         plot_run(run)
-    table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # a column of words, as a robot's run has
+    table.assign(fault="NONE").to_csv(run / "episodes.csv", index=False)  # text, as in a run on hardware
     assert plot_run(run).is_file()
 
 
-def test_description_of_a_figure_is_escaped():
+def test_description_of_a_figure_is_escaped_in_xml():
     figure, _ = new_figure(1, 1, (1.0, 1.0))
     element = ElementTree.fromstring(_svg(figure, 'success of "my" <task> & more'))
     assert element.attrib["aria-label"] == 'success of "my" <task> & more'
@@ -260,22 +261,22 @@ def test_safety_is_counted_in_control_steps_with_a_step_log(tmp_path):
 
 def test_command_of_a_run_reproduces_its_configuration(bead_config):
     config = replace(bead_config, step_log=False)
-    words = shlex.split(command(config, "runs/bead"))
-    assert words[:3] == ["guiderail", "train", "Bead"]
-    assert words[-3:] == ["--no-step-log", "--out", "runs/bead"]
-    arguments = dict(word.split("=") for before, word in itertools.pairwise(words) if before == "--set")
-    option = dict(zip(words[3:-3:2], words[4:-3:2], strict=True))
+    arguments = shlex.split(command(config, "runs/bead"))
+    assert arguments[:3] == ["guiderail", "train", "Bead"]
+    assert arguments[-3:] == ["--no-step-log", "--out", "runs/bead"]
+    settings = dict(value.split("=") for name, value in itertools.pairwise(arguments) if name == "--set")
+    option = dict(zip(arguments[3:-3:2], arguments[4:-3:2], strict=True))
     second = configure(
         "Bead", {"guidance": option["--guidance"]}, algorithm=option["--algorithm"], preset=option["--preset"],
-        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=arguments, step_log=False,
+        episodes=int(option["--episodes"]), seed=int(option["--seed"]), settings=settings, step_log=False,
     )  # fmt: skip
     assert second == config
-    corrected = replace(config, human_in_the_loop=True)
-    assert "--human-in-the-loop" in shlex.split(command(corrected, "runs/bead"))
+    with_human = replace(config, human_in_the_loop=True)
+    assert "--human-in-the-loop" in shlex.split(command(with_human, "runs/bead"))
 
 
 @pytest.mark.parametrize("name", ["report.pdf", "report"])
-def test_report_refuses_another_ending_before_it_reads(name, tmp_path):
+def test_report_refuses_an_ending_before_reading(name, tmp_path):
     with pytest.raises(InputError, match=r"a page is .html"):
         write_report([tmp_path / "missing"], tmp_path / name)
 
@@ -285,16 +286,16 @@ def test_report_refuses_a_folder_without_runs(tmp_path):
         write_report([tmp_path], tmp_path / "report.html")
 
 
-def test_report_evaluates_a_run_next_to_a_study(studied, tmp_path):
+def test_report_evaluates_a_run_next_to_a_study(study_folder, tmp_path):
     run = tmp_path / "alone"
     run_training(RunFolder(run), configure("Bead", {}, settings=SETTINGS, episodes=2, seed=9))
-    judged = gather([run, studied], episodes=2).held_out
-    assert set(judged["seed"]) == {1, 2, 9}
-    assert judged[(judged["seed"] == 9) & (judged["policy"] == "learned")]["episodes"].tolist() == [2]
+    held_out = gather([run, study_folder], episodes=2).held_out
+    assert set(held_out["seed"]) == {1, 2, 9}
+    assert held_out[(held_out["seed"] == 9) & (held_out["policy"] == "learned")]["episodes"].tolist() == [2]
 
 
 @pytest.mark.parametrize("values", [[0.1, math.nan], [math.nan, 0.1]])
-def test_violation_that_is_not_a_number_is_shown_in_any_order(values):
+def test_violation_is_shown_as_not_finite_when_nan(values):
     runs = [
         dict.fromkeys(SAFETY_COLUMNS, 0.0) | {"episodes": 1, "steps": 1, "max_commanded_violation": value}
         for value in values
@@ -303,17 +304,17 @@ def test_violation_that_is_not_a_number_is_shown_in_any_order(values):
     assert "not finite" in [cell.text for cell in row.cells]
 
 
-def test_seeds_with_runs_of_their_own_to_start_from_are_one_method(studied, tmp_path):
+def test_seeds_with_separate_initial_runs_are_one_method(study_folder, tmp_path):
     for seed, source in ((1, "coarse-1"), (2, "coarse-2"), (1, "other"), (2, "other")):
-        run = shutil.copytree(studied / f"skgrl-{seed}", tmp_path / f"{source.partition('-')[0]}-fine-{seed}")
+        run = shutil.copytree(study_folder / f"skgrl-{seed}", tmp_path / f"{source.partition('-')[0]}-fine-{seed}")
         config = RunFolder(run).config()
         RunFolder(run).write_config(replace(config, learner=replace(config.learner, init_from=str(tmp_path / source))))
     methods = [run.method for run in gather([tmp_path]).runs]
     assert methods == ["init from coarse-{seed}"] * 2 + ["init from other"] * 2
 
 
-def test_report_refuses_a_table_that_lost_rows(studied, tmp_path):
-    table = shutil.copytree(studied / "skgrl-1", tmp_path / "run") / "episodes.csv"
+def test_report_refuses_a_table_with_missing_rows(study_folder, tmp_path):
+    table = shutil.copytree(study_folder / "skgrl-1", tmp_path / "run") / "episodes.csv"
     table.write_text("".join(table.read_text().splitlines(keepends=True)[:-1]))
     with pytest.raises(InputError, match=f"{table} has 2 of the 3 episodes of its checkpoint: resume the run"):
         gather([tmp_path])

@@ -1,20 +1,22 @@
+"""Legends and curves of figures."""
+
 import numpy as np
 
 from guiderail.tools.visualization.style import draw_runs, legend_above, new_figure
 
 
-def test_legend_above_covers_no_data():
+def test_legend_is_above_the_data():
     figure, axes = new_figure(1, 1, (4.0, 3.0))
     axis = axes[0, 0]
-    axis.plot([0.0, 1.0], [0.0, 1.0], label="up")
-    axis.plot([0.0, 1.0], [1.0, 0.0], label="down")
+    axis.plot([0.0, 1.0], [0.0, 1.0], label="rising")
+    axis.plot([0.0, 1.0], [1.0, 0.0], label="falling")
     legend_above(axis)
     figure.canvas.draw()
     legend, data = axis.get_legend().get_window_extent(), axis.get_window_extent()
     assert legend.y0 >= data.y1 - 3.0  # [pixel]
 
 
-def test_draw_runs_draws_the_mean_and_a_band_of_several_runs():
+def test_draw_runs_draws_the_mean_and_a_band_of_runs():
     _, axes = new_figure(1, 2, (4.0, 3.0))
     runs = [np.array([0.0, 2.0, 4.0]), np.array([2.0, 2.0])]
     draw_runs(axes[0, 0], runs, color="C0", label="two", window=1)

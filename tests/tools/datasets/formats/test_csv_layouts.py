@@ -1,4 +1,4 @@
-"""Tests of CSV layouts: columns have the units of their names, and invalid tables are refused."""
+"""CSV recordings: units in the names of columns, delimiters, and refused tables."""
 
 import numpy as np
 import pytest
@@ -10,6 +10,7 @@ CLOCK = 0.01 * np.arange(4)
 
 
 def write(path, header, *row, clock=CLOCK):
+    """Write a table with `row` at every time of `clock`; return its path."""
     path.write_text("\n".join([header, *(",".join(map(str, (t, *row))) for t in clock)]) + "\n")
     return path
 
@@ -20,7 +21,7 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("header", "given", "scales"),
+    ("header", "unit", "scales"),
     [
         ("t,x_mm,y_mm,z_m", None, (1e-3, 1e-3, 1)),
         ("t,x [cm],y (mm),z_m", None, (1e-2, 1e-3, 1)),
@@ -29,8 +30,8 @@ def file(tmp_path):
         ("t,x_mm,y,z", "mm", (1e-3, 1e-3, 1e-3)),
     ],
 )
-def test_positions_have_the_unit_of_their_column(header, given, scales, file):
-    result = read_csv_files(write(file, header, 9, 8, 7), unit=given)
+def test_positions_have_the_unit_of_their_column(header, unit, scales, file):
+    result = read_csv_files(write(file, header, 9, 8, 7), unit=unit)
     np.testing.assert_allclose(result.outputs[0][0], np.array([9, 8, 7]) * scales)
 
 
@@ -41,7 +42,7 @@ def test_angles_have_the_unit_of_their_column(file):
 
 
 @pytest.mark.parametrize(
-    ("header", "given"),
+    ("header", "options"),
     [
         ("t,x_mm,y_mm,z_mm", {"unit": "m"}),
         ("t,x_mm,y_mm,z_m", {"unit": "m"}),
@@ -50,27 +51,27 @@ def test_angles_have_the_unit_of_their_column(file):
         ("t,x_m,y_m,z_m,roll_rad,pitch_deg,yaw_rad", {"angles": "rad"}),
     ],
 )
-def test_unit_that_contradicts_a_column_is_refused(header, given, file):
+def test_unit_is_refused_when_a_column_contradicts(header, options, file):
     write(file, header, *range(header.count(",")))
-    with pytest.raises(InputError, match=f"which contradicts --.* {next(iter(given.values()))}: leave --.* out"):
-        read_csv_files(file, **given)
+    with pytest.raises(InputError, match=f"which contradicts --.* {next(iter(options.values()))}: leave --.* out"):
+        read_csv_files(file, **options)
 
 
 @pytest.mark.parametrize("option", ["unit", "time_unit", "angles"])
-def test_unknown_unit_is_refused(option, file):
+def test_unit_is_refused_when_unknown(option, file):
     write(file, "t,x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad", *range(6))
     with pytest.raises(InputError, match="is one of"):
         read_csv_files(file, **{option: "furlong"})
 
 
-def test_unit_of_one_column_does_not_hold_for_others(file):
+def test_unit_of_a_column_is_not_used_for_other_columns(file):
     with pytest.raises(InputError, match="unit of y and z"):
         read_csv_files(write(file, "t,x_mm,y,z", 1, 2, 3))
 
 
 def test_byte_order_mark_is_not_part_of_the_first_name(file):
     text = write(file, "t,x_m,y_m,z_m", 1, 2, 3).read_text()
-    file.write_text(text, encoding="utf-8-sig")  # as Excel writes
+    file.write_text(text, encoding="utf-8-sig")  # the encoding of Excel
     np.testing.assert_allclose(read_csv_files(file).times[0], CLOCK)
 
 
@@ -82,20 +83,21 @@ def test_byte_order_mark_is_not_part_of_the_first_name(file):
         ("t,x_m,y_m,z_m\n0,1,2,3\n", "fewer than two lines"),
     ],
 )
-def test_table_without_two_samples_is_refused(text, message, file):
+def test_table_is_refused_with_fewer_than_two_samples(text, message, file):
     file.write_text(text)
     with pytest.raises(InputError, match=message):
         read_csv_files(file, time_unit="s")
 
 
-def test_quaternion_with_nan_is_refused(file):
-    write(file, "t,x_m,y_m,z_m,qx,qy,qz,qw", 0, 0, 0, 0, 0, 0, "nan")
-    with pytest.raises(InputError, match=r"length nan at sample 0.*cut such samples out"):
+@pytest.mark.parametrize("length", ["nan", 3])
+def test_quaternion_is_refused_when_its_length_is_not_one(length, file):
+    write(file, "t,x_m,y_m,z_m,qx,qy,qz,qw", 0, 0, 0, 0, 0, 0, length)
+    with pytest.raises(InputError, match=rf"length {length} at sample 0.*cut such samples out"):
         read_csv_files(file)
 
 
 @pytest.mark.parametrize("number", ["1_0", "\u0661", "\uff11"])
-def test_number_that_only_python_reads_is_refused(number, file):
+def test_number_is_refused_when_valid_only_in_python(number, file):
     with pytest.raises(InputError, match="not a table of numbers"):
         read_csv_files(write(file, "t,x_m,y_m,z_m", 0, number, 2))
 
@@ -110,21 +112,21 @@ def test_hidden_file_in_a_folder_is_not_read(file):
 
 
 @pytest.mark.parametrize("row", ["0,0,0,3,5", "0,0,0,3,", "0,0,0"])
-def test_line_with_another_number_of_fields_is_refused(row, file):
+def test_line_is_refused_when_its_number_of_fields_differs(row, file):
     file.write_text(f"t,x,y,z\n{row}\n" + 3 * "0.1,1,2,3\n")
     with pytest.raises(InputError, match=f"line 2 has {row.count(',') + 1} fields, the header has 4"):
         read_csv_files(file, unit="m")
 
 
-@pytest.mark.parametrize("between", [",", ", ", ";", "\t", " "])
-def test_common_delimiters_are_detected(between, file):
-    lines = [("t", "x_m", "y_m", "z_m", "note"), *((0.1 * n, 1, 2, 3, 4 if between == " " else "") for n in range(3))]
-    file.write_text("\n\n".join(between.join(map(str, line)) for line in lines))
+@pytest.mark.parametrize("delimiter", [",", ", ", ";", "\t", " "])
+def test_delimiter_is_detected(delimiter, file):
+    lines = [("t", "x_m", "y_m", "z_m", "note"), *((0.1 * n, 1, 2, 3, 4 if delimiter == " " else "") for n in range(3))]
+    file.write_text("\n\n".join(delimiter.join(map(str, line)) for line in lines))
     np.testing.assert_array_equal(read_csv_files(file).outputs[0], [[1, 2, 3]] * 3)
 
 
 @pytest.mark.parametrize(
-    ("header", "named"),
+    ("header", "names"),
     [
         ("t,x [m],y [m],z [m],x [mm]", r"x \[m\] and x \[mm\], and does not state which of them is x"),
         ("t,x (cmd) [m],y [m],z [m],x [m]", r"x \(cmd\) \[m\] and x \[m\]"),
@@ -137,14 +139,14 @@ def test_common_delimiters_are_detected(between, file):
         ("t,x_m,y_m,z_m,force,force", "force and force"),
     ],
 )
-def test_ambiguous_columns_are_both_named(header, named, file):
+def test_ambiguous_columns_are_named_in_the_message(header, names, file):
     write(file, header, *range(header.count(",")))
-    with pytest.raises(InputError, match=named):
+    with pytest.raises(InputError, match=names):
         read_csv_files(file)
 
 
 @pytest.mark.parametrize(
-    ("header", "given", "refused"),
+    ("header", "options", "message"),
     [
         ("time [min],x_m,y_m,z_m", {}, r"time \[min\], whose unit is not one of s, ms, us, ns"),
         ("t,x [in],y [in],z [in]", {}, r"x \[in\], whose unit is not one of m, cm, mm"),
@@ -153,16 +155,16 @@ def test_ambiguous_columns_are_both_named(header, named, file):
         ("t,x_m,y_m,z_m,roll [gon],pitch [deg],yaw [deg]", {}, r"roll \[gon\], whose unit is not one of deg, rad"),
     ],
 )
-def test_unknown_unit_in_a_name_is_refused(header, given, refused, file):
+def test_unknown_unit_in_a_column_name_is_refused(header, options, message, file):
     write(file, header, *range(header.count(",")))
-    with pytest.raises(InputError, match=refused):
-        read_csv_files(file, **given)
+    with pytest.raises(InputError, match=message):
+        read_csv_files(file, **options)
 
 
 @pytest.mark.parametrize(
     ("unit", "scale"), [("µs", 1e-6), ("\u03bcs", 1e-6), ("us", 1e-6), ("sec", 1), ("Seconds", 1), ("MS", 1e-3)]
 )
-def test_spellings_of_units_are_recognized(unit, scale, file):
+def test_spelling_of_a_unit_is_recognized(unit, scale, file):
     write(file, f"t [{unit}],x [meters],y (M),Z [m] (raw)", 1, 2, 3)
     result = read_csv_files(file)
     np.testing.assert_allclose(result.times[0], CLOCK * scale)
@@ -170,7 +172,7 @@ def test_spellings_of_units_are_recognized(unit, scale, file):
 
 
 @pytest.mark.parametrize("option", ["unit", "time_unit", "quaternion", "angles"])
-def test_unused_option_is_validated_too(option, file):
+def test_option_is_validated_when_unused(option, file):
     write(file, "t [s],x_m,y_m,z_m", 1, 2, 3)
     with pytest.raises(InputError, match=rf"--{option.replace('_', '-')} is one of .*, not 'foo'"):
         read_csv_files(file, **{option: "foo"})
@@ -178,8 +180,8 @@ def test_unused_option_is_validated_too(option, file):
 
 @pytest.mark.parametrize("header", ["t,x_m,y_m,z_m", "t [s],x_m,y_m,z_m"])
 def test_time_that_does_not_increase_is_refused(header, file):
-    for clock, words in ((-CLOCK, "decreases at sample 1"), (0 * CLOCK, "does not increase")):
-        with pytest.raises(InputError, match=f"the time column {header.split(',')[0][0]}.*{words}"):
+    for clock, message in ((-CLOCK, "decreases at sample 1"), (0 * CLOCK, "does not increase")):
+        with pytest.raises(InputError, match=f"the time column {header.split(',')[0][0]}.*{message}"):
             read_csv_files(write(file, header, 1, 2, 3, clock=clock))
 
 
@@ -190,14 +192,14 @@ def test_duplicated_samples_do_not_change_the_time_unit(file):
 
 @pytest.mark.parametrize("prefix", ["v.", "vel_", "tcp_velocity_", "twist.linear.", "wrench.force."])
 def test_velocity_and_force_columns_are_not_positions(prefix, file):
-    others = ",".join(prefix + axis for axis in "xyz")
-    result = read_csv_files(write(file, f"t,pos_x_mm,pos_y_mm,pos_z_mm,{others}", 1, 2, 3, 4, 5, 6))
+    columns = ",".join(prefix + axis for axis in "xyz")
+    result = read_csv_files(write(file, f"t,pos_x_mm,pos_y_mm,pos_z_mm,{columns}", 1, 2, 3, 4, 5, 6))
     np.testing.assert_allclose(result.outputs[0][0], [1e-3, 2e-3, 3e-3])
     with pytest.raises(InputError, match="no columns x, y and z"):
-        read_csv_files(write(file, f"t,{others}", 4, 5, 6), unit="m")
+        read_csv_files(write(file, f"t,{columns}", 4, 5, 6), unit="m")
 
 
-def test_unused_columns_are_listed(file):
+def test_unused_columns_are_listed_as_left_out(file):
     result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,rx,ry,rz", *range(6)))
     assert result.assumptions == ["there is no orientation", "rx, ry and rz are left out"]
     many = ",".join(f"f{n}" for n in range(20))

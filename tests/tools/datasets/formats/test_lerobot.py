@@ -1,4 +1,4 @@
-"""A dataset whose description makes no sense is refused in a sentence, and one that is written says what it leaves."""
+"""LeRobot datasets: refused descriptions and data, and notes and refusals of the export."""
 
 import json
 
@@ -21,7 +21,7 @@ def dataset(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
+    ("changes", "message"),
     [
         ({"features": {"action": "x"}}, "info.json is missing or damaged"),
         ({"features": {"action": {"dtype": "float32", "shape": 1}}}, "info.json is missing or damaged"),
@@ -32,10 +32,10 @@ def dataset(tmp_path):
         ({"fps": float("nan")}, "nan frames a second"),
     ],
 )
-def test_invalid_description_is_refused(changed, words, dataset):
+def test_dataset_is_refused_when_its_description_is_invalid(changes, message, dataset):
     info = json.loads((dataset / INFO).read_text())
-    (dataset / INFO).write_text(json.dumps(info | changed))
-    with pytest.raises(InputError, match=words):
+    (dataset / INFO).write_text(json.dumps(info | changes))
+    with pytest.raises(InputError, match=message):
         read_lerobot(dataset, "action")
 
 
@@ -45,13 +45,13 @@ def test_hidden_file_next_to_the_data_is_not_read(dataset):
     assert len(read_lerobot(dataset, "action").times) == 1
 
 
-def test_dataset_with_too_many_rows_is_refused(dataset, monkeypatch):
+def test_dataset_is_refused_with_too_many_rows(dataset, monkeypatch):
     monkeypatch.setattr("guiderail.tools.datasets.formats.lerobot.MAX_LINES", len(CLOCK) - 1)
     with pytest.raises(InputError, match=f"more than {len(CLOCK) - 1} rows"):
         read_lerobot(dataset, "action")
 
 
-def test_data_that_pyarrow_cannot_read_is_refused(dataset, monkeypatch):
+def test_dataset_is_refused_when_pyarrow_cannot_read_it(dataset, monkeypatch):
     def fail(*_, **__):
         raise pyarrow.ArrowNotImplementedError("Support for codec 'lzo' not built")
 
@@ -60,7 +60,7 @@ def test_data_that_pyarrow_cannot_read_is_refused(dataset, monkeypatch):
         read_lerobot(dataset, "action")
 
 
-def test_lerobot_export_states_a_shifted_start(dataset, tmp_path):
+def test_lerobot_export_notes_a_shifted_start(dataset, tmp_path):
     notes = write_lerobot(tmp_path / "later", Demonstrations([CLOCK - 0.2], [CLOCK[:, None]]))
     assert "first samples were at -0.2 s" in notes[-1]
     np.testing.assert_allclose(read_lerobot(tmp_path / "later", "action").times[0], CLOCK)

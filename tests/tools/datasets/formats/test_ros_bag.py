@@ -1,4 +1,4 @@
-"""Tests of ROS 2 bags: joints are read by name, and messages without a motion are refused."""
+"""ROS 2 bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
 
 import numpy as np
 import pytest
@@ -13,26 +13,29 @@ POSE = "geometry_msgs/msg/Pose"
 ARRAY = "std_msgs/msg/Float64MultiArray"
 
 
-def write(path, kind, make, given):
-    """A bag of a message for each of what is given, of which `make` makes it with the types by their short names."""
+def write(path, kind, make, values):
+    """Write a bag with a message for each of `values`; return its path.
+
+    `make` returns a message from the message types by short name and a value.
+    """
     from rosbags.rosbag2 import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
-    types = {name.split("/")[-1]: one for name, one in store.types.items()}
+    types = {name.split("/")[-1]: message_type for name, message_type in store.types.items()}
     with Writer(path, version=8) as writer:
-        connection = writer.add_connection("/it", kind, typestore=store)
-        for n, one in enumerate(given):
-            writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, one), kind))
+        connection = writer.add_connection("/topic", kind, typestore=store)
+        for n, value in enumerate(values):
+            writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, value), kind))
     return path
 
 
 def joints(types, values):
     names, positions = values
     header = types["Header"](stamp=types["Time"](sec=0, nanosec=0), frame_id="")
-    none = np.array([])
+    empty = np.array([])
     return types["JointState"](
-        header=header, name=list(names), position=np.array(positions, dtype=float), velocity=none, effort=none
+        header=header, name=list(names), position=np.array(positions, dtype=float), velocity=empty, effort=empty
     )
 
 
@@ -69,64 +72,64 @@ def test_joint_order_may_differ_between_bags(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("other", "words"),
+    ("second", "message"),
     [
-        (("g", (5,)), "message 1 on /it of .* has the joints g, and message 0 a, b: record each device"),
+        (("g", (5,)), "message 1 on /topic of .* has the joints g, and message 0 a, b: record each device"),
         (("ag", (1, 5)), "has the joints a, g, and message 0 a, b"),
         (("ab", ()), "has 0 positions for 2 joints"),
     ],
 )
-def test_messages_of_other_joints_are_refused(other, words, tmp_path):
-    bag = write(tmp_path / "bag", JOINTS, joints, [("ab", (1, 2)), other, ("ab", (1, 2))])
-    with pytest.raises(InputError, match=words):
+def test_bag_is_refused_when_the_joints_change(second, message, tmp_path):
+    bag = write(tmp_path / "bag", JOINTS, joints, [("ab", (1, 2)), second, ("ab", (1, 2))])
+    with pytest.raises(InputError, match=message):
         read_bags(bag, None, None)
 
 
-def test_joints_of_one_name_are_refused(tmp_path):
+def test_bag_is_refused_when_two_joints_have_one_name(tmp_path):
     bag = write(tmp_path / "bag", JOINTS, joints, [("aba", (1, 2, 3))] * 2)
-    with pytest.raises(InputError, match=r"message 0 on /it of .* has a joint twice \(a, b, a\)"):
+    with pytest.raises(InputError, match=r"message 0 on /topic of .* has a joint twice \(a, b, a\)"):
         read_bags(bag, None, None)
 
 
-@pytest.mark.parametrize("wrong", [0.0, 0.5, np.nan])
-def test_bag_quaternion_of_wrong_length_is_refused(wrong, tmp_path):
-    bag = write(tmp_path / "bag", POSE, pose, [1.0, wrong, 1.0])
+@pytest.mark.parametrize("length", [0.0, 0.5, np.nan])
+def test_bag_is_refused_when_a_quaternion_has_no_unit_length(length, tmp_path):
+    bag = write(tmp_path / "bag", POSE, pose, [1.0, length, 1.0])
     with pytest.raises(InputError, match=r"at sample 1, .*cut such samples out \(1 of 3\)"):
         read_bags(bag, None, None)
 
 
-def test_arrays_of_other_sizes_are_refused(tmp_path):
+def test_bag_is_refused_when_the_array_size_changes(tmp_path):
     bag = write(tmp_path / "bag", ARRAY, array, [range(6), range(5)])
-    with pytest.raises(InputError, match=r"message 1 on /it .* has 5 numbers instead of 6"):
+    with pytest.raises(InputError, match=r"message 1 on /topic .* has 5 numbers instead of 6"):
         read_bags(bag, None, None)
 
 
-def test_numbers_of_an_array_with_one_dimension_are_counted(tmp_path):
-    def sized(types, label):
+def test_array_outputs_are_named_after_its_dimension(tmp_path):
+    def labeled_array(types, label):
         dimension = types["MultiArrayDimension"](label=label, size=3, stride=3)
         layout = types["MultiArrayLayout"](dim=[dimension], data_offset=0)
         return types["Float64MultiArray"](layout=layout, data=np.arange(3.0))
 
-    result = read_bags(write(tmp_path / "bag", ARRAY, sized, ["force", "force"]), None, None)
+    result = read_bags(write(tmp_path / "bag", ARRAY, labeled_array, ["force", "force"]), None, None)
     assert result.names == ("force 0", "force 1", "force 2")
     np.testing.assert_array_equal(result.outputs[0], [[0, 1, 2]] * 2)
-    unnamed = read_bags(write(tmp_path / "other", ARRAY, sized, ["", ""]), None, None)
+    unnamed = read_bags(write(tmp_path / "unnamed", ARRAY, labeled_array, ["", ""]), None, None)
     assert unnamed.names == ("output 0", "output 1", "output 2")
 
 
-@pytest.mark.parametrize(("kind", "make", "one"), [(ARRAY, array, range(6)), (JOINTS, joints, ("ab", (1, 2)))])
-def test_target_is_refused_without_poses(kind, make, one, tmp_path):
-    with pytest.raises(InputError, match=r"/it of .* does not state which numbers are a pose: leave --target out"):
-        read_bags(write(tmp_path / "bag", kind, make, [one] * 2), None, (0.0,) * 6)
+@pytest.mark.parametrize(("kind", "make", "value"), [(ARRAY, array, range(6)), (JOINTS, joints, ("ab", (1, 2)))])
+def test_target_is_refused_without_poses(kind, make, value, tmp_path):
+    with pytest.raises(InputError, match=r"/topic of .* does not state which numbers are a pose: leave --target out"):
+        read_bags(write(tmp_path / "bag", kind, make, [value] * 2), None, (0.0,) * 6)
 
 
-def test_time_is_that_of_the_recorder_if_messages_have_no_stamps(tmp_path):
+def test_recorder_time_is_used_when_messages_have_no_stamps(tmp_path):
     result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 3), None, None)
     np.testing.assert_allclose(result.times[0], [0.0, 0.01, 0.02])
     assert any("the messages have no stamps that increase" in text for text in result.assumptions)
 
 
-def test_assumption_names_no_frame_of_poses_without_header(tmp_path):
+def test_assumption_names_no_frame_without_a_header(tmp_path):
     result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 2), None, None)
     assert any(text.startswith("poses stay in the frame of the recording: ") for text in result.assumptions)
 
@@ -141,10 +144,10 @@ def test_bag_export_shifts_negative_time(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("times", "words"),
+    ("times", "message"),
     [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")],
 )
-def test_bag_export_refuses_time_out_of_range(times, words, tmp_path):
-    with pytest.raises(InputError, match=words):
+def test_bag_export_refuses_time_out_of_range(times, message, tmp_path):
+    with pytest.raises(InputError, match=message):
         write_mcap(tmp_path / "bags", Demonstrations([np.array(times)], [np.ones((2, 1))]))
     assert list(tmp_path.iterdir()) == []
