@@ -11,7 +11,8 @@ from guiderail.systems.support.declarations import as_count, check_period, input
 class TorquePublisher(LeafSystem):
     """Publish joint torques once per period while ``is_sending`` is 1; otherwise send no message, not even zero torque.
 
-    While ``is_holding`` is 1, `hold` is called once per period instead; if it returns False, ``is_sending`` applies.
+    While ``is_holding`` is 1, `hold` is called once per period instead. If it returns False, torques are published as
+    if ``is_holding`` were 0.
 
     .. pydrake_system::
 

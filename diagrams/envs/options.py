@@ -32,7 +32,7 @@ STANDARD = "standard"
 def check_options_class(owner: str, attribute: str, given: object, kind: type[Options]) -> None:
     """Raise an InputError unless an attribute of a task, a station or a guidance is a subclass of `kind`."""
     if not (isinstance(given, type) and issubclass(given, kind)):
-        raise InputError(f"{attribute} of {owner} must be a class made of {kind.__name__}, not {brief(given)}")
+        raise InputError(f"{attribute} of {owner} must be a subclass of {kind.__name__}, not {brief(given)}")
 
 
 class Options(BaseModel):
@@ -51,7 +51,7 @@ def _split_list(value: Any) -> Any:
 
 
 def _reject_bool(value: Any) -> Any:
-    """Raise a `ValueError` for a bool, which Python would accept as 0 or 1; convert a NumPy number to Python's."""
+    """Convert NumPy numbers to Python numbers; raise a `ValueError` for a bool, which Python would accept as 0 or 1."""
     if isinstance(value, bool | np.bool_):
         raise ValueError("give a number")
     return value.item() if isinstance(value, np.number) else value
@@ -116,11 +116,12 @@ class PrimitiveOptions(Options):
     history_source: Literal["commanded", "measured"] = Field("commanded", description="poses that form the history")
     adaptive_history: bool = Field(False, description="shorten the history during contact")
     gains: Numbers | None = Field(
-        None, description="null-space action per unit of the action, one number per output; default: computed from κ"
+        None,
+        description="null-space action per unit of the policy's action, for each output; default: computed from κ",
     )
     horizon: Integer = Field(40, ge=0, le=200, description="H, number of future points with constraints")
-    lambda_: Number = Field(6.0, ge=0, description="λ of the thesis's problem 4.5")
-    beta: Number = Field(6.0, gt=0, description="β of the thesis's problem 4.5")
+    lambda_: Number = Field(6.0, ge=0, description="λ, regularization in the thesis's problem 4.5")
+    beta: Number = Field(6.0, gt=0, description="β, weight of a null-space action in the thesis's problem 4.5")
     kernel: str = Field(DEFAULT_KERNEL, description="name of a registered kernel k(ζ, ζ')")
     length_scale: Number = Field(
         DEFAULT_LENGTH_SCALE, gt=0, description="ℓ of the kernel [s]; the thesis's l is 1 / (2 ℓ²)"
@@ -145,7 +146,10 @@ class PrimitiveOptions(Options):
         "constraint",
     )
     min_singular_value: Number = Field(
-        0.0, ge=0, le=0.2, description="smallest singular value of the arm's scaled Jacobian [m], with joint_margin"
+        0.0,
+        ge=0,
+        le=0.2,
+        description="smallest singular value of the arm's scaled Jacobian [m]; needs joint_margin",
     )
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: the motion waits for a robot that lags"
@@ -192,10 +196,10 @@ class BasePolicyOptions(Options):
 
     base_policy: str = Field(
         "",
-        description="base policy: folder of a run of the learner chunk, or a registered name; default: the "
-        "demonstrations instead of a base policy",
+        description="base policy: folder of a run of the learner chunk, or a registered name; default: none, and the "
+        "guidance is built from the demonstrations",
     )
-    replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two chunks")
+    replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two predictions of a chunk")
     covariance_floor: Number = Field(
         1.0, gt=0, description="multiple of the demonstrations' covariance that is added to the chunks' variance"
     )
@@ -211,7 +215,7 @@ class BasePolicyOptions(Options):
 
 
 class GuardOptions(BasePolicyOptions):
-    """Options of guidance of the kind `base_policy`, which executes the chunks."""
+    """Options of the guidance `base_policy`, which executes a base policy's chunks."""
 
     guard: Literal["none", "projection", "slowdown"] = Field(
         "projection",
@@ -220,8 +224,8 @@ class GuardOptions(BasePolicyOptions):
     )
     max_jerk: PositiveNumbers = Field(
         (),
-        description="largest jerk of a guarded command, in the form of max_speed; default of max_jerk and "
-        "max_speed: twice the largest value in the demonstrations",
+        description="largest jerk of a command behind the guard, in the form of max_speed; if max_jerk or max_speed "
+        "is not given: twice the largest value in the demonstrations",
     )
 
 
@@ -306,7 +310,7 @@ _NUMBER_ERRORS |= dict.fromkeys(("float_type", "float_parsing"), "number")
 
 
 def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any], subject: str) -> str:
-    """Return an error that pydantic reports as a sentence that names the option and the remedy."""
+    """Convert a pydantic error to a sentence that names the option and the remedy."""
     kind, context = error["type"], error.get("ctx", {})
     if isinstance(context.get("error"), InputError):
         return str(context["error"])
@@ -337,7 +341,7 @@ def _format_error(model: type[BaseModel], error: Any, values: Mapping[str, Any],
 def _locate(
     model: type[BaseModel], location: tuple[int | str, ...], values: Mapping[str, Any]
 ) -> tuple[str, FieldInfo | None, Any]:
-    """Return the path, field and value of the innermost option at the location of an error that pydantic reports.
+    """Return the path, field and value of the innermost option at the location of a pydantic error.
 
     A path is, for example, motion.push. An index into a list of option models is part of the path, as in
     plug.pieces[0].friction; an index into a list of numbers is not. For an error of the whole model, the path is empty
@@ -364,7 +368,7 @@ def _models_of(field: FieldInfo) -> list[type[BaseModel]]:
 
 
 def _example(field: FieldInfo) -> str:
-    """Describe the value of a tuple of numbers by its number of entries and an example; "" for any other field."""
+    """Return the number of entries of a field of numbers as text, with an example; "" for any other field."""
     annotations = repr(field.annotation)
     if "tuple" not in annotations or ("float" not in annotations and "int" not in annotations):
         return ""

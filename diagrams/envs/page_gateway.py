@@ -44,7 +44,7 @@ Controls: TypeAlias = Mapping[str, tuple[float, float] | None]
 _ASSET = re.compile(rb"cas-v1/[0-9a-f]{64}")  # texture or mesh that a frame refers to
 _HEADERS = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "X-Frame-Options": "DENY"}
 _KINDS = {".js": "text/javascript", ".html": "text/html; charset=utf-8"}
-_QUIET = logging.getLogger(__name__)  # refused connections are not logged
+_QUIET = logging.getLogger(__name__)  # logger that omits refused connections
 _QUIET.setLevel(logging.CRITICAL)
 
 
@@ -155,7 +155,7 @@ class Gateway:
     """Server of a page; it is the only client of Meshcat's server.
 
     Args:
-        port: Port of Meshcat's server, which is also the port of the page if it is still free after Meshcat closed it.
+        port: Port of Meshcat's server. After it is closed, the page uses this port, or another one if it is not free.
         token: Secret part of the page's address.
         files: Paths of the page's files by name.
     """

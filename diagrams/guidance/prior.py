@@ -48,7 +48,8 @@ class PrimitiveConfig:
     Attributes:
         reference: Reference trajectory of the demonstrations, in steps of the control period.
         constraints: Linear constraints G y ≥ c on every command y.
-        motion: Further constraints of the commanded motion, enforced on the output of the primitive, if there are any.
+        motion: Constraints of the commanded motion (shapes, speed, acceleration, joints), which are enforced on the
+            primitive's output; None if there are none.
         control_period: Control period [s].
         history: P, number of past outputs that sKGRL's motion passes through.
         history_variance: ρ, variance of the past outputs [output²].
@@ -108,9 +109,9 @@ class PrimitiveConfig:
         if self.action_dims is not None and not self.action_dims:
             raise InputError("a policy must move at least one output: name it in action_dims")
         if len(set(self.action_dims or ())) < len(self.action_dims or ()):
-            raise InputError(f"action_dims names an output twice, {self.action_dims}: each has one action")
+            raise InputError(f"action_dims names an output twice, {self.action_dims}: name each output once")
         if any(not 0 <= o < self.num_outputs for o in self.action_dims or ()):
-            raise InputError(f"action_dims names outputs 0 … {self.num_outputs - 1}, not {self.action_dims}")
+            raise InputError(f"action_dims must be outputs from 0 to {self.num_outputs - 1}, not {self.action_dims}")
 
     @property
     def num_outputs(self) -> int:
@@ -146,7 +147,12 @@ class PrimitiveConfig:
         return replace(self, history=history).primitive(history=True)
 
     def primitive(self, *, history: bool, constrained: bool = True) -> LcNsKmp:
-        """Return the movement primitive: with history for sKGRL, without for KGRL; unconstrained for the mean alone."""
+        """Return the movement primitive.
+
+        Args:
+            history: True for the primitive of sKGRL, False for that of KGRL, which has no history.
+            constrained: Enforce `constraints`; False for a baseline without constraints.
+        """
         return get_shared_primitive(
             self.reference,
             self.constraints if constrained else LinearConstraints.none(self.num_outputs),
@@ -202,7 +208,7 @@ class PlacedTemplate:
 
         check_template(self.template, self.frames)
 
-    def constrained(self, by_default: bool) -> bool:
+    def is_constrained(self, by_default: bool) -> bool:
         """Return `active_constraints`, or the guidance's default `by_default` if `active_constraints` is None."""
         return by_default if self.active_constraints is None else self.active_constraints
 

@@ -47,7 +47,7 @@ class ResidualDescent(Guidance):
         assert prior.template is not None
         assert prior.approach is not None
         placed, approach, period = prior.template, prior.approach, prior.period
-        template = placed.template if placed.constrained(True) else placed.template.without_active_constraints()
+        template = placed.template if placed.is_constrained(True) else placed.template.without_active_constraints()
         builder = DiagramBuilder()
         hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, 3))
         times = [0.0, (approach.heights[0] - approach.heights[1]) / approach.speed]

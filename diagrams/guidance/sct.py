@@ -155,7 +155,7 @@ def _build_sct(
 ) -> SctGuidance:
     placed = prior.template
     assert placed is not None
-    is_constrained = placed.constrained(is_constrained_by_default)
+    is_constrained = placed.is_constrained(is_constrained_by_default)
     return SctGuidance(
         placed.template,
         placed.frames,

@@ -64,7 +64,7 @@ def add_arm(
     *,
     as_rigid: bool = False,
 ) -> ArmModel:
-    """Add the arm at the world's origin, the tool, and the workpiece to a plant that is not finalized.
+    """Add arm, tool and workpiece to a plant that is not finalized; the arm's base is at the world's origin.
 
     `robot` and `end_effector` are objects or names. With `as_rigid`, a gripper is one rigid body in its open state.
     """
@@ -301,7 +301,10 @@ class ArmStation(Station):
         }
 
     def set_payload(self, context: Context, mass: float) -> None:
-        """Add a mass [kg] to the tool, which controller and sensor do not model; `context` is the root context."""
+        """Add a mass [kg] to the tool; `context` is the root context.
+
+        The models of controller and sensor do not contain this mass.
+        """
         plant_context, tool = self.plant.GetMyMutableContextFromRoot(context), self.arm.tool[0]
         tool.SetMass(plant_context, tool.default_mass() + mass)
         if self._joint_torque is not None:

@@ -49,7 +49,7 @@ GANTRY_JOINTS = (
     ("Ry", RevoluteJoint, [0.0, 1.0, 0.0]),
     ("Rx", RevoluteJoint, [1.0, 0.0, 0.0]),
 )
-# Mass [kg] and moment of inertia [kg m²] of the moving tool, as an arm with inertia shaping has at its tool.
+# Mass [kg] and moment of inertia [kg m²] of the moving tool, as at the tool of an arm with inertia shaping.
 CARRIAGE_MASS, CARRIAGE_INERTIA = 1.5, 2e-3
 MASSES = np.array([CARRIAGE_MASS] * 3 + [CARRIAGE_INERTIA] * 3)  # mass or moment of inertia that each joint moves
 # Mass [kg] and radius [m] of a link between two joints; massless links would make the plant's mass matrix singular.
@@ -164,8 +164,8 @@ def moving_mass(plant: MultibodyPlant) -> float:
 def max_stable_time_step(impedance: Impedance) -> float:
     """Return the time step [s] above which a Cartesian controller with an impedance is unstable.
 
-    For a force K e − D v that is constant within a time step h and semi-implicit Euler integration, a mode with natural
-    frequency ω and damping ratio ζ is stable if h ω < 2 (√(1 + ζ²) − ζ).
+    The controller's force K e − D v is constant within a time step h, and the plant is integrated by the semi-implicit
+    Euler method. A mode with natural frequency ω and damping ratio ζ is then stable if h ω < 2 (√(1 + ζ²) − ζ).
     """
     fastest = float(np.sqrt(np.max(np.array(impedance.stiffness) / MASSES)))  # [rad/s]
     ratio = impedance.damping_ratio
@@ -216,7 +216,7 @@ def _add_gantry(
 def _add_wrench(
     builder: DiagramBuilder, plant: MultibodyPlant, gantry: ModelInstanceIndex, pose: OutputPort, time_constant: float
 ) -> OutputPort:
-    """Add the low-pass filtered contact wrench, delayed by one plant step like a sensor's; return its port.
+    """Add the contact wrench with a low-pass filter and, as from a sensor, a delay of one plant step; return its port.
 
     Only C++ systems of Drake run at every plant step; the Python system `PoseWrench` runs when its output is read.
     """

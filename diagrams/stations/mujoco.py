@@ -266,7 +266,10 @@ class MujocoStation(Station):
         self.gantry.set_pose(self.gantry.GetMyMutableContextFromRoot(context), check_pose(pose, POSE_SIZE))
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
-        """Multiply friction and stiffness of the engine's contacts; `context` is the root context."""
+        """Scale friction coefficients by `friction`, and the stiffness of contacts and springs by `modulus`.
+
+        `context` is the root context.
+        """
         self.gantry.set_contact(self.gantry.GetMyMutableContextFromRoot(context), friction, modulus)
 
 
@@ -287,7 +290,10 @@ def _add_workcell(plant: MultibodyPlant, scene_graph: SceneGraph, workcell: Work
     plant.RegisterAsSourceForSceneGraph(scene_graph)
     workcell.add_fixture(plant)
     if plant.num_bodies() != 2:  # world and fixture
-        raise InputError(f"station='mujoco' has a fixture of one body, and {type(workcell).__name__} adds another")
+        raise InputError(
+            f"station='mujoco' needs a fixture of one body, and that of {type(workcell).__name__} has "
+            f"{plant.num_bodies() - 1}"
+        )
     fixture = plant.get_body(BodyIndex(1))
     target = plant.AddFrame(FixedOffsetFrame("target", plant.world_frame(), workcell.X_WT))
     model = plant.AddModelInstance("gantry")

@@ -28,7 +28,7 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.mean_force import MeanForce
 
-OBSTACLE_Z = -0.035  # height of drawn obstacles, below the robot that passes over them [m]
+OBSTACLE_Z = -0.035  # height of the visual obstacles [m]; the robot passes above them
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]
 
 
@@ -65,8 +65,8 @@ class PlaneConfig:
     def position_gain(self) -> float:
         """Position gain [N/m] for critical damping of the discrete loop.
 
-        With a = m/(m + d h) and b = k h²/(m + d h) the loop's characteristic polynomial is z² − (1 + a − b) z + a;
-        both roots are √a if b = (1 − √a)².
+        For mass m, damping d, gain k and plant period h, let a = m/(m + d h) and b = k h²/(m + d h). The loop's
+        characteristic polynomial is z² − (1 + a − b) z + a; both roots are √a if b = (1 − √a)².
         """
         inertia = self.mass + self.damping * self.plant_period
         return (1 - np.sqrt(self.mass / inertia)) ** 2 * inertia / self.plant_period**2

@@ -90,13 +90,13 @@ class PouringConfig:
 
     @cached_property
     def X_WT(self) -> RigidTransform:
-        """Pose of the target frame T: the tip of the nominal mug. All poses of the station are X_TP."""
+        """Pose of the target frame T, the tip frame of the nominal mug; commanded and measured poses are X_TP."""
         x, y, z = self.p_WStand
         return RigidTransform([x, y, z + self.stand_height + self.mug.height])
 
     @cached_property
     def X_FlangeP(self) -> RigidTransform:
-        """Pose of the thermos's tip P at the flange, with its axis perpendicular to the flange's."""
+        """Pose of the thermos's tip P in the flange's frame; the axes of thermos and flange are perpendicular."""
         X_FlangeTurned = RigidTransform(RotationMatrix.MakeZRotation(self.arm.tool_turn), [0.0, 0.0, 0.0])
         R = RotationMatrix(np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]))
         return X_FlangeTurned @ RigidTransform(R, [self.grip_height, 0.0, self.grip])

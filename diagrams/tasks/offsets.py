@@ -27,7 +27,8 @@ def reference_of_file(
     Args:
         path: File .npz or .csv with poses (N, 6) in the target frame.
         components: Number of components of the Gaussian mixture; None: selected by the Bayesian information criterion.
-        floor: Standard deviation (6,) of a hand's repeatability; its square is added to the fitted variances.
+        floor: Repeatability of a demonstrator's hand, as a standard deviation (6,); its square is added to the fitted
+            variances.
         count: Number of demonstrations to use, from the first on; None: all.
         fit: Further arguments of `ReferenceTrajectory.from_demonstrations`; see `ReferenceOptions.fit_arguments`.
 

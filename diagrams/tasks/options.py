@@ -12,7 +12,7 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.primitives.reference import interpolate_prior
 
 COLLISION_FORCE = 35.0  # contact force above which an episode ends [N]
-MIN_CONTACT_FORCE = 0.5  # smallest force of a plug in contact [N]
+MIN_CONTACT_FORCE = 0.5  # smallest force along z at which a center of pressure is computed [N]
 
 # Scales of the observed center of pressure and of the observed command. The center of pressure, unlike the torque, does
 # not increase with the contact force. The command is observed because the measured pose of a plug on a rim does not
@@ -22,14 +22,15 @@ CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE = 3.0 * MM, 2.0 * MM
 # Variance ρ of the history [m², rad²]; the thesis's 1e-8, (0.1 mm)², is too large for demonstrations that vary by 1 mm.
 HISTORY_VARIANCE = 1e-11
 
-# Standard deviation of a hand's repeatability, x y z [m] and Rz Ry Rx [rad]. Its square is added to fitted variances.
+# Repeatability of a demonstrator's hand, as a standard deviation: x y z [m] and Rz Ry Rx [rad]. Its square is added to
+# fitted variances.
 REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE)
 
 # Observations and rewards of `DemonstratedInsertion`.
 OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
 REWARDS = ("sparse", "shaped", "aligned")
 
-KNOWN_OFFSET = 0.3 * MM  # largest fixture offset with fixture_offset=none [m]
+NEGLIGIBLE_OFFSET = 0.3 * MM  # largest fixture offset with fixture_offset=none [m]
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
 MAX_PRIOR_STD = np.array([0.05, 0.05, 0.05, 1.0, 1.0, 1.0])  # [m], [rad]; larger values are probably in mm or degrees
 FORCE_LIMITS = (1.0, 60.0)  # smallest and largest force limit [N]
@@ -58,7 +59,8 @@ class FixtureOffsetOptions(Options):
     """Options of a task whose fixture is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
-        "per_run", description="offset of the fixture: sampled per run or per episode; none: within 0.3 mm per episode"
+        "per_run",
+        description="offset of the fixture: sampled per run or per episode; none: at most 0.3 mm, sampled per episode",
     )
     offset_range: OffsetRange | None = Field(
         None, description="smallest and largest offset of the fixture [m]; default: depends on fixture_offset"
@@ -66,10 +68,10 @@ class FixtureOffsetOptions(Options):
 
     @field_validator("offset_range")
     @classmethod
-    def _is_none_within_its_range(cls, value: OffsetRange | None, info: ValidationInfo) -> OffsetRange | None:
-        if value is not None and value[1] > KNOWN_OFFSET and info.data.get("fixture_offset") == "none":
+    def _check_offset_range(cls, value: OffsetRange | None, info: ValidationInfo) -> OffsetRange | None:
+        if value is not None and value[1] > NEGLIGIBLE_OFFSET and info.data.get("fixture_offset") == "none":
             raise ValueError(
-                f"fixture_offset=none is an offset of at most {KNOWN_OFFSET:g} m: choose fixture_offset=per_episode"
+                f"fixture_offset=none allows offsets up to {NEGLIGIBLE_OFFSET:g} m: choose fixture_offset=per_episode"
             )
         return value
 
@@ -103,8 +105,8 @@ class PriorOptions(ReferenceOptions):
     )
     prior_std: PriorStd | None = Field(
         None,
-        description="standard deviation x y z Rz Ry Rx [m], [rad] around a single demonstration, for which it is "
-        "required; its square is added to the fitted variance; or rows of a phase from 0 to 1 and these six numbers",
+        description="standard deviation around a single demonstration, required for one demonstration: x y z Rz Ry Rx "
+        "[m], [rad], or rows of a phase from 0 to 1 and six such numbers; its square is added to the fitted variance",
         examples=[(0.002, 0.002, 0.0005, 0.02, 0.01, 0.01)],
     )
 
@@ -124,7 +126,8 @@ class ForceOptions(Options):
         "except with observation=image; default: force_limit",
     )
     bounded_force: bool = Field(
-        True, description="limit the impedance so that its force stays below force_limit; if false: 40 N per axis"
+        True,
+        description="limit the force of the impedance so that it stays below force_limit; if false: to 40 N per axis",
     )
 
     @property

@@ -85,8 +85,8 @@ def declare(of=Own, **attributes):
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"Options": dict}, "Options of lab/Own must be a class made of Options"),
-        ({"Reset": None}, "Reset of lab/Own must be a class made of ResetOptions"),
+        ({"Options": dict}, "Options of lab/Own must be a subclass of Options"),
+        ({"Reset": None}, "Reset of lab/Own must be a subclass of ResetOptions"),
         ({"clip": None}, "clip of lab/Own must be a positive number"),
         ({"num_steps": 0}, "num_steps of lab/Own must be a whole number of at least 1, not 0"),
         ({"num_steps": 1.5}, "num_steps of lab/Own must be a whole number of at least 1, not 1.5"),

@@ -38,14 +38,14 @@ def to_json(result: Mapping[str, Any]) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a mapping, number or array of NumPy as an object that JSON has, and anything else as text."""
+    """Convert a mapping, NumPy number or NumPy array to an object that JSON can represent; anything else to text."""
     if isinstance(value, Mapping):
         return dict(value)
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> None:
-    """Print a result, with a column for every baseline policy in `baselines`, or as one JSON object.
+    """Print a result as one JSON object, or as a table with a column for every baseline policy in `baselines`.
 
     Args:
         result: Values by name.
@@ -79,7 +79,7 @@ app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
 def _names(module: str, attribute: str) -> Callable[[], list[str]]:
-    """Return a function that lists the names of a registry, a collection or a callable of a module."""
+    """Return a function that lists names: those of a module's registry or collection, or those its function returns."""
 
     def list_names() -> list[str]:
         value = getattr(import_module(f"guiderail.{module}"), attribute)
@@ -120,7 +120,7 @@ LISTED: dict[str, Callable[[], list[str]]] = {
 
 
 def find_broken(key: str) -> dict[str, str]:
-    """Return the message of each entry point of a list in `LISTED` that cannot be used, by name."""
+    """Return the unusable entry points of a list in `LISTED`: error message by name."""
     if key not in REGISTRIES:
         return {}
     module, attribute = REGISTRIES[key]
@@ -233,14 +233,17 @@ def _import_option(content: str) -> Any:
     return option(f"Module or file (.py) that registers {content}.", "--import", metavar="MODULE")
 
 
-Imports = Annotated[list[str] | None, _import_option("a task, guidance, a station or a learner; a run stores its name")]
+Imports = Annotated[
+    list[str] | None,
+    _import_option("a task, guidance, a station or a learner; a run stores the module's name or the file's path"),
+]
 TaskImports = Annotated[list[str] | None, _import_option("the task")]
 HardwareImports = Annotated[list[str] | None, _import_option("a robot or a driver")]
 TemplateImports = Annotated[list[str] | None, _import_option("parts of templates")]
 
 
 def _trust(context: typer.Context, value: bool) -> bool:
-    """Allow imports that a file names until the command ends, if the option is given; return the option's value."""
+    """If the option is given, allow a file's imports until the command ends; return the option's value."""
     if value:
         from guiderail.tools.imports import trust_imports
 
@@ -261,15 +264,17 @@ Baselines = Annotated[
     str | None,
     option(
         "Baseline policies that are evaluated on the same episodes, comma-separated: scripted, {baselines}; or none. "
-        "The demonstration is always evaluated if the guidance has one; zero is then the same policy.  "
-        "[default: uniform_random; scripted if the task has one; constant, only in evaluate; zero without a "
-        "demonstration]"
+        "If the guidance has a demonstration, the demonstration alone is always evaluated; it equals the policy zero.  "
+        "[default: uniform_random, constant (only in evaluate), scripted (if the task has such a policy), and zero (if "
+        "there is no demonstration)]"
     ),
 ]
 PolicyTask = Annotated[str | None, option("Task that a POLICY without a run acts in: {tasks}.", choices="tasks")]
 TrustPolicy = Annotated[
     bool,
-    option("Read a policy's file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--trust-policy"),
+    option(
+        "Read a policy from a file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--trust-policy"
+    ),
 ]
 Processes = Annotated[
     int | None,
@@ -280,7 +285,7 @@ Offsets = Annotated[bool, option("Resample the fixture offset of the run in ever
 RobotUrl = Annotated[
     str | None, option("Hardware: LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")
 ]
-Driver = Annotated[str | None, option("Hardware: driver fci (Franka) or rtde (UR).  [default: the robot's on LCM]")]
+Driver = Annotated[str | None, option("Hardware: driver fci (Franka) or rtde (UR).  [default: the robot's LCM driver]")]
 Robot = Annotated[
     str | None, option("Hardware: robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
 ]
@@ -427,7 +432,7 @@ def connect(
 
 
 def refuse_hardware_options(**given: Any) -> None:
-    """Raise an InputError if one of these options, which need a hardware station, is neither None nor False."""
+    """Raise an InputError if an option that needs a hardware station is given, that is, neither None nor False."""
     if any(value is not None and value is not False for value in given.values()):
         *names, last = (f"--{name}" for name in given)
         raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")

@@ -78,14 +78,14 @@ def _clearance(environment: Environment, value: float) -> dict[str, Any]:
 
 def _offsets(environment: Environment, value: float) -> dict[str, Any]:
     from guiderail.diagrams.tasks.bnc_connector.options import OFFSET_RANGES
-    from guiderail.diagrams.tasks.options import KNOWN_OFFSET
+    from guiderail.diagrams.tasks.options import NEGLIGIBLE_OFFSET
 
     if "offset_range" not in environment:
         raise InputError("the task has no range of offsets")
     default = environment["offset_range"] or OFFSET_RANGES[environment["fixture_offset"]]
     low, high = (value * distance for distance in default)
-    # fixture_offset=none refuses offsets above `KNOWN_OFFSET`; per_episode samples them in the same way.
-    is_refused = environment["fixture_offset"] == "none" and high > KNOWN_OFFSET
+    # fixture_offset=none refuses offsets above `NEGLIGIBLE_OFFSET`; per_episode samples them in the same way.
+    is_refused = environment["fixture_offset"] == "none" and high > NEGLIGIBLE_OFFSET
     return {"offset_range": (low, high)} | ({"fixture_offset": "per_episode"} if is_refused else {})
 
 

@@ -60,7 +60,7 @@ RunName = Annotated[str, AfterValidator(_check_run_name)]
 EvaluatedFile = Annotated[str, AfterValidator(_check_file)]
 
 
-def _are_distinct(seeds: tuple[int, ...]) -> tuple[int, ...]:
+def _check_distinct_seeds(seeds: tuple[int, ...]) -> tuple[int, ...]:
     if repeated := [seed for seed in seeds if seeds.count(seed) > 1]:
         raise ValueError(f"the seed {repeated[0]} is given twice: give each seed once")
     return seeds
@@ -68,7 +68,7 @@ def _are_distinct(seeds: tuple[int, ...]) -> tuple[int, ...]:
 
 Seed = Annotated[int, Field(strict=True, ge=0, lt=2**31)]
 SweepValue = Annotated[float, Field(allow_inf_nan=False)]
-Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_are_distinct)]
+Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_check_distinct_seeds)]
 
 
 class _Strict(BaseModel):
@@ -99,7 +99,7 @@ class Method(_Strict):
     """Environment and policy that a study compares with others."""
 
     env: dict[str, Any] = {}  # options of the environment, in addition to the study's
-    learner: LearnerChoice = LearnerChoice()  # overrides the study's; null algorithm or preset: the task's own
+    learner: LearnerChoice = LearnerChoice()  # overrides the study's; null: the task's algorithm or preset
     policy: str = LEARNED  # "learned", "best_constant", or the name of a baseline or scripted policy
     grid: tuple[float, ...] = (-1.0, 0.0, 1.0)  # values of each action component that best_constant tries
     seeds: Seeds | None = None  # default: the study's; one seed is enough for a policy without learning
@@ -119,7 +119,7 @@ class EvalSet(_Strict):
 
     @field_validator("sampled")
     @classmethod
-    def _are_ranges(cls, value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    def _check_ranges(cls, value: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
         for name, (low, high) in value.items():
             if not -math.inf < low <= high < math.inf:
                 raise ValueError(f"the range of {name} is two finite numbers, the smaller first, not {low}, {high}")
@@ -136,7 +136,7 @@ class Sweep(_Strict):
 
     @field_validator("at", mode="wrap")
     @classmethod
-    def _are_distinct(cls, given: Any, validate: ValidatorFunctionWrapHandler) -> dict[float, dict[str, Any]]:
+    def _check_distinct_values(cls, given: Any, validate: ValidatorFunctionWrapHandler) -> dict[float, dict[str, Any]]:
         values: dict[float, dict[str, Any]] = validate(given)
         if len(values) < len(given):
             equal = next(keys for keys in itertools.combinations(given, 2) if float(keys[0]) == float(keys[1]))
@@ -174,11 +174,11 @@ class Study(_Strict):
     task: str  # name of the task of every method; in a YAML file, the path of a task folder is allowed too
     env: dict[str, Any] = {}  # options of the environment of every method
     learner: LearnerChoice = LearnerChoice()  # learner of every method that learns
-    methods: dict[FolderName, Method] = Field(min_length=1)  # by name, used in folders and legends
+    methods: dict[FolderName, Method] = Field(min_length=1)  # methods by name; folders and legends have the names
     seeds: Seeds  # seeds of training
     after_episodes: tuple[Annotated[Integer, Field(ge=1)], ...] = ()  # when policies are evaluated; default: at the end
     eval_set: tuple[EvalSet, ...] = (EvalSet(),)  # evaluation sets
-    sweeps: tuple[Sweep, ...] = ()  # quantities whose values are evaluation sets too
+    sweeps: tuple[Sweep, ...] = ()  # quantities; each of their values adds an evaluation set
     statistics: tuple[str, ...] = ()  # statistics of training in addition to the usual ones
     ratios: tuple[Ratio, ...] = ()  # ratios reported next to the table
     folder: RunName = "{method}-{seed}"  # folder of a run
@@ -275,7 +275,7 @@ def source_file(out: Path, study: str) -> Path:
 
 
 def _sentence(error: ValidationError) -> str:
-    """Return the first error as a sentence: the key, and the values that are allowed."""
+    """Return the first validation error as one sentence."""
     first = error.errors()[0]
     where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":

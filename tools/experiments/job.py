@@ -123,7 +123,7 @@ class Job:
 
     @cached_property
     def source_job(self) -> Job | None:
-        """Job that trains the source run; a subset of the study may leave its method out."""
+        """Job that trains the source run, also if the study is a subset without its method; None without such a job."""
         if self.source is None:
             return None
         whole = self.study.model_copy(update={"methods": self.study.all_methods})
@@ -160,12 +160,13 @@ def check_job(job: Job) -> None:
         file, content = _evaluated_file(job, episodes, eval_set)
         if (first_part := file.relative_to(job.folder.path).parts[0]) in RUN_FILES:
             raise InputError(
-                f"the evaluation set {eval_set.name!r} has a file of the run, {first_part}: name another file"
+                f"the evaluation set {eval_set.name!r} names {first_part}, which is reserved for the run: name another "
+                "file"
             )
         if contents.setdefault(file, content) != content:
             raise InputError(
-                f"the evaluation set {eval_set.name!r} has the file {file.name} of other evaluated episodes: write "
-                "{name}, {after_episodes} and {digest} into the file's name"
+                f"the evaluation set {eval_set.name!r} has the same file, {file.name}, as other evaluated episodes: "
+                "write {name}, {after_episodes} and {digest} into the file's name"
             )
         _refuse_other_rows(file, content, eval_set)
     if (job.folder.path / "config.yaml").exists():
@@ -177,10 +178,10 @@ def check_job(job: Job) -> None:
         job.folder.refuse_existing()
 
 
-def check_source(job: Job, *, is_selected: bool = False) -> str:
+def check_source(job: Job, *, is_source_selected: bool = False) -> str:
     """Return the state of the run that a job starts from; "" if there is no such run, or the job needs no training.
 
-    With `is_selected`, that run may be unfinished, because the study trains it before the job.
+    With `is_source_selected`, that run may be unfinished, because the study trains it before the job.
 
     Raises:
         InputError: If that run is not finished, or its state differs from that at the start of the job's training.
@@ -194,7 +195,7 @@ def check_source(job: Job, *, is_selected: bool = False) -> str:
     state = f"{source.path.name}, {episodes} episodes, "
     if done == episodes and (source.path / "policy.json").exists():
         state = source.state
-    elif not (is_selected and done <= episodes):
+    elif not (is_source_selected and done <= episodes):
         if not any(_needs_training(job, number) for number in job.after_episodes):
             return ""
         if done > episodes:
@@ -244,7 +245,7 @@ def _needs_training(job: Job, episodes: int) -> bool:
     if not job.learns:
         return False
     done = _num_episodes(folder)
-    if (job.policy_folder(episodes) / "policy.json").exists():  # training only restores rows that the table lost
+    if (job.policy_folder(episodes) / "policy.json").exists():  # only rows of the table can be missing
         return done < episodes <= folder.num_saved_episodes()
     if done != episodes:
         return done < episodes
@@ -330,7 +331,7 @@ def _load_or_evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFram
 
 
 def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> tuple[Path, str]:
-    """Return the file of the evaluated episodes of a policy after a number of training episodes, and their digest."""
+    """Return the file and the digest of the episodes that evaluate a policy after `episodes` training episodes."""
     name = re.sub(r"[ /\\\0]", "_", eval_set.name).lstrip(".")  # one path component, inside the run's folder
     values = {"name": name, "after_episodes": episodes, "episodes": eval_set.episodes}
     content = digest(job, eval_set, episodes)
@@ -338,7 +339,7 @@ def _evaluated_file(job: Job, episodes: int, eval_set: EvalSet) -> tuple[Path, s
 
 
 def _is_evaluated(job: Job, episodes: int, eval_set: EvalSet) -> bool:
-    """Return True if all episodes of an evaluation set are stored; a damaged table is refused when it is read."""
+    """Return True if all episodes of an evaluation set are stored, or their table is damaged: reading refuses it."""
     file = _evaluated_file(job, episodes, eval_set)[0]
     try:
         return read_complete(file, eval_set.episodes) is not None
@@ -352,7 +353,7 @@ def _digest_file(file: Path) -> Path:
 
 
 def _refuse_other_rows(file: Path, content: str, eval_set: EvalSet) -> None:
-    """Raise an InputError if a file of evaluated episodes with the digest `content` belongs to another study."""
+    """Raise an InputError if a file of evaluated episodes was stored with a digest other than `content`."""
     stored = _digest_file(file)
     if "{digest}" not in eval_set.file and stored.exists() and stored.read_text() != content:
         raise InputError(
@@ -371,7 +372,7 @@ def _evaluate(job: Job, episodes: int, eval_set: EvalSet) -> pd.DataFrame:
         sampled = {name: float(rng.uniform(low, high)) for name, (low, high) in eval_set.sampled.items()}
         seed = eval_set.first_seed + done
         kwargs: dict[str, Any] = {"episodes": number, "seed": seed, "options": eval_set.options}
-        # `first_number=0`: random actions depend on the run's seed alone, as in the published tables.
+        # `first_number=0`: a baseline's random actions do not depend on `first_seed`, as in the published tables.
         rows = evaluate_run(config, policy, environment | sampled, **kwargs, first_number=0)
         tables.append(rows.assign(episode=rows["episode"] + done, **sampled))
     return pd.concat(tables, ignore_index=True)

@@ -216,7 +216,7 @@ def _order_jobs(jobs: list[Job]) -> list[list[int]]:
             f"{job.method}, seed {job.seed}, would start from its own run: let init_from name another method's run"
         ) from None
     for job, source in zip(jobs, sources, strict=True):
-        check_source(job, is_selected=source is not None)
+        check_source(job, is_source_selected=source is not None)
     groups = []
     while sorter.is_active():
         groups.append(sorted(sorter.get_ready()))

@@ -1,4 +1,4 @@
-"""Page of episodes before and after learning: animation and plots on one time axis, self-contained, in any browser."""
+"""Self-contained HTML page of episodes before and after learning: animation and plots on one time axis."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ VISUALIZER_PATH = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's
 DIGITS = 5  # significant digits of a plotted number
 
 
-class Motion(EnvCallback):
+class MotionRecorder(EnvCallback):
     """Recorder of the poses of all visible bodies and of the actions at every control step.
 
     The recorder replaces the simulator's monitor.
@@ -124,9 +124,10 @@ class Motion(EnvCallback):
 
 
 def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple[str, float]:
-    """Return the unit of plotted violations and its factor from m or rad: mm if only positions are constrained.
+    """Return the unit of plotted violations and the factor from m or rad to it.
 
-    `outputs` is the number of a command's outputs.
+    The unit is mm if only positions are constrained, and m or rad otherwise. `outputs` is the number of outputs of a
+    command.
     """
     has_rotations = outputs >= 6 and (constraints is None or bool(np.any(constraints.G[..., 3:])))
     return (VIOLATION, 1.0) if has_rotations else ("mm", 1.0 / MM)
@@ -148,12 +149,12 @@ TEMPLATE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=T
     Path(__file__).with_name("replay.html").read_text(encoding="utf-8")
 )
 
-TRANSPARENCY = 0.35  # opacity of bodies when the page shows them transparent
+TRANSPARENT_OPACITY = 0.35  # opacity of bodies when the page shows them transparent
 EPISODES = 4  # number of held-out episodes
 
 GRAY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
 GREEN, RED = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0)
-PALE = 0.3  # opacity of the paths of episodes that are not selected
+PALE_OPACITY = 0.3  # opacity of the paths of episodes that are not selected
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         Side("after", episode.acting, GREEN): episode.policy(env),
     }
     _LOGGER.info("simulating held-out episodes (%d) before and after learning, then writing %s", episodes, html)
-    motion = Motion(env)
+    motion = MotionRecorder(env)
     rows, recorded = [], []
     for side, act in sides.items():
         side_episodes = []
@@ -238,8 +239,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         "sides": recorded,
         "violation": {"unit": unit, "scale": scale},
         "states": [state.name for state in task.template().template.states] if has_template else [],
-        "pale": PALE,
-        "transparency": TRANSPARENCY,
+        "pale_opacity": PALE_OPACITY,
+        "transparent_opacity": TRANSPARENT_OPACITY,
     }
     page = meshcat.StaticHtml()
     env.close()

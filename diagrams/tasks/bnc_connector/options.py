@@ -14,7 +14,7 @@ from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
-    KNOWN_OFFSET,
+    NEGLIGIBLE_OFFSET,
     FixtureOffsetOptions,
     ForceOptions,
     PriorOptions,
@@ -27,7 +27,7 @@ from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
 OFFSET_RANGES = {
     "per_run": (1.0 * MM, 1.5 * MM),
     "per_episode": (0.0, 1.5 * MM),
-    "none": (0.0, KNOWN_OFFSET),
+    "none": (0.0, NEGLIGIBLE_OFFSET),
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
 LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a failed grasp

@@ -75,7 +75,8 @@ def scripted_slalom(observation: np.ndarray) -> np.ndarray:
 
 IMAGE_SIZE = (144, 110)  # width and height of the observed image [pixels] (thesis, end of section 4.4.1)
 COMPONENTS = 20  # components of the Gaussian mixture; with 8 to 16 the gap is blurred
-FLOOR = 0.002  # [m] standard deviation of a hand's repeatability; its square is added to the fitted variances
+# Repeatability of a demonstrator's hand, as a standard deviation [m]; its square is added to the fitted variances.
+FLOOR = 0.002
 HELD_OUT_DEVIATION = 0.01  # [m] standard deviation of a held-out start
 MAX_DEVIATIONS = 4.0  # limit of a sampled start along x and y [standard deviations]; 1 of 8000 starts is clipped
 MAX_START = 2.0  # [m] largest coordinate of a given start

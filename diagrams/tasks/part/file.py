@@ -51,7 +51,7 @@ AUTOMATE: dict[str, Any] = {
 }
 """Options of difficulty="automate": AutoMate's uncertainty, ±2 mm along x and y and ±5° about the axis."""
 _LARGEST = float(np.finfo(float).max)
-MAX_CLEARANCE = 500.0  # largest measured clearance [mm], the largest size of a part
+MAX_CLEARANCE = 500.0  # largest accepted clearance [mm], equal to the largest size of a part
 # Largest bound of a command [m], [rad]: larger bounds are probably in millimeters or degrees. A command may approach
 # from the side, start at the largest `travel`, and turn by 180° plus a `search_turn`.
 MAX_BOUND = np.array([0.1, 0.1, 0.6, 4.0, 1.0, 1.0])
@@ -106,7 +106,7 @@ class MotionNumbers(Options):
 
     @field_validator("rim")
     @classmethod
-    def _is_below_the_start(cls, value: float, info: ValidationInfo) -> float:
+    def _check_rim(cls, value: float, info: ValidationInfo) -> float:
         travel = info.data.get("travel", np.inf)
         if travel - value - TOUCH < 0.0:
             raise ValueError(f"rim must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m")
@@ -114,7 +114,7 @@ class MotionNumbers(Options):
 
     @field_validator("advance")
     @classmethod
-    def _is_within_the_socket(cls, value: float, info: ValidationInfo) -> float:
+    def _check_advance(cls, value: float, info: ValidationInfo) -> float:
         if value and value >= info.data.get("rim", np.inf) - TOUCH:
             raise ValueError(f"the advance must be more than {TOUCH:g} m less than rim")
         return value
@@ -161,7 +161,7 @@ class Bounds(Options):
 
     @field_validator("lower", "upper")
     @classmethod
-    def _are_numbers(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _check_rows(cls, value: tuple[Any, ...]) -> tuple[Any, ...]:
         rows = value if value and isinstance(value[0], list | tuple) else (value,)
         if not all(_is_row(row) for row in rows):
             raise ValueError("bounds are six finite numbers each, [x y z Rz Ry Rx], null for an absent bound")
@@ -173,7 +173,7 @@ class Bounds(Options):
         return value
 
     @model_validator(mode="after")
-    def _fit(self) -> Self:
+    def _check_shapes(self) -> Self:
         (lower, upper), phases = self.arrays(), self.phases
         if lower.shape != upper.shape or lower.shape[:-1] != (() if phases is None else (len(phases),)):
             raise ValueError("without phases, lower and upper are one list each; with phases, one list for each phase")
@@ -232,7 +232,8 @@ class DemonstrationFile(PriorOptions):
         REPEATABILITY_STD,
         min_length=6,
         max_length=6,
-        description="standard deviation of a hand's repeatability [m], [rad]; its square is added to the covariance",
+        description="repeatability of a demonstrator's hand, as a standard deviation [m], [rad]; its square is added "
+        "to the covariance",
     )
 
     def reference(self, folder: Path) -> ReferenceTrajectory:
@@ -260,7 +261,7 @@ class Recommended(Options):
 
     @field_validator("learner")
     @classmethod
-    def _is_a_learner(cls, value: dict[str, Any]) -> dict[str, Any]:
+    def _check_learner(cls, value: dict[str, Any]) -> dict[str, Any]:
         kinds = {"algorithm": str, "preset": str, "settings": dict}
         for key, entry in value.items():
             if key not in kinds:
@@ -313,36 +314,36 @@ class PartTaskFile(Options):
 
     @field_validator("measured")
     @classmethod
-    def _has_a_clearance(cls, value: dict[str, Any]) -> dict[str, Any]:
+    def _check_clearance(cls, value: dict[str, Any]) -> dict[str, Any]:
         clearance = value.get("clearance_mm")
         is_number = isinstance(clearance, int | float) and not isinstance(clearance, bool)
         if clearance is not None and not (is_number and 0.0 <= clearance <= MAX_CLEARANCE):
             raise ValueError(
-                f"clearance_mm is a number from 0 to {MAX_CLEARANCE:g}, or null if no walls face each other, not "
+                f"clearance_mm must be a number from 0 to {MAX_CLEARANCE:g}, or null (no walls face each other), not "
                 f"{brief(clearance)}"
             )
         return value
 
     @field_validator("time_step")
     @classmethod
-    def _is_a_time_step(cls, value: float | None) -> float | None:
+    def _check_time_step(cls, value: float | None) -> float | None:
         return ContactOptions(time_step=value).time_step
 
     @field_validator("tolerance")
     @classmethod
-    def _is_below_the_rim(cls, value: Tolerance, info: ValidationInfo) -> Tolerance:
+    def _check_height(cls, value: Tolerance, info: ValidationInfo) -> Tolerance:
         if "motion" in info.data and value.height >= info.data["motion"].rim:
             raise ValueError(f"height must be less than motion.rim, {info.data['motion'].rim:g} m")
         return value
 
     @field_validator("bounds")
     @classmethod
-    def _include_the_target(cls, value: Bounds, info: ValidationInfo) -> Bounds:
+    def _check_target_is_allowed(cls, value: Bounds, info: ValidationInfo) -> Bounds:
         if not {"motion", "tolerance"} <= info.data.keys():
             return value  # their errors are reported instead
         tolerance, push = info.data["tolerance"], info.data["motion"].push
         x, y, z, Rz, Ry, Rx = value.nearest(np.zeros(POSE_SIZE), -1)
-        nearest = np.array([x, y, max(z, min(z + push, 0.0)), Rx, Ry, Rz])  # a push is below the target
+        nearest = np.array([x, y, max(z, min(z + push, 0.0)), Rx, Ry, Rz])  # the command may be below the seated plug
         if not tolerance.accepts(nearest) or max(abs(Ry), abs(Rx)) >= tolerance.turn * DEGREE:
             raise ValueError(
                 "these bounds exclude the pose of the seated plug, which is 0 in all outputs: let them include 0 (for "
@@ -352,7 +353,7 @@ class PartTaskFile(Options):
 
     @field_validator("sides", "rim_sides")
     @classmethod
-    def _are_sides(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+    def _check_symmetries(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         for name in value:
             if name not in SYMMETRIES:
                 raise ValueError(f"there is no symmetry {name!r}: {did_you_mean(name, SYMMETRIES)}")

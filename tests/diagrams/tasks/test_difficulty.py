@@ -71,7 +71,7 @@ OUT_OF_RANGE = [
     ("BncConnector", {"offset_range": (0.003, 0.002)}, "the smaller one first"),
     ("BncConnector", {"offset_range": (0.0, 0.005)}, "two distances from 0 to 0.004 m"),
     ("BncConnector", {"offset_range": (0.001,)}, "offset_range"),
-    ("BncConnector", {"fixture_offset": "none", "offset_range": (0.003, 0.003)}, "none is an offset of at most 0.0003"),
+    ("BncConnector", {"fixture_offset": "none", "offset_range": (0.003, 0.003)}, "none allows offsets up to 0.0003"),
     ("BncConnector", {"difficulty": "hard", "fixture_offset": "none"}, "choose fixture_offset=per_episode"),
     ("BncConnector", {"mouth_chamfer": 0.1}, "mouth_chamfer must be at most 0.0006"),
     ("BncConnector", {"bore_clearance": 0.0}, "bore_clearance must be at least"),

@@ -361,9 +361,9 @@ FREE = [None] * 6  # no bound on any output
         ({"motion": {"travel": 0.02, "rim": 0.01, "pusch": 0}}, r"motion has no option 'pusch': did you mean push"),
         ({"recommended": {"learner": {"algoritm": "tqc"}}}, "there is no key 'algoritm': did you mean algorithm"),
         ({"recommended": {"learner": {"algorithm": 3}}}, r"recommended\.learner cannot .*: algorithm must be a name"),
-        ({"measured": {"clearance_mm": "abc"}}, "clearance_mm is a number from 0 to 500, or null"),
-        ({"measured": {"clearance_mm": -5}}, "clearance_mm is a number from 0 to 500, or null"),
-        ({"measured": {"clearance_mm": 10**400}}, "clearance_mm is a number from 0 to 500, or null"),
+        ({"measured": {"clearance_mm": "abc"}}, "clearance_mm must be a number from 0 to 500, or null"),
+        ({"measured": {"clearance_mm": -5}}, "clearance_mm must be a number from 0 to 500, or null"),
+        ({"measured": {"clearance_mm": 10**400}}, "clearance_mm must be a number from 0 to 500, or null"),
     ],
 )
 def test_task_file_is_refused_when_a_value_is_invalid(changes, message, tmp_path):

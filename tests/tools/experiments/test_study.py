@@ -482,14 +482,14 @@ INVALID = [
         {"eval_set": [{"file": "{after_episodes}-{seed}.csv"}]},
         "the placeholders are {name}, {after_episodes}, {episodes}, {digest}",
     ),
-    ({"eval_set": [{"file": "./episodes.csv"}]}, "has a file of the run, episodes.csv"),
+    ({"eval_set": [{"file": "./episodes.csv"}]}, "names episodes.csv, which is reserved for the run"),
     ({"eval_set": [{"file": "held_out.csv"}]}, "write {name}, {after_episodes} and {digest} into the file's name"),
     (
         {
             "after_episodes": [2],
             "eval_set": [{"name": name, "episodes": k, "file": "a.csv"} for k, name in [(1, "a"), (2, "b")]],
         },
-        "the evaluation set 'b' has the file a.csv of other evaluated episodes",
+        "the evaluation set 'b' has the same file, a.csv, as other evaluated episodes",
     ),
     ({"eval_set": [{"first_seed": 2**31}]}, "less than 2147483648"),
     ({"sweeps": [{"quantity": "wall", "at": {"nan": {}}}]}, "finite number"),

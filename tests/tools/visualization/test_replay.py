@@ -17,7 +17,7 @@ from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization import replay
 from guiderail.tools.visualization.replay import (
     VISUALIZER_PATH,
-    Motion,
+    MotionRecorder,
     default_page,
     find_report,
     violation_unit,
@@ -106,7 +106,7 @@ def test_motion_keeps_the_peak_force_when_it_is_resampled(monkeypatch):
     env = make_environment("NarrowPassage", {"guidance": "residual", "action_repeat": 10}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
-    motion = Motion(env)
+    motion = MotionRecorder(env)
     row = rollout(env, constant_policy(env, np.array([1.0, 0.0])), motion, seed=1_000_000, held_out=True)
     recorded, trace = motion.data(), env.unwrapped.trace
     assert len(recorded["times"]) <= 8
@@ -121,7 +121,7 @@ def test_motion_has_one_sample_without_a_control_step():
     env = make_environment("NarrowPassage", {"guidance": "kgrl"}, render_mode="human")
     env.unwrapped.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=0)
-    motion = Motion(env)
+    motion = MotionRecorder(env)
     env.reset(seed=1)
     motion.on_episode_start()
     recorded = motion.data()

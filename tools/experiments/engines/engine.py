@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_callable
 
-MAX_ATTEMPTS = 3  # number of lost workers after which a job is given up: the job itself may kill its worker
+MAX_ATTEMPTS = 3  # lost workers after which a job has failed; the job itself may be the cause
 GIVEN_UP = f"{MAX_ATTEMPTS} workers were lost running it, one after the other"
 
 
