@@ -141,12 +141,12 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
 
     @field_validator("demonstrations")
     @classmethod
-    def _is_shipped_or_a_file(cls, value: str) -> str:
+    def _check_file(cls, value: str) -> str:
         if value in SHIPPED:
             return value
         path = Path(value)
         if not path.is_file():
-            raise ValueError(f"it is {', '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
+            raise ValueError(f"must be {', '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
         return str(path.resolve())  # so that a run can be resumed from another folder
 
 
