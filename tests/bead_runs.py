@@ -1,4 +1,4 @@
-"""Fixtures of runs on the bead task, for the tests of tools and research."""
+"""Fixtures with training runs on the bead task, for the tests of tools and research."""
 
 import shutil
 import sys
@@ -14,7 +14,7 @@ bead.register()
 
 @pytest.fixture(scope="session")
 def bead_config():
-    """Return the configuration of a run that takes a second: tiny networks, trained from the second episode on."""
+    """Return the configuration of a run of about one second: small networks, updated from the second episode on."""
     from guiderail.tools.learning.train import configure
 
     settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}

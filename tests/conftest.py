@@ -3,8 +3,8 @@
 import gc
 
 import pytest
+from fork_server import Forks, start_forkserver
 from hypothesis import HealthCheck, settings
-from served import Forks, begin_forkserver
 
 COMMON = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
 
@@ -13,7 +13,7 @@ settings.register_profile("long", max_examples=2500, **COMMON)
 settings.load_profile("quick")
 
 
-# Tests with Python LCM handlers while a simulator handles subscriptions, which some versions of Drake do not support.
+# Test files in which a simulator calls Python handlers of LCM messages, which ends the process in some Drake versions.
 WITH_HANDLERS = (
     "hardware/test_station.py", "hardware/test_injections.py", "hardware/test_clock.py",
     "hardware/test_sim_driver.py", "hardware/test_connection.py", "hardware/test_executor.py",
@@ -22,25 +22,26 @@ WITH_HANDLERS = (
 
 
 def pytest_collection_modifyitems(items):
-    """Skip tests with LCM handlers if a handler would abort the process."""
+    """Skip the tests with LCM handlers if a handler would end the process."""
     from guiderail.diagrams.hardware.lcm import handlers_are_safe
 
     if not handlers_are_safe():
         for item in items:
             if item.path.as_posix().endswith(WITH_HANDLERS):
-                item.add_marker(pytest.mark.skip(reason="this Drake calls handlers without the interpreter's lock"))
+                reason = "this version of Drake calls LCM handlers without the interpreter's lock"
+                item.add_marker(pytest.mark.skip(reason=reason))
 
 
 FORKS = pytest.StashKey[Forks]()
 
 
 def pytest_collection_finish(session):
-    """Start the fork servers when everything is imported and nothing has been created."""
-    gc.freeze()  # saves a fifteenth of the whole run in garbage collections
+    """Start the fork servers after the imports of all tests and before the first fixture."""
+    gc.freeze()  # excludes imported objects from garbage collections, which saves a fifteenth of the run time
     used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
-    # In this order: the later server holds the pipe of the earlier one and must end first.
+    # The server that starts later inherits the pipe of the earlier server and must end first.
     if "forkserver" in used:
-        begin_forkserver()
+        start_forkserver()
     if "forks" in used:
         session.config.stash[FORKS] = Forks()
 
@@ -52,10 +53,10 @@ def pytest_unconfigure(config):
 
 @pytest.fixture(scope="session")
 def forks(request):
-    """Return an interpreter that runs programs in forks of this process, because importing takes seconds."""
+    """Return the server that runs programs in forks of this process, which saves seconds of imports."""
     return request.config.stash[FORKS]
 
 
 @pytest.fixture
 def forkserver():
-    """Make processes of multiprocessing's "forkserver" forks of this process as well."""
+    """Request that multiprocessing's start method "forkserver" forks this process, which saves seconds of imports."""

@@ -1,29 +1,33 @@
-"""Writer of a minimal ONNX file, so that tests need no package that writes them (the format is Protocol Buffers)."""
+"""Writer of a minimal ONNX file (Protocol Buffers), so that the tests do not need the package `onnx`."""
 
 import numpy as np
 
 
 def _number(field, value):
+    """Return a field with a whole number."""
     return _varint(field << 3) + _varint(value)
 
 
 def _bytes(field, *parts):
+    """Return a field with texts and encoded messages."""
     content = b"".join(part.encode() if isinstance(part, str) else part for part in parts)
     return _varint(field << 3 | 2) + _varint(len(content)) + content
 
 
 def _varint(value):
+    """Return the encoding of a whole number in groups of seven bits, the lowest first."""
     low, value = value & 0x7F, value >> 7
     return bytes([low | 0x80]) + _varint(value) if value else bytes([low])
 
 
 def _tensor(name, array):
+    """Return the field of an initializer with float32 numbers."""
     dims = b"".join(_number(1, size) for size in array.shape)
     return _bytes(5, dims, _number(2, 1), _bytes(8, name), _bytes(9, array.astype("<f4").tobytes()))
 
 
 def _value(field, name, sizes):
-    """Return the type of a float32 input or output; a size of None is left out, text names a variable size."""
+    """Return the field of a float32 input or output; text names a variable size, and None omits a dimension."""
     dims = [_bytes(1, _bytes(2, size) if isinstance(size, str) else _number(1, size)) for size in sizes if size]
     return _bytes(field, _bytes(1, name), _bytes(2, _bytes(1, _number(1, 1), _bytes(2, *dims))))
 

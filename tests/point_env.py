@@ -1,16 +1,20 @@
-"""Environment of another origin: a point that follows velocity actions towards a target, and a gripper."""
+"""Gymnasium environment without guiderail: velocity actions move a point to a target and close a gripper."""
 
 import gymnasium
 import numpy as np
 
 from guiderail import Demonstrations
 
-PERIOD = 0.05
-SPEED = 0.04  # largest displacement in a step [m]
+PERIOD = 0.05  # of a step [s]
+MAX_STEP = 0.04  # largest displacement along each axis in a step [m]
 
 
 class PointEnv(gymnasium.Env):
-    """Point at p; the target lies at `target`, and the episode ends in success near it with a closed gripper."""
+    """Point at `p` [m]. The episode succeeds within 10 mm of `target` while the gripper action is positive.
+
+    Args:
+        kind: Observation space: "box", "dict", "dict_with_phase" or "image".
+    """
 
     def __init__(self, kind="box"):
         spaces = gymnasium.spaces
@@ -31,7 +35,7 @@ class PointEnv(gymnasium.Env):
         return self._observe(), {"own": 1}
 
     def step(self, action):
-        self.p = self.p + SPEED * np.clip(action[:3], -1, 1)
+        self.p = self.p + MAX_STEP * np.clip(action[:3], -1, 1)
         distance = np.linalg.norm(self.p - self.target)
         success = bool(distance < 0.01 and action[3] > 0)
         return self._observe(), -distance, success, False, {"is_success": success, "own": 2}
@@ -44,17 +48,19 @@ class PointEnv(gymnasium.Env):
 
 
 def pose(env, observation):
+    """Return the measured position (3,) [m]."""
     return env.unwrapped.p.copy()
 
 
 def to_action(env, observation, command, extra):
+    """Return the action that moves the point to the command, and record the command."""
     inner = env.unwrapped
     inner.commands.append(command.copy())
-    return np.append(np.clip((command - inner.p) / SPEED, -1, 1), 0.0 if extra is None else extra)
+    return np.append(np.clip((command - inner.p) / MAX_STEP, -1, 1), 0.0 if extra is None else extra)
 
 
 def demonstrations(end=(0.0, 0.0, 0.0), steps=25, count=5, seed=0, start=(-0.5, -0.1, -0.2)):
-    """Return curved motions from about `start` to `end`, in the target's frame."""
+    """Return curved motions from `start` to `end` (3,) [m], in the frame of the target."""
     rng, t = np.random.default_rng(seed), PERIOD * np.arange(steps)
     s = np.linspace(0, 1, steps)[:, None]
     outputs = []

@@ -1,4 +1,4 @@
-"""Import order of the folders: tools → diagrams → systems → models, and no import cycles."""
+"""Import order of the folders (tools → diagrams → systems → models) and absence of import cycles."""
 
 import ast
 import re
@@ -20,7 +20,7 @@ LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 
 def imports(path, nodes=None):
-    """Yield the imported modules and names of a file, or of some of its nodes."""
+    """Yield the imported modules and names of a file, or of some of its syntax tree nodes."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if nodes is None else nodes:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -50,17 +50,17 @@ def test_systems_import_no_task_and_no_robot():
             assert not name.startswith(modules), f"{path.relative_to(ROOT)} imports {name}"
 
 
-def test_robot_names_occur_in_their_own_files_only():
-    """Adding a robot is one file and its model. Only `diagrams/hardware` names one: its LCM messages are the iiwa's."""
+def test_systems_and_diagrams_name_no_robot():
+    """A new robot needs one file and a model only. `diagrams/hardware` is excepted: its LCM messages are the iiwa's."""
     names = re.compile(rf"\b({'|'.join((*robot_names(), 'iiwa', 'kuka', 'franka'))})", re.IGNORECASE)
     for folder in ("systems", "diagrams"):
         for path in (ROOT / folder).rglob("*.py"):
-            inside = path.relative_to(ROOT)
+            relative = path.relative_to(ROOT)
             match = names.search(path.read_text(encoding="utf-8"))
-            assert match is None or inside.parts[:2] == ("diagrams", "hardware"), f"{inside} names {match}"
+            assert match is None or relative.parts[:2] == ("diagrams", "hardware"), f"{relative} names {match}"
 
 
-def modules():
+def module_paths():
     """Return the path of every module of the package, by name."""
     result = {}
     for folder in MAY_IMPORT:
@@ -71,8 +71,8 @@ def modules():
 
 
 def test_modules_have_no_import_cycle():
-    """Imports inside functions are left out: they are made when both modules exist."""
-    known = modules()
+    """Imports inside functions are ignored: they are executed after both modules are loaded."""
+    known = module_paths()
     graph = {}
     for module, path in known.items():
         top_level = [

@@ -1,4 +1,4 @@
-"""Docstrings of exported names: arguments, shapes and exceptions. The reference is generated from them."""
+"""Docstrings of exported names describe arguments, array shapes and exceptions; they are the reference's source."""
 
 import ast
 import dataclasses
@@ -21,34 +21,34 @@ EXPORTED = {
     if name[:2] != "__"
 }
 CALLABLES = {
-    f"{thing.__module__}.{thing.__qualname__}": thing
-    for thing in EXPORTED.values()
-    if inspect.isclass(thing) or inspect.isfunction(thing)
+    f"{exported.__module__}.{exported.__qualname__}": exported
+    for exported in EXPORTED.values()
+    if inspect.isclass(exported) or inspect.isfunction(exported)
 }
 
 
-def functions(thing):
-    """Return a function itself, or the constructor and the public methods that a class defines."""
-    if inspect.isfunction(thing):
-        return {thing.__name__: thing}
+def functions(exported):
+    """Return a function by name, or the constructor and the public methods that a class defines."""
+    if inspect.isfunction(exported):
+        return {exported.__name__: exported}
     result = {}
-    for name, value in vars(thing).items():
+    for name, value in vars(exported).items():
         function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
         function = function.fget if isinstance(function, property) else function
-        if dataclasses.is_dataclass(thing) and name in {one.name for one in dataclasses.fields(thing)}:
-            continue  # the default value is a function
+        if dataclasses.is_dataclass(exported) and name in {field.name for field in dataclasses.fields(exported)}:
+            continue  # a field whose default value is a function
         if inspect.isfunction(function) and (name == "__init__" or not name.startswith("_")):
             result[name] = function
     # The constructor of a dataclass takes its fields, which the class documents; a protocol has no constructor.
-    if dataclasses.is_dataclass(thing) or getattr(thing, "_is_protocol", False):
+    if dataclasses.is_dataclass(exported) or getattr(exported, "_is_protocol", False):
         result.pop("__init__", None)
     return result
 
 
-def documented(function, thing):
-    """Return the docstring of a function; for a constructor together with that of its class."""
+def docstring(function, exported):
+    """Return the docstring of a function, preceded by the docstring of the class for a constructor."""
     doc = inspect.getdoc(function) or ""
-    return f"{inspect.getdoc(thing) or ''}\n{doc}" if function.__name__ == "__init__" else doc
+    return f"{inspect.getdoc(exported) or ''}\n{doc}" if function.__name__ == "__init__" else doc
 
 
 def section(doc, name):
@@ -57,21 +57,17 @@ def section(doc, name):
     return result[1] if result else ""
 
 
-def arguments(function):
-    return [name for name in inspect.signature(function).parameters if name not in ("self", "cls")]
-
-
-def refuses(function):
-    """Return True if the function itself raises InputError."""
+def raises_input_error(function):
+    """Return True if the body of the function has `raise InputError(...)`."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
-    raised = (node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call))
-    return any(isinstance(one.func, ast.Name) and one.func.id == "InputError" for one in raised)
+    calls = (node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call))
+    return any(isinstance(call.func, ast.Name) and call.func.id == "InputError" for call in calls)
 
 
-def entries(described):
-    """Return the description of each argument in a section."""
+def entries(sections):
+    """Return the description of each argument in sections of a docstring, by name."""
     result, names = {}, []
-    for line in described.splitlines():
+    for line in sections.splitlines():
         entry = re.match(r"^    (\S[\w, /*]*):\s+(.*)$", line)
         if entry:
             names = [name.strip(" *") for name in re.split("[,/]", entry[1])]
@@ -80,7 +76,7 @@ def entries(described):
     return result
 
 
-# (N,), (n, 6), (H+1, O, O) or (∗, 7), or the word "shape".
+# A shape such as (N,), (n, 6), (H+1, O, O) or (∗, 7), or the word "shape".
 SHAPE = re.compile(r"\((?:[\w ]|[+−∗·…()])+(?:, ?[^)]*|,)\)|\bshape")
 
 
@@ -88,47 +84,45 @@ def is_array(annotation):
     return bool(re.search("ndarray|ArrayLike", str(annotation))) and "Callable" not in str(annotation)
 
 
-@pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_exported_arrays_have_shapes(thing):
+@pytest.mark.parametrize("exported", CALLABLES.values(), ids=CALLABLES)
+def test_exported_arrays_have_shapes(exported):
     descriptions = []
-    for name, function in functions(thing).items():
-        doc, signature = documented(function, thing), inspect.signature(function)
-        described = entries(section(doc, "Args") + section(doc, "Attributes"))
+    for name, function in functions(exported).items():
+        doc, signature = docstring(function, exported), inspect.signature(function)
+        description_by_name = entries(section(doc, "Args") + section(doc, "Attributes"))
         for argument, parameter in signature.parameters.items():
             if is_array(parameter.annotation):
-                descriptions.append((f"{name}({argument})", described.get(argument, doc)))
+                descriptions.append((f"{name}({argument})", description_by_name.get(argument, doc)))
         if is_array(signature.return_annotation):
             descriptions.append((f"return value of {name}", doc))
-    if dataclasses.is_dataclass(thing):
-        doc = inspect.getdoc(thing)
-        described = entries(section(doc, "Attributes") + section(doc, "Args"))
-        descriptions += [
-            (one.name, described.get(one.name, "")) for one in dataclasses.fields(thing) if is_array(one.type)
-        ]
-    missing = [name for name, words in descriptions if not SHAPE.search(words)]
-    assert not missing, f"{', '.join(missing)}: no shape is given"
+    if dataclasses.is_dataclass(exported):
+        doc = inspect.getdoc(exported)
+        description_by_name = entries(section(doc, "Attributes") + section(doc, "Args"))
+        arrays = [field.name for field in dataclasses.fields(exported) if is_array(field.type)]
+        descriptions += [(name, description_by_name.get(name, "")) for name in arrays]
+    missing = [name for name, description in descriptions if not SHAPE.search(description)]
+    assert not missing, f"{', '.join(missing)}: the shape is not documented"
 
 
-@pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_exported_names_have_docstrings_with_raises(thing):
-    assert (inspect.getdoc(thing) or "").strip()
-    for name, function in functions(thing).items():
-        doc = documented(function, thing)
+@pytest.mark.parametrize("exported", CALLABLES.values(), ids=CALLABLES)
+def test_exported_names_have_docstrings_with_raises(exported):
+    assert (inspect.getdoc(exported) or "").strip()
+    for name, function in functions(exported).items():
+        doc = docstring(function, exported)
         assert doc.strip(), f"{name} has no docstring"
-        if refuses(function):
+        if raises_input_error(function):
             assert "InputError" in section(doc, "Raises"), f"{name} has no Raises section for InputError"
 
 
-@pytest.mark.parametrize("thing", CALLABLES.values(), ids=CALLABLES)
-def test_exported_arguments_are_described(thing):
-    if dataclasses.is_dataclass(thing):
-        doc = inspect.getdoc(thing)
-        described = section(doc, "Attributes") + section(doc, "Args")
-        missing = [one.name for one in dataclasses.fields(thing) if not re.search(rf"\b{one.name}\b", described)]
-        assert not missing, f"fields {', '.join(missing)} are not described"
-        return
-    constructor = functions(thing).get("__init__" if inspect.isclass(thing) else thing.__name__)
-    if constructor is not None:
-        described = section(documented(constructor, thing), "Args")
-        missing = [name for name in arguments(constructor) if not re.search(rf"\b{name}\b", described)]
-        assert not missing, f"arguments {', '.join(missing)} are not described"
+@pytest.mark.parametrize("exported", CALLABLES.values(), ids=CALLABLES)
+def test_exported_arguments_are_described(exported):
+    if dataclasses.is_dataclass(exported):
+        doc = inspect.getdoc(exported)
+        section_text = section(doc, "Attributes") + section(doc, "Args")
+        names = [field.name for field in dataclasses.fields(exported)]
+    else:
+        function = functions(exported).get("__init__" if inspect.isclass(exported) else exported.__name__)
+        section_text = section(docstring(function, exported), "Args") if function else ""
+        names = [name for name in inspect.signature(function).parameters if name != "self"] if function else []
+    missing = [name for name in names if not re.search(rf"\b{name}\b", section_text)]
+    assert not missing, f"{', '.join(missing)}: not described"

@@ -1,4 +1,4 @@
-"""The import root `guiderail`: lazy public names, in any working directory and for tools that read code."""
+"""Import root `guiderail`: lazy public names in any working directory, and the stub for type checkers."""
 
 import ast
 import pkgutil
@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 STUB = ROOT / "src" / "guiderail" / "__init__.pyi"
 
 
-def test_package_tools_find_the_four_parts():
+def test_package_has_four_folders_and_its_version():
     assert {module.name for module in pkgutil.iter_modules(guiderail.__path__)} >= {
         "models", "systems", "diagrams", "tools",
     }  # fmt: skip
@@ -30,14 +30,15 @@ def test_public_names_match_the_stub():
             assert alias.name in guiderail.__all__
 
 
-def run_elsewhere(code, tmp_path):
-    """Run code in an interpreter with another working directory."""
-    return subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+def output_of(tmp_path, *arguments):
+    """Return the output of an interpreter with these arguments in another working directory."""
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
 
 
 def test_import_does_not_load_drake_or_torch(tmp_path):
     code = "import sys, guiderail; print(guiderail.__version__, 'pydrake' in sys.modules, 'torch' in sys.modules)"
-    assert run_elsewhere(code, tmp_path).stdout.split()[1:] == ["False", "False"]
+    assert output_of(tmp_path, "-c", code).split()[1:] == ["False", "False"]
 
 
 def test_import_registers_environments_without_drake(tmp_path):
@@ -47,10 +48,8 @@ imported = {"pydrake", "pydantic", "torch"} & {*sys.modules}
 env = gymnasium.make("guiderail/NarrowPassage-v0", guidance="kgrl")
 print(imported, env.unwrapped.action_space.shape)
 """
-    assert run_elsewhere(code, tmp_path).stdout.split() == ["set()", "(2,)"]
+    assert output_of(tmp_path, "-c", code).split() == ["set()", "(2,)"]
 
 
 def test_package_runs_as_the_command(tmp_path):
-    command = [sys.executable, "-m", "guiderail", "--version"]
-    printed = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    assert printed == f"guiderail {guiderail.__version__}\n"
+    assert output_of(tmp_path, "-m", "guiderail", "--version") == f"guiderail {guiderail.__version__}\n"

@@ -1,4 +1,4 @@
-"""The core of the package: movement primitives, templates and constraints run without Drake and PyTorch."""
+"""Core of the package: movement primitives, templates and constraints, which run without Drake and PyTorch."""
 
 import subprocess
 import sys
@@ -21,8 +21,8 @@ sys.meta_path.insert(0, Blocked())
 """
 
 
-def run_light(code, *, exit_code=0):
-    """Run code in an interpreter that has no module of an extra; return its output."""
+def run_without_extras(code, *, exit_code=0):
+    """Return the output of code in an interpreter that cannot import the modules of the extras."""
     program = BLOCK + textwrap.dedent(code)
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert result.returncode == exit_code, result.stderr
@@ -30,7 +30,7 @@ def run_light(code, *, exit_code=0):
 
 
 def test_primitive_and_templates_run_without_extras():
-    printed = run_light("""
+    output = run_without_extras("""
     import numpy as np
     from guiderail import Demonstrations, LcNsKmp, LinearConstraints, ReferenceTrajectory, load_template
     from guiderail.models.common.transforms import RigidTransform
@@ -56,11 +56,11 @@ def test_primitive_and_templates_run_without_extras():
     assert not [finding for finding in validate(template) if finding.is_error]
     print(not {"pydrake", "torch", "pandas"} & set(sys.modules))
     """)
-    assert printed.strip() == "True"
+    assert output.strip() == "True"
 
 
 def test_guided_env_runs_without_extras():
-    printed = run_light(f"""
+    output = run_without_extras(f"""
     sys.path.insert(0, {str(Path(__file__).parent)!r})
     import numpy as np
     from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
@@ -73,17 +73,17 @@ def test_guided_env_runs_without_extras():
     env.reset(seed=0)
     print(env.step(np.zeros(3))[4]["phase"], not {{"pydrake", "torch", "pandas"}} & set(sys.modules))
     """)
-    assert printed.strip() == "0.2 True"
+    assert output.strip() == "0.2 True"
 
 
-def test_learners_for_other_environments_need_neither_drake_nor_pandas():
-    """The environment with metaworld and robosuite (`make outside`) has neither."""
-    printed = run_light("""
-    sys.meta_path.pop(0)
+def test_learners_import_neither_drake_nor_pandas():
+    """The virtual environment with metaworld and robosuite (`make outside`) has neither package."""
+    output = run_without_extras("""
+    sys.meta_path.pop(0)  # the extras can be imported
     from guiderail.tools.learning import fast_sb3, networks, sb3
     print(not {"pydrake", "pandas"} & set(sys.modules))
     """)
-    assert printed.strip() == "True"
+    assert output.strip() == "True"
 
 
 @pytest.mark.parametrize(
@@ -95,14 +95,14 @@ def test_learners_for_other_environments_need_neither_drake_nor_pandas():
         ("import guiderail; guiderail.train", "pandas", "sim"),
     ],
 )
-def test_missing_extra_is_named_with_the_command_that_installs_it(code, software, extra):
-    printed = run_light(code, exit_code=1)
-    assert f'this needs {software}, which is not installed: pip install "guiderail[{extra}]"' in printed
+def test_missing_extra_is_named_with_its_install_command(code, software, extra):
+    output = run_without_extras(code, exit_code=1)
+    assert f'this needs {software}, which is not installed: pip install "guiderail[{extra}]"' in output
 
 
 def test_command_without_extras_exits_with_2_and_one_sentence():
-    printed = run_light("from guiderail.__main__ import main; main()", exit_code=2)
-    assert printed == 'guiderail: this needs typer, which is not installed: pip install "guiderail[sim]"\n'
+    output = run_without_extras("from guiderail.__main__ import main; main()", exit_code=2)
+    assert output == 'guiderail: this needs typer, which is not installed: pip install "guiderail[sim]"\n'
 
 
 def test_train_without_torch_exits_with_2_and_names_the_extra(tmp_path):
@@ -116,14 +116,14 @@ def test_train_without_torch_exits_with_2_and_names_the_extra(tmp_path):
     from guiderail.__main__ import main
     main()
     """
-    printed = run_light(code, exit_code=2)
-    assert 'which is not installed: pip install "guiderail[learn]"' in printed
-    assert len(printed.splitlines()) == 1
+    output = run_without_extras(code, exit_code=2)
+    assert 'which is not installed: pip install "guiderail[learn]"' in output
+    assert len(output.splitlines()) == 1
     assert not (tmp_path / "run").exists()
 
 
-def test_other_missing_module_is_not_explained():
-    printed = run_light(
+def test_missing_module_of_no_extra_raises_the_import_error():
+    output = run_without_extras(
         "from guiderail.models.common.errors import require_extra; require_extra('absent')", exit_code=1
     )
-    assert "ModuleNotFoundError: No module named 'absent'" in printed
+    assert "ModuleNotFoundError: No module named 'absent'" in output

@@ -1,4 +1,4 @@
-"""The sdist and the wheel: complete, and importable without the repository."""
+"""Source distribution (sdist) and wheel: complete, and importable without the repository."""
 
 import shutil
 import subprocess
@@ -14,7 +14,7 @@ FOLDERS = ("models", "systems", "diagrams", "tools")
 
 
 def tracked_files():
-    """Return the names of the files of the repository."""
+    """Return the sorted names of all files of the repository that git does not ignore."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     names = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
     return sorted(name for name in names if name and (ROOT / name).exists())
@@ -22,7 +22,7 @@ def tracked_files():
 
 @pytest.fixture(scope="module")
 def packages(tmp_path_factory):
-    """Return the extracted sdist of the tracked files, and the content of the wheel built from it."""
+    """Return the folders of the extracted sdist of the tracked files and of the extracted wheel built from it."""
     source, build = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("build")
     for name in tracked_files():
         target = source / name
@@ -33,19 +33,19 @@ def packages(tmp_path_factory):
     (archive,) = build.glob("*.tar.gz")
     with tarfile.open(archive) as file:
         file.extractall(build, filter="data")
-    (unpacked,) = (path for path in build.iterdir() if path.is_dir())
-    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", build, unpacked]
+    (sdist,) = (path for path in build.iterdir() if path.is_dir())
+    pip = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", build, sdist]
     subprocess.run(pip, check=True)
     (wheel,) = build.glob("*.whl")
     installed = tmp_path_factory.mktemp("installed")
     zipfile.ZipFile(wheel).extractall(installed)
-    return unpacked, installed
+    return sdist, installed
 
 
 def test_sdist_has_every_tracked_file(packages):
-    unpacked, _ = packages
+    sdist, _ = packages
     links = {f"src/guiderail/{folder}" for folder in FOLDERS}
-    missing = [name for name in tracked_files() if name not in links and not (unpacked / name).is_file()]
+    missing = [name for name in tracked_files() if name not in links and not (sdist / name).is_file()]
     assert not missing
 
 
@@ -58,7 +58,7 @@ def test_wheel_has_exactly_the_four_folders(packages):
     assert {path.name for path in (installed / "guiderail").iterdir() if path.is_dir()} == set(FOLDERS)
 
 
-NOT_INSTALLED = {"guiderail.diagrams.hardware.fci_simulated"}  # needs franky-sim, which has an environment of its own
+NOT_IMPORTABLE = {"guiderail.diagrams.hardware.fci_simulated"}  # needs franky-sim, which is in another environment
 
 
 def test_every_module_imports_from_the_wheel(packages, forks):
@@ -67,7 +67,7 @@ def test_every_module_imports_from_the_wheel(packages, forks):
         ".".join(path.relative_to(installed).with_suffix("").parts).removesuffix(".__init__")
         for path in (installed / "guiderail").rglob("*.py")
     )
-    modules = [name for name in modules if name not in NOT_INSTALLED]
+    modules = [name for name in modules if name not in NOT_IMPORTABLE]
     code = (
         "import sys, importlib\nfor name in [name for name in sys.modules if name.split('.')[0] == 'guiderail']: "
         f"del sys.modules[name]\nsys.path.insert(0, {str(installed)!r}); sys.meta_path = "

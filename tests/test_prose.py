@@ -1,4 +1,4 @@
-"""Prose of docstrings, comments, help texts and pages."""
+"""Rules for the prose of docstrings, comments, help texts and pages."""
 
 import ast
 import io
@@ -13,7 +13,6 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FRAGMENT = re.compile(r"(Of|What|How|Where|Whether|Who|Whoever|That)\b(?![^.]*\?)")  # a question is no fragment
 WORD = re.compile(r"\b(whoever|nobody|somebody|anew)\b", re.IGNORECASE)
-# Folders and files that are checked.
 CHECKED = (
     "CONTRIBUTING.md",
     "README.md",
@@ -28,8 +27,7 @@ CHECKED = (
     "tests/",
     "tools/",
 )
-# Calls whose text arguments are shown as help.
-HELP_CALLS = {"Option", "Argument", "add_argument", "Field", "opt", "arg"}
+HELP_CALLS = {"Option", "Argument", "add_argument", "Field", "opt", "arg"}  # their text arguments are help texts
 NOT_CHECKED = (
     "CHANGELOG.md",
     "docs/changelog.md",
@@ -39,7 +37,7 @@ NOT_CHECKED = (
 
 
 def tracked(*endings):
-    """Return the checked files of git with one of the endings."""
+    """Return the checked files with one of the endings that git does not ignore."""
     names = subprocess.run(
         ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
         cwd=ROOT,
@@ -77,7 +75,7 @@ def comments(source):
 
 
 def report(violations):
-    """Return a message that counts and lists violations."""
+    """Return a message with the number of violations of each word and the list of all violations."""
     counts = ", ".join(f"{count} × {word}" for word, count in Counter(word for _, _, word in violations).most_common())
     return "\n".join([f"{len(violations)}: {counts}", *(f"{path}:{line}: {word}" for path, line, word in violations)])
 

@@ -1,4 +1,4 @@
-"""Files of the repository that have to agree with each other."""
+"""Consistency of versions, extras, make targets and workflows between the files of the repository."""
 
 import re
 import subprocess
@@ -22,16 +22,15 @@ def test_version_is_the_same_in_every_file():
 def test_all_extra_has_every_extra_of_users():
     extras = PROJECT["optional-dependencies"]
     (requirement,) = extras["all"]
-    named = set(re.search(r"\[(.*)\]", requirement)[1].split(","))
-    assert named == extras.keys() - {"all", "docs", "dev"}
+    listed = set(re.search(r"\[(.*)\]", requirement)[1].split(","))
+    assert listed == extras.keys() - {"all", "docs", "dev"}
 
 
 def test_bare_make_prints_every_documented_target():
-    # Inside `make test`, make would also print which folder it enters.
-    command = ["make", "--no-print-directory"]
-    printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    command = ["make", "--no-print-directory"]  # inside `make test`, make would also print the folder that it enters
+    output = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     phony = re.search(r"^\.PHONY: (.*)$", (ROOT / "Makefile").read_text(), re.M)[1].split()
-    assert [line.split()[1] for line in printed.splitlines()] == phony
+    assert [line.split()[1] for line in output.splitlines()] == phony
 
 
 @pytest.mark.parametrize("path", [*ROOT.glob(".github/**/*.yml"), *ROOT.glob(".*.yaml")], ids=lambda path: path.name)

@@ -1,4 +1,4 @@
-"""The animations of the gallery: complete, small and up to date."""
+"""Animations of the gallery page: complete, small and up to date."""
 
 import json
 import re
@@ -14,7 +14,7 @@ NAMES = re.findall(r"\]\(pictures/(\w+)\.webp\)", (DOCS / "gallery.md").read_tex
 
 @pytest.fixture(scope="module")
 def gallery():
-    """Return the module that renders the gallery, which is not part of the package."""
+    """Return the module in `docs/` that renders the gallery."""
     sys.path.insert(0, str(DOCS))
     try:
         import make_gallery
@@ -34,7 +34,7 @@ def test_animation_is_small_and_moves(gallery, name):
     assert path.stat().st_size < 250_000
     with Image.open(path) as picture:
         assert picture.n_frames > gallery.FRAMES // 2
-        first, last = (picture.seek(n) or picture.convert("RGB") for n in (0, picture.n_frames - 1))
+        first, last = (picture.seek(frame) or picture.convert("RGB") for frame in (0, picture.n_frames - 1))
     assert first.tobytes() != last.tobytes()
 
 
@@ -51,7 +51,7 @@ def test_endings_are_stored_for_every_panel(gallery):
 def test_endings_in_the_passage_are_up_to_date(gallery):
     endings = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
     name = "passage_constraint"
-    panels, size, every = gallery.PICTURES[name]
+    panels, size, steps_per_frame = gallery.PICTURES[name]
     for panel in panels():
-        gallery.run_panel(panel, size, every)
+        gallery.run_panel(panel, size, steps_per_frame)
         assert panel.ending() == endings[name][panel.title], f"{name} is stale: make gallery"

@@ -1,4 +1,4 @@
-"""Notebooks in `examples/notebooks`: their cells run, in order, and no output is stored."""
+"""Notebooks in `examples/notebooks`: the cells run in order, and no output is stored."""
 
 import json
 import shutil
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-PLAIN_PICTURES = "import run_pages; run_pages.plain_pictures()"
+SHORTEN_PICTURES = "import run_pages; run_pages.shorten_pictures()"
 NOTEBOOKS = sorted((Path(__file__).parents[2] / "examples" / "notebooks").glob("*.ipynb"))
 
 
@@ -18,12 +18,12 @@ def code_cells(notebook):
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebook_runs(notebook, forks, tmp_path):
     program = tmp_path / "cells.py"
-    shutil.copy(Path(__file__).with_name("run_pages.py"), tmp_path)  # next to the program, where it can be imported
-    program.write_text("\n".join([PLAIN_PICTURES, *("".join(cell["source"]) for cell in code_cells(notebook))]))
+    shutil.copy(Path(__file__).with_name("run_pages.py"), tmp_path)  # the program imports it from its own folder
+    program.write_text("\n".join([SHORTEN_PICTURES, *("".join(cell["source"]) for cell in code_cells(notebook))]))
     finished = forks.run(program, folder=tmp_path, MPLBACKEND="agg", OMP_NUM_THREADS="1")
     assert finished.returncode == 0, finished.stderr
 
 
-def test_each_of_the_first_steps_has_a_notebook_without_outputs():
+def test_notebooks_are_complete_and_have_no_outputs():
     assert [path.stem for path in NOTEBOOKS] == ["1_environment", "2_train", "3_evaluate"]
     assert not any(cell["outputs"] for notebook in NOTEBOOKS for cell in code_cells(notebook))

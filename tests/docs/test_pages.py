@@ -1,4 +1,4 @@
-"""Links and tables of contents of the pages, and completeness of the reference."""
+"""Links and tables of contents of the pages, completeness of the reference, and limits on the robot page."""
 
 import inspect
 import re
@@ -15,7 +15,7 @@ LINK = re.compile(r"\]\(([^)#\s]+)(?:#[^)]*)?\)")
 
 @pytest.fixture(scope="module")
 def generator():
-    """Return the module that generates the reference, which is not part of the package."""
+    """Return the module in `docs/` that generates the reference."""
     sys.path.insert(0, str(DOCS))
     try:
         import make_reference
@@ -26,6 +26,7 @@ def generator():
 
 @pytest.fixture(scope="module")
 def reference(generator):
+    """Return the text of each generated page of the reference, by name."""
     return {name: page() for name, page in generator.PAGES.items()}
 
 
@@ -35,7 +36,7 @@ def test_links_of_pages_have_targets(generator):
         for link in LINK.findall(page.read_text(encoding="utf-8")):
             if "://" not in link:
                 target = (page.parent / link).resolve()
-                assert target in generated or target.is_file(), f"{page.name} leads to {link}"
+                assert target in generated or target.is_file(), f"{page.name} links to {link}, which does not exist"
 
 
 def test_every_page_is_in_the_contents():
@@ -62,7 +63,7 @@ def test_reference_has_every_system_with_its_ports(reference):
             for method, getter in vars(system).items():
                 result = re.fullmatch(r"get_(\w+)_(input|output)_port", method)
                 if result and "name" not in inspect.signature(getter).parameters:
-                    assert f"| {result[2]} | `{result[1]}` |" in part, f"{name} lacks {result[1]}"
+                    assert f"| {result[2]} | `{result[1]}` |" in part, f"{name} lacks the port {result[1]}"
 
 
 def test_reference_has_every_command_task_and_template_kind(reference):
@@ -75,11 +76,14 @@ def test_reference_has_every_command_task_and_template_kind(reference):
 
     commands = {}
     for name, command in typer.main.get_command(load_commands()).commands.items():
-        parts = getattr(command, "commands", None)
-        commands |= {name: command} if parts is None else {f"{name} {part}": one for part, one in parts.items()}
+        subcommands = getattr(command, "commands", None)
+        if subcommands is None:
+            commands[name] = command
+        else:
+            commands |= {f"{name} {subname}": subcommand for subname, subcommand in subcommands.items()}
     for name, command in commands.items():
         part = reference["command"].partition(f"\n## guiderail {name}\n")[2].partition("\n## ")[0]
-        for option in (one for parameter in command.params for one in parameter.opts if one[:2] == "--"):
+        for option in (text for parameter in command.params for text in parameter.opts if text[:2] == "--"):
             assert option == "--help" or f"`{option}" in part or f", {option}" in part, f"{name} lacks {option}"
     assert all(f"\n## Task {name}\n" in reference["options"] for name in TASKS.names() if "/" not in name)
     kinds = (*ACTIVE_CONSTRAINTS, *INPUT_MAPPINGS, *TRANSITION_DISTANCES)
@@ -90,7 +94,7 @@ def test_reference_has_every_command_task_and_template_kind(reference):
 def test_template_fields_have_descriptions(reference):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| .* \|$", reference["templates"], re.MULTILINE)
     assert len(rows) > 50
-    assert not [name for name, _, words in rows if not words.strip()]
+    assert not [name for name, _, description in rows if not description.strip()]
 
 
 def test_reference_has_task_attributes_and_shipped_templates(reference):
@@ -112,7 +116,6 @@ def test_reference_has_no_local_path(reference):
 
 
 def test_robot_page_has_the_limits_of_the_code():
-    """Compare the table of limits with the constants."""
     import numpy as np
 
     from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE

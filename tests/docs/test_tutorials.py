@@ -1,4 +1,4 @@
-"""Blocks of tutorials and cells of notebooks: they run and print what the page shows."""
+"""Code blocks of tutorials and cells of notebook pages: they run, and tutorials show the printed output."""
 
 import json
 import re
@@ -19,7 +19,7 @@ LONG_PAGES = {"compose_systems": 220}  # a complete program, from the plant to t
 
 @pytest.fixture(scope="module")
 def failures(forks):
-    """Return the failure of each page, an empty text if there is none."""
+    """Return the failure of each page by name; an empty text means none."""
     environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1", "MPLBACKEND": "agg"}
     finished = forks.run(Path(__file__).with_name("run_pages.py"), *RUN, *NOTEBOOKS, **environment)
     assert finished.returncode == 0, finished.stderr
@@ -27,14 +27,14 @@ def failures(forks):
 
 
 @pytest.mark.parametrize("page", RUN + NOTEBOOKS, ids=lambda path: path.stem)
-def test_page_runs_and_prints_what_it_shows(page, failures):
+def test_page_runs_and_shows_the_printed_output(page, failures):
     assert not failures[page.stem], failures[page.stem]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
 def test_tutorial_is_short_and_in_the_contents(page):
     assert len(page.read_text(encoding="utf-8").splitlines()) <= LONG_PAGES.get(page.stem, MAX_LINES)
-    assert f"tutorials/{page.stem}\n" in (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    assert f"tutorials/{page.stem}\n" in (DOCS / "index.md").read_text(encoding="utf-8")
 
 
 def test_concept_pages_are_notebooks():
@@ -53,19 +53,19 @@ def test_wrong_output_is_reported(forks, tmp_path):
     page = tmp_path / "wrong.md"
     page.write_text("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", encoding="utf-8")
     finished = forks.run(Path(__file__).with_name("run_pages.py"), page)
-    assert "it prints" in json.loads(finished.stdout)["wrong"]
+    assert "the step prints" in json.loads(finished.stdout)["wrong"]
 
 
 def test_files_named_in_pages_exist():
-    for page in [*(ROOT / "docs").glob("*.md"), *(ROOT / "docs" / "concepts").glob("*.md"), *PAGES]:
+    for page in [*DOCS.glob("*.md"), *DOCS.glob("concepts/*.md"), *PAGES]:
         for name in re.findall(
             r"`((?:examples|models|diagrams|tests|systems|tools)/[\w./]+)`", page.read_text("utf-8")
         ):
-            assert (ROOT / name).exists(), f"{page.name} names {name}"
+            assert (ROOT / name).exists(), f"{page.name} names {name}, which does not exist"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda path: path.stem)
-def test_page_trusts_the_imports_of_its_runs(page):
+def test_evaluation_trusts_imports_when_training_has_imports(page):
     text = page.read_text("utf-8")
     for run in re.findall(r"guiderail train .*--import .*--out ([\w/]+)", text):
-        assert all("--trust-imports" in rest for rest in re.findall(rf"guiderail evaluate {run}\b(.*)", text))
+        assert all("--trust-imports" in options for options in re.findall(rf"guiderail evaluate {run}\b(.*)", text))

@@ -1,6 +1,6 @@
-"""Run programs one after the other in one process, because importing takes longer than most of them.
+"""Run programs one after the other in one process, because imports take longer than most programs.
 
-Prints one JSON object from file to its standard output and its traceback, if it failed.
+Prints a JSON object that maps each file to its standard output and its traceback; the traceback is empty on success.
 """
 
 import contextlib
@@ -15,15 +15,15 @@ def main() -> None:
     files, result = sys.argv[1:], {}
     for file in files:
         sys.argv = [file]
-        printed, wrong = io.StringIO(), ""
-        with contextlib.redirect_stdout(printed):
+        output, failure = io.StringIO(), ""
+        with contextlib.redirect_stdout(output):
             try:
                 runpy.run_path(file, run_name="__main__")
             except Exception:
-                wrong = traceback.format_exc()
-        result[file] = {"printed": printed.getvalue(), "wrong": wrong}
+                failure = traceback.format_exc()
+        result[file] = {"output": output.getvalue(), "failure": failure}
     print(json.dumps(result))
 
 
-if __name__ == "__main__":  # processes that an example starts import this file
+if __name__ == "__main__":  # child processes of an example import this file
     main()

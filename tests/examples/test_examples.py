@@ -1,4 +1,4 @@
-"""Examples: they run, are short and pass the type checker."""
+"""Examples run, are short and pass the type checker."""
 
 import json
 import subprocess
@@ -9,12 +9,12 @@ import pytest
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 FILES = sorted(EXAMPLES.glob("*.py"))
-LINES = 60
+MAX_LINES = 60
 
 
 @pytest.fixture(scope="module")
-def found(forks, tmp_path_factory):
-    """Return the output of each example, run in another folder."""
+def results(forks, tmp_path_factory):
+    """Return the output and the failure of each example, run in another folder."""
     program = Path(__file__).with_name("run_all.py")
     environment = {"DRAKE_ALLOW_NETWORK": "meshcat", "OMP_NUM_THREADS": "1"}
     finished = forks.run(program, *FILES, folder=tmp_path_factory.mktemp("elsewhere"), **environment)
@@ -23,10 +23,11 @@ def found(forks, tmp_path_factory):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda path: path.stem)
-def test_example_runs_in_another_folder(file, found):
-    assert not found[str(file)]["wrong"], found[str(file)]["wrong"]
-    assert found[str(file)]["printed"].strip()
-    assert len(file.read_text().splitlines()) <= LINES
+def test_example_is_short_and_runs_in_another_folder(file, results):
+    result = results[str(file)]
+    assert not result["failure"], result["failure"]
+    assert result["output"].strip()
+    assert len(file.read_text().splitlines()) <= MAX_LINES
 
 
 def test_examples_pass_mypy_without_path_settings(tmp_path):
@@ -34,7 +35,7 @@ def test_examples_pass_mypy_without_path_settings(tmp_path):
     # Other packages are skipped, because reading them takes seconds.
     skipped = "pydrake.*,numpy.*,scipy.*,pandas.*,pydantic.*,gymnasium.*,matplotlib.*,torch.*"
     configuration.write_text(f"[mypy]\n[mypy-{skipped}]\nfollow_imports = skip\nfollow_imports_for_stubs = True\n")
-    # mypy searches the interpreter's packages: an editable install must be enough.
+    # mypy searches the packages of this interpreter, where an editable install must suffice.
     command = [sys.executable, "-m", "mypy", "--config-file", str(configuration), *map(str, FILES)]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert "import-not-found" not in result.stdout, result.stdout

@@ -1,6 +1,6 @@
-"""Export of a policy to LeRobot, with doubles of LeRobot's modules.
+"""Export of a policy to LeRobot, tested with doubles of LeRobot's modules.
 
-`make lerobot` tests it with the real library.
+`make lerobot` tests the export with the real library.
 """
 
 import importlib.util
@@ -15,7 +15,7 @@ import pytest
 from safetensors.numpy import save_file
 
 FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/export.py"
-IMPORTED = {
+DOUBLES = {
     "lerobot.configs": ("FeatureType", "PolicyFeature"),
     "lerobot.utils.constants": ("ACTION", "OBS_STATE"),
     "lerobot_robot_guiderail.configuration_guiderail": ("GuiderailConfig",),
@@ -26,12 +26,12 @@ IMPORTED = {
 
 @pytest.fixture
 def module(monkeypatch):
-    """Return the module, imported with doubles of LeRobot's modules and of those that need LeRobot."""
+    """Return the export module, imported with doubles of LeRobot's modules and of modules that import LeRobot."""
     for name in ("lerobot", "lerobot.utils", "lerobot_robot_guiderail"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    for name, contents in IMPORTED.items():
+    for name, members in DOUBLES.items():
         double = ModuleType(name)
-        vars(double).update({content: MagicMock() for content in contents})
+        vars(double).update({member: MagicMock() for member in members})
         monkeypatch.setitem(sys.modules, name, double)
     spec = importlib.util.spec_from_file_location("guiderail_lerobot_export", FILE)
     module = importlib.util.module_from_spec(spec)

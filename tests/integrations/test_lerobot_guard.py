@@ -1,6 +1,6 @@
-"""Guard of chunks as a step of LeRobot's processors, with a double of LeRobot's interface.
+"""Guard of chunks as a step of LeRobot's processors, tested with a double of LeRobot's interface.
 
-`make lerobot` tests it with the real library.
+`make lerobot` tests the guard with the real library.
 """
 
 import importlib.util
@@ -13,17 +13,17 @@ import pytest
 import torch
 
 FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/guard.py"
-PERIOD, VELOCITY, JERK, BOUND = 0.1, 0.5, 5.0, 0.2
+PERIOD, VELOCITY, JERK, BOUND = 0.1, 0.5, 5.0, 0.2  # [s], [unit/s], [unit/s³], [unit]
 NAMES = ["a.pos", "b.pos"]
 
 
 @pytest.fixture(scope="module")
 def guard():
-    """Return the module, imported with a double of `lerobot.processor`."""
-    registered = {}
+    """Return the guard module, imported with a double of `lerobot.processor`."""
+    registry = {}
 
     def register(name):
-        return lambda kind: registered.setdefault(name, kind)
+        return lambda kind: registry.setdefault(name, kind)
 
     processor = ModuleType("lerobot.processor")
     processor.ProcessorStep = type("ProcessorStep", (), {})
@@ -37,17 +37,25 @@ def guard():
             patch.setitem(sys.modules, name, double)
         patch.setitem(sys.modules, spec.name, module)
         spec.loader.exec_module(module)
-    assert registered == {"guiderail_chunk_guard": module.ChunkGuardProcessorStep}
+    assert registry == {"guiderail_chunk_guard": module.ChunkGuardProcessorStep}
     return module
 
 
 def make(guard, **changes):
+    """Return the processor step for two joints, of which only the first has bounds of its position."""
     limits = {"lower": [-BOUND, None], "upper": [BOUND, None], "velocity": [VELOCITY] * 2, "jerk": [JERK] * 2}
     return guard.ChunkGuardProcessorStep(**limits | {"period": PERIOD, "start": [0.0, 0.0], "names": NAMES} | changes)
 
 
 def send(step, action, observation=None):
+    """Return the action that the processor step outputs."""
     return step({"action": action, "observation": observation})["action"]
+
+
+def assert_motion_is_within_limits(motion):
+    """Assert that a motion (n, 2) is within the limits of velocity and jerk."""
+    assert np.abs(np.diff(motion, axis=0)).max() <= VELOCITY * PERIOD * (1 + 1e-9)
+    assert np.abs(np.diff(motion, n=3, axis=0)).max() <= JERK * PERIOD**3 * (1 + 1e-9)
 
 
 @pytest.mark.parametrize("mode", ["projection", "slowdown"])
@@ -55,15 +63,14 @@ def send(step, action, observation=None):
 def test_actions_are_within_the_limits(guard, shape, mode):
     step, random = make(guard, mode=mode), np.random.default_rng(1)
     sent = [send(step, torch.from_numpy(random.uniform(-0.5, 0.5, shape))) for _ in range(30)]
-    assert all(one.shape == shape for one in sent)
-    motion = np.concatenate([np.zeros((3, 2)), torch.cat([one.reshape(-1, 2) for one in sent]).numpy()])
-    assert np.abs(np.diff(motion, axis=0)).max() <= VELOCITY * PERIOD * (1 + 1e-9)
-    assert np.abs(np.diff(motion, n=3, axis=0)).max() <= JERK * PERIOD**3 * (1 + 1e-9)
+    assert all(action.shape == shape for action in sent)
+    motion = np.concatenate([np.zeros((3, 2)), torch.cat([action.reshape(-1, 2) for action in sent]).numpy()])
+    assert_motion_is_within_limits(motion)
     assert np.abs(motion[:, 0]).max() <= BOUND
     assert np.ptp(motion, axis=0).max() > 0.005
 
 
-def test_motion_reaches_an_action_that_is_held(guard):
+def test_motion_reaches_a_constant_action(guard):
     step = make(guard)
     sent = [send(step, torch.tensor([[0.15, -0.3]], dtype=torch.float64)) for _ in range(40)]
     np.testing.assert_allclose(sent[-1][0], [0.15, -0.3], atol=1e-3)
@@ -79,20 +86,19 @@ def test_actions_by_name_start_at_the_observed_position(guard):
 
 
 @pytest.mark.parametrize("mode", ["projection", "slowdown"])
-@pytest.mark.parametrize("wanted", [-0.3, 0.0, 0.3])
-def test_first_commands_are_within_the_limits_when_the_start_is_outside(guard, mode, wanted):
+@pytest.mark.parametrize("position", [-0.3, 0.0, 0.3])
+def test_commands_are_within_limits_when_the_start_is_outside(guard, mode, position):
     step = make(guard, start=None, mode=mode)
-    for beyond in (1e-4, 0.001, 0.0024):
+    for excess in (1e-4, 0.001, 0.0024):
         step.reset()
-        observed = {"a.pos": BOUND + beyond, "b.pos": 2.0}
-        sent = [send(step, {"a.pos": wanted, "b.pos": 2.0 + wanted}, observed) for _ in range(10)]
-        motion = np.array([[observed["a.pos"], 2.0]] * 3 + [list(one.values()) for one in sent])
-        assert np.abs(np.diff(motion, axis=0)).max() <= VELOCITY * PERIOD * (1 + 1e-9)
-        assert np.abs(np.diff(motion, n=3, axis=0)).max() <= JERK * PERIOD**3 * (1 + 1e-9)
+        observed = {"a.pos": BOUND + excess, "b.pos": 2.0}
+        sent = [send(step, {"a.pos": position, "b.pos": 2.0 + position}, observed) for _ in range(10)]
+        motion = np.array([[observed["a.pos"], 2.0]] * 3 + [list(action.values()) for action in sent])
+        assert_motion_is_within_limits(motion)
         assert motion[3:, 0].max() <= BOUND + 1e-9
 
 
-def test_start_is_refused_when_one_step_does_not_lead_inside(guard):
+def test_start_is_refused_when_a_step_cannot_reach_the_bounds(guard):
     outside = dict.fromkeys(NAMES, 0.3)
     with pytest.raises(ValueError, match=r"number 0 of .* start is 0\.1 outside of the bounds.*move the robot"):
         send(make(guard, start=None), outside, outside)
@@ -111,12 +117,12 @@ def test_start_is_refused_when_one_step_does_not_lead_inside(guard):
         ({"a.pos": 0.0, "b.pos": 0.0, "gripper.pos": 1.0}, "drop.*gripper.pos"),
     ],
 )
-def test_action_is_refused_when_it_does_not_fit(guard, action, words):
+def test_action_is_refused_when_values_shape_or_names_are_wrong(guard, action, words):
     with pytest.raises(ValueError, match=words):
         send(make(guard), action)
 
 
-def test_guard_is_refused_when_start_or_limits_are_missing(guard):
+def test_guard_refuses_invalid_start_and_limits(guard):
     with pytest.raises(ValueError, match="give start"):
         send(make(guard, start=None), torch.zeros(1, 2))
     with pytest.raises(ValueError, match="one entry"):
@@ -127,7 +133,7 @@ def test_guard_is_refused_when_start_or_limits_are_missing(guard):
         send(make(guard, start=[0.21, 0.0]), torch.zeros(1, 2))
 
 
-def test_configuration_makes_the_same_step(guard):
+def test_step_from_a_configuration_outputs_the_same_action(guard):
     step = make(guard)
     second = guard.ChunkGuardProcessorStep(**step.get_config())
     action = torch.tensor([[0.3, 0.4]])

@@ -1,6 +1,6 @@
-"""Process of LeRobot's simulated robot, with a double of LeRobot's interface.
+"""Process behind LeRobot's simulated robot, tested with a double of LeRobot's interface.
 
-`make lerobot` tests it with the real library.
+`make lerobot` tests the robot with the real library.
 """
 
 import importlib.util
@@ -16,7 +16,7 @@ FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot
 
 @pytest.fixture
 def module(monkeypatch):
-    """Return the module, imported with a double of `lerobot.robots`."""
+    """Return the robot module, imported with a double of `lerobot.robots`."""
     robots = ModuleType("lerobot.robots")
     robots.Robot = type("Robot", (), {"__init__": lambda self, config: None})
     robots.RobotConfig = type("RobotConfig", (), {"register_subclass": staticmethod(lambda name: lambda kind: kind)})
@@ -30,7 +30,7 @@ def module(monkeypatch):
 
 
 def start(module, script, tmp_path):
-    """Return a robot whose interpreter is a shell script."""
+    """Return a robot whose process is running; its interpreter is a shell script."""
     interpreter = tmp_path / "python"
     interpreter.write_text(f"#!/bin/sh\n{script}\n")
     interpreter.chmod(0o755)
@@ -49,14 +49,14 @@ def test_process_is_killed_when_it_does_not_end_in_time(module, monkeypatch, tmp
     assert not robot.is_connected
 
 
-def test_process_that_ends_with_its_input_is_not_killed(module, tmp_path):
+def test_process_is_not_killed_when_it_ends_with_its_input(module, tmp_path):
     robot = start(module, "cat > /dev/null", tmp_path)
     process = robot._process
     robot.disconnect()
     assert process.returncode == 0
 
 
-def test_pipes_of_an_ended_process_are_closed_when_another_one_starts(module, tmp_path):
+def test_pipes_of_an_ended_process_are_closed_at_the_next_start(module, tmp_path):
     robot = start(module, "exit 3", tmp_path)
     ended = robot._process
     ended.wait()

@@ -1,5 +1,3 @@
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
@@ -50,8 +48,8 @@ class Rig:
         self.steps = 0
 
     def step(self, request, measured=None, state=None):
-        """Run one control step; return its command and the fallback flag."""
-        # The request comes from a hold: it changes with the events of an instant, not before them.
+        """Run one control step; return the command and the fallback flag of this step."""
+        # In a diagram a zero-order hold outputs the request, so the request changes after the previous instant.
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.request.GetMutableData().set_value(request)
         if state is not None:
@@ -80,12 +78,12 @@ def test_last_command_has_no_direct_feedthrough():
     system = ActiveConstraintProjector(TEMPLATE, FRAMES, PERIOD)
     last = system.get_last_desired_pose_output_port().get_index()
     assert not any(system.HasDirectFeedthrough(i, last) for i in range(system.num_input_ports()))
-    # The command doesn't follow the measured pose within a step either.
+    # Nor does the measured pose change the command within a step.
     desired = system.get_desired_pose_output_port().get_index()
     assert not system.HasDirectFeedthrough(system.get_pose_input_port().get_index(), desired)
 
 
-def test_projector_commands_an_allowed_request():
+def test_request_is_commanded_when_it_satisfies_the_constraints():
     rig = Rig()
     request = START + [0.001, -0.002, 0.001, 0.0, 0.0, 0.0]
     desired, fallback = rig.step(request)
@@ -93,7 +91,7 @@ def test_projector_commands_an_allowed_request():
     assert fallback == 0.0
 
 
-def test_projector_projects_every_forbidden_request():
+def test_every_command_satisfies_the_constraints():
     rig = Rig()
     rng = np.random.default_rng(0)
     for _ in range(300):
@@ -110,7 +108,7 @@ def test_projector_respects_the_speed_limits():
         desired, _ = rig.step(np.array([5.0, 0.0, -5.0, 0.0, 0.0, 0.0]))
         assert np.linalg.norm(desired[:3] - last[:3]) <= 0.5 * PERIOD * (1 + 1e-9)
         last = desired
-    assert last[2] == pytest.approx(0.1)  # it slid along the slab
+    assert last[2] == pytest.approx(0.1)  # lowest height [m] above the slab
     assert last[0] > 0.1
 
 
@@ -118,7 +116,7 @@ def test_projector_updates_once_at_each_instant():
     rig = Rig()
     step = np.array([0.001, 0.0, 0.0, 0.0, 0.0, 0.0])
     rig.step(START + step)
-    # Before the events of an instant, the last command is that of the step before.
+    # Before the events of an instant, the output is the command of the step before the last.
     np.testing.assert_allclose(rig.value("last_desired_pose"), START[0])
     rig.step(START + 2 * step)
     np.testing.assert_allclose(rig.system.get_last_desired_pose_output_port().Eval(rig.context), START + step)
@@ -141,8 +139,8 @@ def test_projector_repeats_the_last_command_for_an_unknown_state(state):
     assert fallback == 1.0
     np.testing.assert_array_equal(desired, before)
     X_WE = pose_to_transform(START)
-    largest = max(TEMPLATE.violation(one, X_WE, FRAMES) for one in range(len(TEMPLATE.states)))
-    assert rig.value("measured_violation") == largest
+    violations = [TEMPLATE.violation(index, X_WE, FRAMES) for index in range(len(TEMPLATE.states))]
+    assert rig.value("measured_violation") == max(violations)
 
 
 def test_command_waits_when_the_tracking_error_is_too_large():
@@ -151,34 +149,35 @@ def test_command_waits_when_the_tracking_error_is_too_large():
         desired, fallback = rig.step(np.array([1.0, 0.0, 0.3, 0.0, 0.0, 0.0]), measured=START)
     assert fallback == 1.0
     assert 0.02 < desired[0] < 0.02 + 2 * 0.5 * PERIOD
-    # A request within the last command brings the robot no nearer either.
+    # A request for the last command does not reduce the tracking error.
     assert rig.step(desired)[1] == 1.0
-    # A request towards the robot is always followed.
+    # A request towards the measured pose reduces the tracking error and is commanded.
     desired, fallback = rig.step(START)
     assert fallback == 0.0
     assert desired[0] < 0.02
 
 
 @pytest.mark.parametrize(("distance", "fallback"), [(0.4999, 0.0), (0.5, 0.0), (0.5001, 1.0)])
-def test_command_waits_above_the_largest_tracking_error_only(distance, fallback):
+def test_command_waits_only_above_the_largest_tracking_error(distance, fallback):
     rig = Rig(max_tracking_error=0.5)
     rig.step(START, measured=START + [distance, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert rig.step(START - [0.1, 0.0, 0.0, 0.0, 0.0, 0.0])[1] == fallback
 
 
-def test_waiting_command_inside_the_constraints_is_repeated_bit_for_bit():
-    """Its projection would differ by rounding errors."""
+def test_waiting_command_inside_the_constraints_is_unchanged():
+    """The projection of the command would differ from the command by rounding errors."""
     rig, rng = Rig(template=RAISED), np.random.default_rng(0)
     for _ in range(30):
         before, fallback = rig.step(START + rng.normal(scale=[0.1] * 3 + [1.0] * 3))
         assert fallback == 0.0
         for _ in range(2):
-            desired, fallback = rig.step(NOWHERE)
+            desired, fallback = rig.step(NOT_FINITE)
             assert fallback == 1.0
             np.testing.assert_array_equal(desired, before)
 
 
-# The floor of the second state is slightly above the transition's threshold, within reach of one period.
+# The lowest height of the second state is 2 mm above the threshold of the transition. One period can raise a command
+# by 3.9 mm.
 RAISED = parse_template(
     "name: step"
     + ABOVE
@@ -194,14 +193,14 @@ RAISED = parse_template(
     ends_at_m: 0.0
 """
 )
-NOWHERE = np.full(6, np.nan)
+NOT_FINITE = np.full(6, np.nan)
 DOWN = START + [0.0, 0.0, -0.1, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize(
-    ("request_", "measured"), [(DOWN, START - [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]), (NOWHERE, START), (DOWN, NOWHERE)]
+    ("request_", "measured"), [(DOWN, START - [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]), (NOT_FINITE, START), (DOWN, NOT_FINITE)]
 )
-def test_waiting_command_is_inside_after_a_transition(request_, measured):
+def test_waiting_command_moves_inside_after_a_transition(request_, measured):
     rig = Rig(max_tracking_error=0.01, template=RAISED)
     assert RAISED.can_enter(1, pose_to_transform(rig.desired()), FRAMES, PERIOD)
     before, _ = rig.step(START, measured=measured)
@@ -214,7 +213,7 @@ def test_waiting_command_is_inside_after_a_transition(request_, measured):
     np.testing.assert_allclose(desired, [0.0, 0.0, 0.302, 0.0, 0.0, 0.0], atol=1e-9)
 
 
-def test_waiting_command_is_led_inside_when_an_object_moves():
+def test_waiting_command_moves_inside_when_an_object_moves():
     rig = Rig(max_tracking_error=0.02)
     rig.step(START, measured=START + [0.0, 0.0, -0.05, 0.0, 0.0, 0.0])
     rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.3])})
@@ -230,26 +229,26 @@ def test_waiting_command_is_led_inside_when_an_object_moves():
 
 
 @pytest.mark.parametrize(("tolerance", "expected"), [(0.1, 0.5), (0.09995, 0.5 + 0.5 * PERIOD)])
-def test_waiting_command_moves_inside_when_its_violation_exceeds_the_tolerance(monkeypatch, tolerance, expected):
+def test_waiting_command_moves_only_above_the_tolerance(monkeypatch, tolerance, expected):
     monkeypatch.setattr(active_constraint_projector, "INSIDE", tolerance)
     rig = Rig(start=START + [0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
-    rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.5])})  # violated by exactly 0.1 m
-    assert rig.step(NOWHERE)[0][2] == pytest.approx(expected, abs=1e-9)
+    rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.5])})  # violation of exactly 0.1 m
+    assert rig.step(NOT_FINITE)[0][2] == pytest.approx(expected, abs=1e-9)
 
 
-@pytest.mark.parametrize("nowhere", [NOWHERE, *(START + [0.0, 0.0, 0.0, 0.0, bad, 0.0] for bad in (np.nan, np.inf))])
+@pytest.mark.parametrize("pose", [NOT_FINITE, *(START + [0.0, 0.0, 0.0, 0.0, bad, 0.0] for bad in (np.nan, np.inf))])
 @pytest.mark.parametrize("max_tracking_error", [0.02, np.inf])
-def test_command_waits_while_the_measured_pose_is_nan(max_tracking_error, nowhere):
+def test_command_waits_while_the_measured_pose_is_not_finite(max_tracking_error, pose):
     rig = Rig(max_tracking_error=max_tracking_error)
-    away = START + [0.001, 0.0, 0.0, 0.0, 0.0, 0.0]
-    before, _ = rig.step(START, measured=nowhere)
+    request = START + [0.001, 0.0, 0.0, 0.0, 0.0, 0.0]
+    before, _ = rig.step(START, measured=pose)
     for _ in range(5):
-        desired, fallback = rig.step(away)
+        desired, fallback = rig.step(request)
         assert fallback == 1.0
         np.testing.assert_array_equal(desired, before)
-    rig.step(away, measured=START)
-    desired, fallback = rig.step(away)
-    np.testing.assert_allclose(desired, away, atol=1e-15)
+    rig.step(request, measured=START)
+    desired, fallback = rig.step(request)
+    np.testing.assert_allclose(desired, request, atol=1e-15)
     assert fallback == 0.0
 
 
@@ -259,17 +258,17 @@ def test_projector_refuses_a_nan_initial_pose():
 
 
 def test_projector_refuses_a_frame_that_is_not_finite():
-    nowhere = {"slab": RigidTransform([0.0, np.nan, 0.0])}
+    frames = {"slab": RigidTransform([0.0, np.nan, 0.0])}
     with pytest.raises(InputError, match="frame slab must be at a finite pose"):
-        ActiveConstraintProjector(TEMPLATE, nowhere, PERIOD)
+        ActiveConstraintProjector(TEMPLATE, frames, PERIOD)
     rig = Rig()
     with pytest.raises(InputError, match="frame slab must be at a finite pose"):
-        rig.system.frames.set(rig.context, nowhere)
+        rig.system.frames.set(rig.context, frames)
     rig.step(START)
     assert rig.value("fallback") == 0.0
 
 
-def test_frame_that_is_not_finite_at_the_start_is_refused():
+def test_initialization_fails_when_a_frame_is_not_finite():
     rig = Rig()
     valid = rig.context.get_numeric_parameter(0).CopyToVector()
     rig.context.get_mutable_numeric_parameter(0).SetFromVector([*valid[:2], np.nan, *valid[3:]])
@@ -277,8 +276,8 @@ def test_frame_that_is_not_finite_at_the_start_is_refused():
         rig.simulator.Initialize()
 
 
-def test_nan_is_never_commanded_or_stored():
-    """A NaN pose of an object that was written without `set` repeats the last command until the pose is finite."""
+def test_last_command_is_repeated_while_a_frame_is_nan():
+    """The NaN is written without `set`, which would refuse the pose."""
     rig = Rig()
     before, _ = rig.step(START)
     valid = rig.context.get_numeric_parameter(0).CopyToVector()
@@ -292,15 +291,18 @@ def test_nan_is_never_commanded_or_stored():
     assert rig.desired()[2] < START[2]
 
 
-def test_command_is_led_inside_when_the_robot_starts_outside():
-    low = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.2])
-    rig = Rig(start=low)
+@pytest.mark.parametrize(
+    ("start", "steps", "violation"),  # start pose (6,), control steps, and least violation of the first command
+    [([0.0, 0.0, 0.05, 0.0, 0.0, 0.2], 40, 0.1), ([0.0, 0.0, 0.0, 0.9, 0.0, 0.0], 200, 0.5)],
+)
+def test_command_moves_inside_when_the_robot_starts_outside(start, steps, violation):
+    rig = Rig(np.array(start))
     violations = []
-    for _ in range(40):
+    for _ in range(steps):
         rig.step(rig.desired())
         violations.append(rig.value("commanded_violation"))
-    assert violations[0] > 0.1
-    assert all(later <= earlier + 1e-12 for earlier, later in pairwise(violations))
+    assert violations[0] > violation
+    assert (np.diff(violations) <= 1e-12).all()
     assert violations[-1] <= 1e-9
 
 
@@ -348,14 +350,3 @@ def test_projector_refuses_constraints_that_contradict():
 def test_projector_refuses_a_start_far_outside_its_constraints(start):
     with pytest.raises(InputError, match=r"outside of the active constraints of the template slab, state above"):
         Rig(np.array(start))
-
-
-def test_projector_returns_inside_after_a_start_slightly_outside():
-    rig = Rig(np.array([0.0, 0.0, 0.0, 0.9, 0.0, 0.0]))
-    violations = []
-    for _ in range(200):
-        rig.step(rig.desired())
-        violations.append(rig.value("commanded_violation"))
-    assert violations[0] > 0.5
-    assert (np.diff(violations) <= 1e-12).all()
-    assert violations[-1] <= 1e-9

@@ -1,4 +1,4 @@
-"""Physics of the impedance of an arm in free space: statics, energy, limits and command timeout."""
+"""Cartesian impedance: control law, physics of an arm in free space, limits and command timeout."""
 
 from dataclasses import fields
 
@@ -45,7 +45,7 @@ WORKCELL = BncWorkcell()
 
 
 class FreeArm:
-    """Arm that is commanded to stay at a posture, with a force that a test applies to its tool."""
+    """Simulated arm that is commanded to remain at its initial pose, and forces on its tool."""
 
     def __init__(self, q, *, gains=None, time_step=0.001, ball=False, turned_axes=None):
         builder = DiagramBuilder()
@@ -101,6 +101,7 @@ class FreeArm:
             self.controller.get_command_time_input_port().FixValue(self.controller_context, [time])
 
     def push(self, force, torque=(0, 0, 0)):
+        """Apply a force [N] and a torque [Nm] in world axes to the tool center."""
         applied = ExternallyAppliedSpatialForce()
         body = self.plant.GetBodyByName("tool_center")
         applied.body_index = body.index()
@@ -112,15 +113,17 @@ class FreeArm:
     def torque(self):
         return self.controller.get_generalized_force_output_port().Eval(self.controller_context)
 
-    def advance(self, seconds, watch=None):
+    def advance(self, seconds, callback=None):
+        """Advance the simulation, and call `callback` every 10 ms."""
         end = self.context.get_time() + seconds
         while self.context.get_time() < end - 1e-9:
             self.simulator.AdvanceTo(min(end, self.context.get_time() + 0.01))
-            if watch:
-                watch()
+            if callback:
+                callback()
 
 
 def _with_axes(R_WAxes):
+    """Return a plant of the arm with a world-fixed frame `axes` of this rotation, and the arm."""
     plant = MultibodyPlant(0.0)
     arm = add_arm(plant, WORKCELL)
     plant.AddFrame(FixedOffsetFrame("axes", plant.world_frame(), RigidTransform(R_WAxes, [0, 0, 0])))
@@ -129,14 +132,14 @@ def _with_axes(R_WAxes):
 
 
 def displacement(before, after):
-    """Return translation and rotation vector of the tool between two poses, in the axes of T."""
+    """Return the translation and the rotation vector of the tool between two poses, in the axes of the target T."""
     X, Y = pose_to_transform(before), pose_to_transform(after)
-    turn = (Y.rotation() @ X.rotation().inverse()).ToAngleAxis()
-    return np.concatenate([Y.translation() - X.translation(), turn.angle() * turn.axis()])
+    rotation = (Y.rotation() @ X.rotation().inverse()).ToAngleAxis()
+    return np.concatenate([Y.translation() - X.translation(), rotation.angle() * rotation.axis()])
 
 
 class Law:
-    """Controller of an arm in a random state, without a simulation, and the arguments of its law."""
+    """Controller of an arm in a random state, and the arguments of its control law."""
 
     def __init__(self, seed=0, *, turned_axes=None, **options):
         rng = np.random.default_rng(seed)
@@ -189,9 +192,9 @@ class Law:
     def __getitem__(self, port):
         return self.system.GetOutputPort(port).Eval(self.context)
 
-    def check(self, **changed):
-        """Compare the outputs with the law."""
-        expected = impedance_torques(**(self.arguments | changed))
+    def check(self, **changes):
+        """Assert that the outputs are those of the control law with changed arguments; return the expected outputs."""
+        expected = impedance_torques(**(self.arguments | changes))
         np.testing.assert_allclose(self["generalized_force"], expected.torque, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(self["impedance_wrench"], expected.wrench, rtol=1e-7, atol=1e-7)
         assert self["saturation"].tolist() == [expected.is_saturated]
@@ -216,7 +219,7 @@ def test_gains_have_their_documented_defaults():
     assert (gains.damping_ratio, gains.posture_stiffness, gains.posture_damping) == (1.0, 10.0, 5.0)
 
 
-def test_gravity_is_compensated_unless_the_robot_does_it():
+def test_gravity_is_compensated_only_when_requested():
     Law(compensate_gravity=False).check(gravity_torque=np.zeros(7))
     Law(compensate_gravity=True).check()
 
@@ -232,19 +235,19 @@ def test_requested_bound_lowers_the_configured_one():
     law = Law(bound=bound)
     law.fix(max_wrench=requested)
     law.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.0, contact_stiffness=1e4))
-    without = Law(wrench_limits=np.array([3.0, 1.0, 3.0, 3.0, 0.5, 3.0]))
-    without.fix(max_wrench=requested)
-    without.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.1))
+    without_bound = Law(wrench_limits=np.array([3.0, 1.0, 3.0, 3.0, 0.5, 3.0]))
+    without_bound.fix(max_wrench=requested)
+    without_bound.check(bound=WrenchBound(np.array([2.0, 1.0, 2.0, 1.0, 0.5, 1.0]), 2.5, 1.1))
 
 
 @pytest.mark.parametrize("invalid", [np.nan, -1.0])
-def test_damping_remains_when_the_requested_bound_is_invalid(invalid):
-    law, numbers = Law(), np.full(8, 2.0)
-    law.fix(max_wrench=numbers)
+def test_last_valid_bound_applies_while_the_requested_is_invalid(invalid):
+    law = Law()
+    law.fix(max_wrench=np.full(8, 2.0))
     Simulator(law.system, law.context).Initialize()
     law.fix(max_wrench=np.full(8, invalid))
     law.context.SetDiscreteState(law.system.EvalUniquePeriodicDiscreteUpdate(law.context))
-    law.check(bound=WrenchBound(numbers[:6], 2.0, 2.0))
+    law.check(bound=WrenchBound(np.full(6, 2.0), 2.0, 2.0))
 
 
 @pytest.mark.parametrize(
@@ -265,9 +268,9 @@ def test_static_displacement_is_compliance_times_wrench(q):
     arm.push(force, torque)
     arm.advance(4.0)
     expected = np.linalg.solve(STIFFNESS, np.concatenate([force, torque]))
-    moved = displacement(before, arm.pose())
-    assert np.linalg.norm(moved[:3] - expected[:3]) < 0.02 * np.linalg.norm(expected[:3])
-    assert np.linalg.norm(moved[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
+    actual = displacement(before, arm.pose())
+    assert np.linalg.norm(actual[:3] - expected[:3]) < 0.02 * np.linalg.norm(expected[:3])
+    assert np.linalg.norm(actual[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
 
 
 def test_stiffness_applies_in_the_axes_of_a_rotated_frame():
@@ -290,7 +293,7 @@ def test_energy_never_increases_after_a_push():
     gains = ImpedanceGains(STIFFNESS, LIMITS, np.array(POSTURES[1]), damping_ratio=0.3, posture_stiffness=0.0)
     arm = FreeArm(POSTURES[1], gains=gains, time_step=0.001)
     desired = arm.pose()
-    # Below its limits the energy of the spring is the quadratic form.
+    # This push does not saturate the spring, so its energy is ½ eᵀ K e.
     arm.push([12.0, -10.0, 15.0], [0.5, 0.5, -0.5])
     arm.advance(0.4)
     arm.push([0.0, 0.0, 0.0])
@@ -315,19 +318,20 @@ def test_distant_target_is_approached_within_limits():
     start = arm.pose()
     arm.command(start + [-0.1, 0.35, 0.35, 0.5, 0, 0])
     limits = arm.model.GetEffortUpperLimits()
-    torques, forces = [], []
+    torques, wrenches = [], []
 
-    def watch():
+    def record():
         torques.append(np.abs(arm.torque()))
-        forces.append(np.abs(arm.controller.get_impedance_wrench_output_port().Eval(arm.controller_context)))
+        wrenches.append(np.abs(arm.controller.get_impedance_wrench_output_port().Eval(arm.controller_context)))
 
-    arm.advance(3.0, watch)
+    arm.advance(3.0, record)
     assert (np.array(torques) <= limits).all()
-    assert (np.array(forces) <= LIMITS + 1e-9).all()
+    assert (np.array(wrenches) <= LIMITS + 1e-9).all()
     assert np.linalg.norm((arm.pose() - start)[:3]) > 0.3
 
 
-def test_dropped_mass_is_caught_within_limits():
+def test_arm_returns_within_limits_after_an_impact():
+    """A ball of 2 kg is released 0.35 m above link 6."""
     arm = FreeArm(POSTURES[0], time_step=0.001, ball=True)
     start = arm.pose()
     p_WLink = arm.plant.GetFrameByName("iiwa_link_6").CalcPoseInWorld(arm.plant_context).translation()
@@ -335,11 +339,11 @@ def test_dropped_mass_is_caught_within_limits():
     limits = arm.model.GetEffortUpperLimits()
     deviations = []
 
-    def watch():
+    def record():
         assert (np.abs(arm.torque()) <= limits).all()
         deviations.append(np.abs(arm.pose() - start)[:3].max())
 
-    arm.advance(2.5, watch)
+    arm.advance(2.5, record)
     assert max(deviations) > 0.002
     np.testing.assert_allclose(arm.pose(), start, atol=2e-3)
 
@@ -348,30 +352,30 @@ def test_last_valid_pose_is_followed_when_commands_stop():
     arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     command_timed_out = arm.controller.get_command_timed_out_output_port()
-    safe = start + [0.01, 0, 0, 0, 0, 0]
-    arm.command(safe, time=0.0)
+    last_valid = start + [0.01, 0, 0, 0, 0, 0]
+    arm.command(last_valid, time=0.0)
     arm.advance(0.05)
     assert command_timed_out.Eval(arm.controller_context)[0] == 0.0
     arm.advance(0.2)
     assert command_timed_out.Eval(arm.controller_context)[0] == 1.0
     arm.command(start + [0.5, 0.5, 0, 0, 0, 0], time=0.0)  # a stale message with a distant target
     arm.advance(2.0)
-    np.testing.assert_allclose(arm.pose(), safe, atol=5e-4)
+    np.testing.assert_allclose(arm.pose(), last_valid, atol=5e-4)
 
 
-@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300, 1.001e6])
-def test_command_is_ignored_when_it_is_not_finite(wrong):
-    """A rotated stiffness frame rotates the wrench, and the rotation of an overflow would be NaN."""
+@pytest.mark.parametrize("coordinate", [np.nan, np.inf, 1e300, 1.001e6])
+def test_command_is_ignored_when_it_is_invalid(coordinate):
+    """With a rotated stiffness frame, a wrench that overflows would become NaN in the rotation."""
     arm = FreeArm(POSTURES[0], time_step=0.005, turned_axes=RotationMatrix.MakeZRotation(0.7))
     start = arm.pose()
-    arm.command(np.array([wrong, -wrong, wrong, 0.0, 0.0, 0.0]))
+    arm.command(np.array([coordinate, -coordinate, coordinate, 0.0, 0.0, 0.0]))
     arm.advance(0.5)
     assert np.isfinite(arm.torque()).all()
     np.testing.assert_allclose(arm.pose(), start, atol=1e-4)
 
 
 def test_spring_is_the_gradient_of_its_potential():
-    """Along any motion of the tool, minus the power of the spring is the increase of ½ eᵀ K e."""
+    """The power of the spring is minus the time derivative of ½ eᵀ K e for any velocity V of the tool."""
     rng = np.random.default_rng(0)
     A = rng.standard_normal((6, 6))
     K = A @ A.T + np.eye(6)
@@ -381,8 +385,8 @@ def test_spring_is_the_gradient_of_its_potential():
 
         def error(step, X=X, X_desired=X_desired, V=V):
             angle = step * np.linalg.norm(V[3:])
-            turned = RotationMatrix(_axis_angle(V[3:] / np.linalg.norm(V[3:]), angle)) @ X.rotation()
-            eta, epsilon = orientation_error(X_desired.rotation(), turned)
+            rotation = RotationMatrix(_axis_angle(V[3:] / np.linalg.norm(V[3:]), angle)) @ X.rotation()
+            eta, epsilon = orientation_error(X_desired.rotation(), rotation)
             return X_desired.translation() - X.translation() - step * V[:3], eta, epsilon
 
         def potential(step, error=error):
@@ -390,8 +394,8 @@ def test_spring_is_the_gradient_of_its_potential():
             e = np.concatenate([p, 2 * epsilon])
             return 0.5 * e @ K @ e
 
-        growth = (potential(1e-5) - potential(-1e-5)) / 2e-5
-        assert spring_wrench(K, *error(0.0)) @ V == pytest.approx(-growth, rel=1e-5, abs=1e-6)
+        derivative = (potential(1e-5) - potential(-1e-5)) / 2e-5
+        assert spring_wrench(K, *error(0.0)) @ V == pytest.approx(-derivative, rel=1e-5, abs=1e-6)
 
 
 def test_damping_gives_every_mode_its_damping_ratio():
@@ -405,7 +409,7 @@ def test_damping_gives_every_mode_its_damping_ratio():
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [
         {"stiffness": np.diag([1.0, 1, 1, 1, 1, -1])},
         {"stiffness": np.eye(3)},
@@ -434,15 +438,15 @@ def test_damping_gives_every_mode_its_damping_ratio():
         {"wrench_limits": np.array([1.0, 1, 1, 1, 1, 0])},
     ],
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
+def test_gains_refuse_arguments_out_of_range(arguments):
     valid = {"stiffness": STIFFNESS, "wrench_limits": LIMITS, "posture": np.zeros(7)}
     with pytest.raises(InputError):
-        ImpedanceGains(**(valid | wrong))
+        ImpedanceGains(**(valid | arguments))
 
 
 def test_gains_at_their_limits_are_accepted():
-    stiffest, zero = np.diag([1e8, 1e-9, 1, 1, 1, 1]), {"posture_stiffness": 0.0, "posture_damping": 0.0}
-    ImpedanceGains(stiffest.tolist(), [1e-9] * 6, np.zeros(7), damping_ratio=1e-9, **zero)
+    stiffness, posture_gains = np.diag([1e8, 1e-9, 1, 1, 1, 1]), {"posture_stiffness": 0.0, "posture_damping": 0.0}
+    ImpedanceGains(stiffness.tolist(), [1e-9] * 6, np.zeros(7), damping_ratio=1e-9, **posture_gains)
 
 
 def test_constructor_refuses_a_posture_of_another_arm():
@@ -452,7 +456,11 @@ def test_constructor_refuses_a_posture_of_another_arm():
 
 
 def six_axes(motors):
-    """Return a plant of three prismatic and three revolute axes, and its tool; axis i is limited to i + 1."""
+    """Return a plant of three prismatic and three revolute axes, and its last body.
+
+    Args:
+        motors: Axis of each motor; the motor of axis i has the effort limit i + 1 [N, Nm].
+    """
     plant, axes = MultibodyPlant(0.0), []
     tool = plant.world_body()
     for index, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
@@ -466,7 +474,8 @@ def six_axes(motors):
     return plant, tool
 
 
-def controller_of(plant, tool):
+def make_controller(plant, tool):
+    """Return a controller of this plant whose target is the world frame."""
     gains = ImpedanceGains(STIFFNESS, np.full(6, 1e6), np.zeros(6))
     return CartesianImpedanceController(plant, plant.world_frame(), tool.body_frame(), gains, period=0.01)
 
@@ -474,27 +483,27 @@ def controller_of(plant, tool):
 @pytest.mark.parametrize("motors", [range(6), (5, 4, 3, 2, 1, 0), (2, 0, 1, 5, 3, 4)])
 def test_each_joint_has_the_limit_of_its_own_motor(motors):
     plant, tool = six_axes(motors)
-    controller = controller_of(plant, tool)
+    controller = make_controller(plant, tool)
     context = controller.CreateDefaultContext()
     controller.get_desired_pose_input_port().FixValue(context, [5.0, 5.0, 5.0, 0.0, 0.0, 0.0])
     controller.get_estimated_state_input_port().FixValue(context, np.r_[np.zeros(6), np.full(6, -100.0)])
     torque = controller.get_generalized_force_output_port().Eval(context)
     np.testing.assert_array_equal(torque, np.arange(1, 7))
-    # As documented, the transposed actuation matrix maps the torques to the order of the motors.
+    # The transposed actuation matrix maps generalized forces to the order of the motors.
     np.testing.assert_array_equal(plant.MakeActuationMatrix().T @ torque, [index + 1 for index in motors])
 
 
 @pytest.mark.parametrize("motors", [(), (0, 1), range(5), (0, 1, 2, 3, 4, 4), (0, 1, 2, 3, 4, 5, 5)])
-def test_plant_needs_one_motor_for_each_joint(motors):
+def test_plant_is_refused_without_one_motor_per_joint(motors):
     with pytest.raises(InputError, match=rf"one actuator for each .*axis0, axis1, .*, not {len(motors)} actuators"):
-        controller_of(*six_axes(motors))
+        make_controller(*six_axes(motors))
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("index", [0, 6])
 def test_estimated_state_that_is_not_finite_is_refused(index, number):
-    """Drake would end the process."""
-    controller = controller_of(*six_axes(range(6)))
+    """Drake would end the process for such a state."""
+    controller = make_controller(*six_axes(range(6)))
     context = controller.CreateDefaultContext()
     controller.get_desired_pose_input_port().FixValue(context, np.zeros(6))
     controller.get_estimated_state_input_port().FixValue(context, np.where(np.arange(12) == index, number, 0.0))
@@ -502,7 +511,7 @@ def test_estimated_state_that_is_not_finite_is_refused(index, number):
         controller.get_generalized_force_output_port().Eval(context)
 
 
-def test_ports_and_feedthrough():
+def test_controller_has_its_ports_and_direct_feedthrough():
     model, arm = controller_model(WORKCELL)
     system = CartesianImpedanceController(
         model, arm.target, arm.tool_center, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005

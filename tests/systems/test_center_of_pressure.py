@@ -5,7 +5,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.center_of_pressure import CenterOfPressure
 
 
-def compute(wrench, min_force=0.5):
+def center_of_pressure(wrench, min_force=0.5):
+    """Return the center of pressure (2,) [m] of a wrench (6,), force first."""
     system = CenterOfPressure(min_force)
     context = system.CreateDefaultContext()
     system.get_wrench_input_port().FixValue(context, wrench)
@@ -15,13 +16,13 @@ def compute(wrench, min_force=0.5):
 @pytest.mark.parametrize("force", [0.5, 2.0, 30.0])
 def test_center_of_pressure_is_the_point_of_a_point_force(force):
     point = np.array([0.003, -0.004, 0.0])
-    pushed = np.array([0.0, 0.0, force])
-    np.testing.assert_allclose(compute([*pushed, *np.cross(point, pushed)]), point[:2])
+    f = np.array([0.0, 0.0, force])
+    np.testing.assert_allclose(center_of_pressure([*f, *np.cross(point, f)]), point[:2])
 
 
 @pytest.mark.parametrize("force", [0.49, 0.0, -5.0, np.nan])
 def test_center_of_pressure_is_zero_when_the_force_is_small(force):
-    np.testing.assert_array_equal(compute([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
+    np.testing.assert_array_equal(center_of_pressure([0.0, 0.0, force, 0.1, 0.1, 0.0]), np.zeros(2))
 
 
 @pytest.mark.parametrize("min_force", [0.0, -1.0, np.nan, np.inf])

@@ -1,4 +1,4 @@
-"""Chunks of a base policy as a reference window: replanning, covariances, and the window before the first chunk."""
+"""Reference window from the chunks of a base policy: replanning, covariances, and the window before the first chunk."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def reference():
 
 
 def two_members(observation):
-    """Chunks (2, 6, 2) that start at the observed numbers and differ by 0.2."""
+    """Return two chunks, (2, 6, 2), whose first points are 0.1 below and above the observation."""
     chunk = np.outer(np.arange(6.0), [1.0, 10.0]) + observation[:2]
     return np.stack([chunk - 0.1, chunk + 0.1])
 
@@ -45,7 +45,7 @@ def windows(system, observations):
     return split[0].reshape(-1, HORIZON + 1, 2), split[1].reshape(-1, HORIZON + 1, 2, 2)
 
 
-def test_window_is_the_references_before_the_first_chunk():
+def test_window_is_that_of_the_reference_before_the_first_chunk():
     system = make()
     window = system.get_reference_window_output_port().Eval(system.CreateDefaultContext())
     means, covariances = np.split(window, [(HORIZON + 1) * 2])
@@ -53,11 +53,11 @@ def test_window_is_the_references_before_the_first_chunk():
     assert (covariances.reshape(-1, 2, 2) == reference().covariances[: HORIZON + 1]).all()
 
 
-def test_window_advances_along_a_chunk_and_is_planned_again():
+def test_window_advances_along_a_chunk_until_replanning():
     observations = np.arange(12.0).reshape(4, 3)
     means, covariances = windows(make(), observations)
-    points = np.minimum(np.arange(7), 5)[:, None] * [1.0, 10.0]
-    for step in range(3):  # the chunk of the first observation, held at its end
+    points = np.minimum(np.arange(7), 5)[:, None] * [1.0, 10.0]  # the last point of a chunk is repeated
+    for step in range(3):  # chunk of the first observation
         assert np.allclose(means[step], points[step : step + HORIZON + 1] + observations[0, :2])
     assert np.allclose(means[3], points[: HORIZON + 1] + observations[3, :2])
     assert np.allclose(covariances, (0.5 * 0.01 + 0.02) * np.eye(2))
@@ -97,7 +97,7 @@ def test_argument_is_refused_when_it_is_out_of_range(argument):
 
 
 def test_primitive_commands_the_chunk_inside_its_constraints():
-    """An action moves the command, and the constraints hold for every window."""
+    """An action moves the command, and every command satisfies the constraints."""
     bound = np.array([0.5, np.inf])
     primitive = LcNsKmp(
         reference(), lambda_=1e-3, beta=1e-3, horizon=HORIZON, constraints=LinearConstraints.box(-bound, bound)
@@ -115,11 +115,11 @@ def test_primitive_commands_the_chunk_inside_its_constraints():
     action = diagram.GetInputPort("action").FixValue(context, np.zeros(2))
     command = lambda: kmp.get_command_output_port().Eval(kmp.GetMyContextFromRoot(context))  # noqa: E731
     simulator.AdvanceTo(0.5 * PERIOD)
-    still = command()
-    assert np.allclose(still, [0.1, 0.2], atol=2e-3)
+    without_action = command()
+    assert np.allclose(without_action, [0.1, 0.2], atol=2e-3)
     action.GetMutableData().set_value([0.0, -1.0])
-    assert command()[0] == pytest.approx(still[0])
-    assert command()[1] < still[1] - 1e-3
+    assert command()[0] == pytest.approx(without_action[0])
+    assert command()[1] < without_action[1] - 1e-3
     random = np.random.default_rng(0)
     for step in range(40):
         observation.GetMutableData().set_value(random.uniform(-3.0, 3.0, 3))
@@ -142,10 +142,10 @@ def test_window_is_refused_when_it_does_not_fit_the_primitive():
             primitive.predict_at(0.1 * np.arange(5), *window)
 
 
-@pytest.mark.parametrize("past", [0, 3])
-def test_window_of_the_reference_gives_the_references_prediction(past):
-    primitive = LcNsKmp(reference(), horizon=HORIZON, history=past, lambda_=1e-3, beta=1e-3)
+@pytest.mark.parametrize("history", [0, 3])
+def test_predict_window_equals_predict_for_the_reference(history):
+    primitive = LcNsKmp(reference(), horizon=HORIZON, history=history, lambda_=1e-3, beta=1e-3)
     means, covariances = reference().means[3 : 4 + HORIZON], reference().covariances[3 : 4 + HORIZON]
-    further = np.array([0.1, -0.2]), reference().means[3 - past : 3] if past else None
-    expected = primitive.predict(3, *further).output
-    assert (primitive.predict_window(3, means, covariances, *further).output == expected).all()
+    action, last_outputs = np.array([0.1, -0.2]), reference().means[3 - history : 3] if history else None
+    expected = primitive.predict(3, action, last_outputs).output
+    assert (primitive.predict_window(3, means, covariances, action, last_outputs).output == expected).all()

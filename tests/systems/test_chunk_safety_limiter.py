@@ -1,4 +1,4 @@
-"""Chunks behind the guard in a diagram: limits at every command, replanning, fallbacks, and the start."""
+"""Chunk guard in a diagram: limits of every command, replanning, fallbacks, and the start of the motion."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def run(chunks, pose=(0.0, 0.0), mode="projection"):
     """Return commands (n, 2), rates (n,) and fallbacks (n,) at the control steps of chunks (n, K, O)."""
     builder = DiagramBuilder()
     system = builder.AddSystem(ChunkSafetyLimiter(guard(mode), STEPS, REPLAN, PERIOD))
-    hold = builder.AddSystem(ZeroOrderHold(PERIOD, STEPS * 2))  # constant during a control step
+    hold = builder.AddSystem(ZeroOrderHold(PERIOD, STEPS * 2))  # the chunk is constant during a control step
     builder.Connect(hold.get_output_port(), system.get_chunk_input_port())
     builder.ExportInput(hold.get_input_port(), "chunk")
     builder.ExportInput(system.get_pose_input_port(), "pose")
@@ -37,7 +37,7 @@ def run(chunks, pose=(0.0, 0.0), mode="projection"):
     for step, chunk in enumerate(chunks):
         port.GetMutableData().set_value(np.ravel(chunk))
         simulator.AdvanceTo(PERIOD * (step + 0.5))
-        result.append(np.concatenate([one.Eval(system.GetMyContextFromRoot(context)) for one in ports]))
+        result.append(np.concatenate([output.Eval(system.GetMyContextFromRoot(context)) for output in ports]))
     return np.array(result)[:, :2], np.array(result)[:, 2], np.array(result)[:, 3]
 
 
@@ -53,16 +53,16 @@ def test_every_command_is_within_the_limits_for_any_chunks(mode):
     assert not fallback.all()
 
 
-def test_commands_are_those_of_the_guard_without_a_diagram():
-    chunks = np.random.default_rng(1).uniform(-0.02, 0.02, (12, STEPS, 2))
-    plain = guard()
-    expected = np.concatenate([plain.guard(chunks[step], REPLAN).outputs[:REPLAN] for step in range(0, 12, REPLAN)])
+def test_commands_equal_those_of_the_guard_without_a_diagram():
+    chunks, chunk_guard = np.random.default_rng(1).uniform(-0.02, 0.02, (12, STEPS, 2)), guard()
+    replans = range(0, 12, REPLAN)
+    expected = np.concatenate([chunk_guard.guard(chunks[step], REPLAN).outputs[:REPLAN] for step in replans])
     assert (run(chunks)[0] == expected).all()
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 @pytest.mark.parametrize("entries", [np.s_[:], np.s_[0, 0]])
-def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite(number, entries):
+def test_previous_chunk_continues_when_a_chunk_is_not_finite(number, entries):
     chunks = np.zeros((5 * REPLAN, STEPS, 2))
     chunks[(slice(REPLAN, None), *np.atleast_1d(entries))] = number
     chunks[:REPLAN] = [0.03, 0.01]
@@ -76,8 +76,8 @@ def test_previous_chunk_is_executed_further_when_a_chunk_is_not_finite(number, e
 
 @pytest.mark.parametrize("chunk", [[0.05, -0.03], [0.0, np.nan]])
 @pytest.mark.parametrize(("x", "first"), [(0.02, 0.02), (0.0501, 0.05), (0.051, 0.051), (0.2, 0.2)])
-def test_motion_from_the_measured_pose_keeps_the_limits(x, first, chunk):
-    """One step leads at most 0.4 mm inside the bound at 50 mm; from farther outside the measured pose is held."""
+def test_motion_from_the_measured_pose_is_within_the_limits(x, first, chunk):
+    """The jerk limit admits 0.4 mm in the first step. Farther outside the bound of 50 mm, the pose is commanded."""
     commands, _, fallback = run(np.tile(chunk, (REPLAN, STEPS, 1)), [x, -0.03])
     motion = np.concatenate([np.tile([x, -0.03], (3, 1)), commands])
     assert (np.abs(np.diff(motion, axis=0)) <= VELOCITY * PERIOD).all()

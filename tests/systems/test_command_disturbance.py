@@ -8,11 +8,11 @@ from pydrake.trajectories import PiecewisePolynomial
 from guiderail.models.common.errors import InputError
 from guiderail.systems import CommandDisturbance
 
-PERIOD, POSE = 0.125, -5.0
+PERIOD, POSE = 0.125, -5.0  # control period [s] and measured pose
 
 
-def delivered(steps=12, seed=0, first=0.0, **options):
-    """Return the delivered commands of each period, for commands that count the periods from `first`."""
+def delivered_commands(steps=12, seed=0, first=0.0, **options):
+    """Return the delivered command of each control step if the command is `first` plus the number of the step."""
     builder = DiagramBuilder()
     ramp = TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 500.0 * PERIOD], [[first, first + 500.0]]))
     ramp = builder.AddSystem(ramp)
@@ -28,7 +28,7 @@ def delivered(steps=12, seed=0, first=0.0, **options):
     simulator.Initialize()
     outputs = []
     for step in range(1, steps + 1):
-        simulator.AdvanceTo(step * PERIOD)  # before the events of that instant: command step − 1
+        simulator.AdvanceTo(step * PERIOD)  # before the events of this instant, the command is that of step − 1
         outputs.append(line.get_delivered_command_output_port().Eval(context)[0])
     return np.array(outputs)
 
@@ -36,38 +36,38 @@ def delivered(steps=12, seed=0, first=0.0, **options):
 def test_measured_pose_must_be_finite_at_initialization(monkeypatch):
     monkeypatch.setattr(f"{__name__}.POSE", np.nan)
     with pytest.raises(InputError, match="measured pose must be finite"):
-        delivered()
+        delivered_commands()
 
 
-def test_every_command_is_delivered_without_disturbance():
-    np.testing.assert_allclose(delivered(), np.arange(12.0), atol=1e-9)
+def test_commands_are_unchanged_without_disturbance():
+    np.testing.assert_allclose(delivered_commands(), np.arange(12.0), atol=1e-9)
 
 
 @pytest.mark.parametrize("delay", [1, 2, 5])
-def test_every_command_arrives_later_by_the_delay(delay):
-    """The first command is 7. The output of the hold before its first update is 0, which is no command."""
-    outputs = delivered(first=7.0, delay=delay)
+def test_commands_arrive_after_the_delay(delay):
+    """The first command is 7. The 0 that the hold outputs before its first update must not be delivered."""
+    outputs = delivered_commands(first=7.0, delay=delay)
     np.testing.assert_array_equal(outputs[:delay], POSE)
     np.testing.assert_allclose(outputs[delay:], 7.0 + np.arange(12.0 - delay), atol=1e-9)
 
 
-def test_measured_pose_replaces_the_first_command_if_it_is_lost():
-    firsts = [delivered(1, seed, first=7.0, loss_probability=0.5)[0] for seed in range(20)]
-    assert set(firsts) == {POSE, 7.0}
+def test_measured_pose_replaces_a_lost_first_command():
+    first_commands = [delivered_commands(1, seed, first=7.0, loss_probability=0.5)[0] for seed in range(20)]
+    assert set(first_commands) == {POSE, 7.0}
 
 
 def test_lost_command_is_replaced_by_the_last_delivered_one():
-    outputs = delivered(400, loss_probability=0.3, seed=1)
-    lost = np.abs(outputs - np.arange(400.0)) > 1e-6
-    assert 0.2 < lost.mean() < 0.4
-    for step in np.flatnonzero(lost[1:]) + 1:
+    outputs = delivered_commands(400, loss_probability=0.3, seed=1)
+    is_lost = np.abs(outputs - np.arange(400.0)) > 1e-6
+    assert 0.2 < is_lost.mean() < 0.4
+    for step in np.flatnonzero(is_lost[1:]) + 1:
         assert outputs[step] == outputs[step - 1]
-    np.testing.assert_array_equal(delivered(400, loss_probability=0.3, seed=1), outputs)
-    assert not np.array_equal(delivered(400, loss_probability=0.3, seed=2), outputs)
+    np.testing.assert_array_equal(delivered_commands(400, loss_probability=0.3, seed=1), outputs)
+    assert not np.array_equal(delivered_commands(400, loss_probability=0.3, seed=2), outputs)
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [
         {"loss_probability": 1.0},
         {"loss_probability": -0.1},
@@ -78,19 +78,19 @@ def test_lost_command_is_replaced_by_the_last_delivered_one():
         {"size": 1.5},
     ],
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        CommandDisturbance(**{"size": 1, "period": PERIOD} | wrong)
+        CommandDisturbance(**{"size": 1, "period": PERIOD} | arguments)
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, np.nan])
-def test_seed_is_refused_when_it_is_no_whole_number_from_zero(seed):
+def test_seed_is_refused_when_negative_or_not_a_whole_number(seed):
     system = CommandDisturbance(1, PERIOD)
     with pytest.raises(InputError, match="a seed must be a whole number of at least 0, not"):
         system.set_seed(system.CreateDefaultContext(), seed)
 
 
-def test_losses_are_samples_of_seed_and_count_and_repeat_after_a_reset():
+def test_losses_depend_on_seed_and_step_and_repeat_after_reset():
     system = CommandDisturbance(1, PERIOD, loss_probability=0.4)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -102,21 +102,21 @@ def test_losses_are_samples_of_seed_and_count_and_repeat_after_a_reset():
         context.SetTime(0.0)
         simulator.Initialize()
         command.GetMutableData().set_value([9999.0])
-        assert system.get_delivered_command_output_port().Eval(context)[0] == 9999.0  # none is lost before a step
-        lost = []
+        assert system.get_delivered_command_output_port().Eval(context)[0] == 9999.0  # no loss before a step
+        is_lost = []
         for step in range(1027):
             simulator.AdvanceTo((step + 0.5) * PERIOD)
             command.GetMutableData().set_value([float(step)])
-            lost.append(system.get_delivered_command_output_port().Eval(context)[0] != step)
-        assert lost == expected
+            is_lost.append(system.get_delivered_command_output_port().Eval(context)[0] != step)
+        assert is_lost == expected
 
 
 @pytest.mark.parametrize(("share", "is_lost"), [(0.9995, False), (1.0005, True)])
-def test_first_command_is_lost_if_its_sample_is_below_the_probability(share, is_lost):
+def test_command_is_lost_when_its_sample_is_below_probability(share, is_lost):
     sample = np.random.default_rng([3, 1]).uniform()
-    output = delivered(1, seed=3, first=7.0, loss_probability=share * sample)[0]
+    output = delivered_commands(1, seed=3, first=7.0, loss_probability=share * sample)[0]
     assert output == (POSE if is_lost else 7.0)
 
 
-def test_probability_slightly_below_one_is_accepted():
-    np.testing.assert_array_equal(delivered(3, loss_probability=0.9995), POSE)
+def test_loss_probability_slightly_below_one_is_accepted():
+    np.testing.assert_array_equal(delivered_commands(3, loss_probability=0.9995), POSE)

@@ -11,29 +11,29 @@ from guiderail.systems.command_filter import CommandFilter
 
 PERIOD = 0.125
 BOX = LinearConstraints.box([-1.0, -np.inf], [1.0, np.inf])
-WALL = ([[0.5, 2.0]], [[9.0, 3.0]])  # above y = 2 where x > 0.5
+WALL = ([[0.5, 2.0]], [[9.0, 3.0]])  # keep-out box 0.5 < x < 9, 2 < y < 3
 KEEP_OUT = KeepOut(*WALL, BOX, margin=0.1)
 LAWS = {"barrier": BarrierFilter(KEEP_OUT, 0.3), "tangent": TangentSpaceFilter(KEEP_OUT, 0.2)}
 
 
-def margin(point):
-    """Distance to the nearest constraint or face, with the margin of 0.1; negative inside."""
-    inside_wall = max(0.5 - point[0], 2.0 - point[1], point[1] - 3.0)
-    return min(0.9 - abs(point[0]), inside_wall - 0.1)
+def clearance(point):
+    """Return the distance to the nearest bound or face of the wall minus the margin of 0.1; negative if violated."""
+    wall_distance = max(0.5 - point[0], 2.0 - point[1], point[1] - 3.0)
+    return min(0.9 - abs(point[0]), wall_distance - 0.1)
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
-def test_every_command_keeps_constraints_for_any_desired_one(law):
+def test_commands_satisfy_constraints_for_random_inputs(law):
     rng = np.random.default_rng(0)
     last, smallest = np.array([0.0, 0.0]), np.inf
     for _ in range(3000):
         desired = last + rng.normal(0.0, rng.choice([0.01, 0.3, 5.0]), 2) + [0.02, 0.02]
         last, _ = law.apply(last, desired)
-        smallest = min(smallest, margin(last))
-    assert -1e-8 < smallest < 0.02  # constraints were reached, and not passed
+        smallest = min(smallest, clearance(last))
+    assert -1e-8 < smallest < 0.02  # a constraint was reached, and none was violated
 
 
-def test_barrier_decreases_by_its_fraction_at_most():
+def test_slack_decreases_at_most_by_the_decay_of_the_barrier():
     last = np.array([0.0, 0.0])
     command, is_changed = LAWS["barrier"].apply(last, np.array([5.0, 0.0]))
     assert is_changed
@@ -49,34 +49,34 @@ def test_barrier_with_full_decay_is_a_projection():
     np.testing.assert_allclose(law.apply(np.zeros(2), np.array([3.0, 4.0]))[0], [1.0, 4.0], atol=1e-9)
 
 
-def test_tangent_step_slides_along_a_constraint_and_is_free_far_from_it():
+def test_tangent_space_scales_the_normal_step_by_the_slack():
     law, step = LAWS["tangent"], np.array([0.05, 0.05])
-    at_wall, _ = law.apply(np.array([0.9, 0.0]), np.array([0.9, 0.0]) + step)
-    np.testing.assert_allclose(at_wall, [0.9, 0.05], atol=1e-3)
-    half, _ = TangentSpaceFilter(KeepOut(np.empty((0, 2)), np.empty((0, 2)), BOX, margin=0.0), 0.2).apply(
+    at_bound, _ = law.apply(np.array([0.9, 0.0]), np.array([0.9, 0.0]) + step)
+    np.testing.assert_allclose(at_bound, [0.9, 0.05], atol=1e-3)
+    near_bound, _ = TangentSpaceFilter(KeepOut(np.empty((0, 2)), np.empty((0, 2)), BOX, margin=0.0), 0.2).apply(
         np.array([0.8, 0.0]), np.array([0.85, 0.0])
     )
-    assert half[0] == pytest.approx(0.8 + 0.5 * 0.05, abs=1e-3)  # half remains at a slack of the width
+    assert near_bound[0] == pytest.approx(0.8 + 0.5 * 0.05, abs=1e-3)  # the slack equals the width: half of the step
     law = TangentSpaceFilter(KEEP_OUT, 1e-3)
     np.testing.assert_allclose(law.apply(np.zeros(2), step)[0], step, atol=1e-6)
 
 
 @pytest.mark.parametrize("law", LAWS.values(), ids=LAWS)
-def test_command_outside_returns_to_the_constraints(law):
-    last = np.array([1.4, 0.0])
-    distances = []
+def test_command_moves_inside_when_it_starts_outside(law):
+    command = np.array([1.4, 0.0])
+    positions = [1.4]
     for _ in range(40):
-        last, _ = law.apply(last, np.array([0.0, 0.0]))
-        distances.append(last[0])
-    assert distances[-1] <= 0.9
-    assert (np.diff([1.4, *distances]) <= 1e-9).all()
+        command, _ = law.apply(command, np.array([0.0, 0.0]))
+        positions.append(command[0])
+    assert positions[-1] <= 0.9
+    assert (np.diff(positions) <= 1e-9).all()
 
 
 @pytest.mark.parametrize("desired", [[np.nan, 0.0], [np.inf, 0.0]])
 @pytest.mark.parametrize(
     "keep_out", [KEEP_OUT, KeepOut(np.empty((0, 2)), np.empty((0, 2)), LinearConstraints.none(2), 0.0)]
 )
-def test_command_that_is_not_finite_repeats_the_last_one(keep_out, desired):
+def test_last_command_is_repeated_when_desired_is_not_finite(keep_out, desired):
     for law in (BarrierFilter(keep_out, 0.3), TangentSpaceFilter(keep_out, 0.2)):
         command, is_changed = law.apply(np.array([0.1, 0.2]), np.array(desired))
         np.testing.assert_array_equal(command, [0.1, 0.2])
@@ -84,31 +84,31 @@ def test_command_that_is_not_finite_repeats_the_last_one(keep_out, desired):
 
 
 @pytest.mark.parametrize("decay", [0.0, -0.1, 1.1, np.nan])
-def test_barrier_raises_when_the_decay_is_out_of_range(decay):
+def test_barrier_refuses_a_decay_out_of_range(decay):
     with pytest.raises(InputError, match="fraction"):
         BarrierFilter(KEEP_OUT, decay)
     assert BarrierFilter(KEEP_OUT, 1.0).num_outputs == 2
 
 
 @pytest.mark.parametrize("width", [0.0, -1.0, np.inf])
-def test_tangent_space_raises_when_the_width_is_not_positive(width):
+def test_tangent_space_refuses_a_width_out_of_range(width):
     with pytest.raises(InputError, match="positive"):
         TangentSpaceFilter(KEEP_OUT, width)
 
 
-def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
+def test_system_filters_from_measured_pose_then_last_command():
     system = CommandFilter(LAWS["barrier"], PERIOD)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     desired = system.get_desired_pose_input_port().FixValue(context, [5.0, 0.0])
     pose = system.get_pose_input_port().FixValue(context, [0.4, 0.0])
     simulator.Initialize()
-    pose.GetMutableData().set_value([0.0, 0.0])  # read at initialization only
-    slack, commands = 0.5, []
+    pose.GetMutableData().set_value([0.0, 0.0])  # without effect after the initialization
+    initial_slack, commands = 0.5, []
     for step in range(3):
         simulator.AdvanceTo((step + 0.5) * PERIOD)
         commands.append(system.get_safe_pose_output_port().Eval(context)[0])
-    np.testing.assert_allclose(commands, 0.9 - slack * 0.7 ** np.arange(1, 4), atol=1e-9)
+    np.testing.assert_allclose(commands, 0.9 - initial_slack * 0.7 ** np.arange(1, 4), atol=1e-9)
     assert system.get_intervention_output_port().Eval(context)[0] == 1.0
     desired.GetMutableData().set_value([0.6, 0.0])
     assert system.get_intervention_output_port().Eval(context)[0] == 0.0
@@ -117,7 +117,7 @@ def test_system_starts_at_the_measured_pose_and_keeps_the_last_command():
 
 
 class PassThrough:
-    """A user's law that returns every desired command."""
+    """User-defined law that returns the desired command."""
 
     num_outputs = 2
 
@@ -129,8 +129,8 @@ class PassThrough:
 
 
 @pytest.mark.parametrize("law", [LAWS["barrier"], PassThrough()])
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_system_repeats_its_command_when_desired_is_not_finite(law, number):
     system = CommandFilter(law, PERIOD)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -139,7 +139,7 @@ def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
     simulator.Initialize()
     simulator.AdvanceTo(1.5 * PERIOD)
     last = system.get_safe_pose_output_port().Eval(context)
-    desired.GetMutableData().set_value([0.0, bad])
+    desired.GetMutableData().set_value([0.0, number])
     simulator.AdvanceTo(2.5 * PERIOD)
     np.testing.assert_array_equal(system.get_safe_pose_output_port().Eval(context), last)
     assert system.get_intervention_output_port().Eval(context)[0] == 1.0
@@ -148,12 +148,12 @@ def test_last_command_repeats_when_desired_one_is_not_finite(law, bad):
     np.testing.assert_allclose(system.get_safe_pose_output_port().Eval(context), [0.0, 0.2], atol=1e-3)
 
 
-def test_system_raises_when_the_period_is_not_positive():
+def test_system_refuses_a_period_of_zero():
     with pytest.raises(InputError):
         CommandFilter(LAWS["tangent"], 0.0)
 
 
-def test_system_keeps_the_velocity_of_a_law_that_limits_the_acceleration():
+def test_system_stores_the_velocity_of_a_motion_filter():
     motion = MotionConstraints(BOX, max_speed=[0.8, 0.8], max_acceleration=[1.6, 1.6])
     system = CommandFilter(MotionConstraintFilter(motion, PERIOD), PERIOD)
     simulator = Simulator(system)

@@ -12,7 +12,7 @@ START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)
 
 
 class Rig:
-    """Watchdog of a robot at `START`, with its inputs fixed by the test."""
+    """Watchdog of a robot at `start`, with fixed inputs."""
 
     def __init__(self, command, time=None, start=START, timeout=(TIMEOUT,)):
         self.system = CommandWatchdog(PERIOD, *timeout, pose_size=len(start))
@@ -32,6 +32,7 @@ class Rig:
         self.simulator.AdvanceTo(self.context.get_time() + seconds)
 
     def check(self, pose, command_timed_out):
+        """Assert that the outputs have these values."""
         np.testing.assert_array_equal(self.system.get_safe_pose_output_port().Eval(self.context), pose)
         assert self.system.get_command_timed_out_output_port().Eval(self.context) == [command_timed_out]
 
@@ -49,19 +50,19 @@ def test_commands_never_time_out_without_a_time_stamp():
     rig.check(FIRST, command_timed_out=0)
 
 
-def test_stale_command_is_replaced_by_the_last_valid_one():
+def test_last_valid_command_replaces_a_stale_command():
     rig = Rig(FIRST, time=0.0)
     rig.advance(TIMEOUT)
     rig.check(FIRST, command_timed_out=0)
-    # Detected at the first check after the timeout, at most one period later.
+    # The check that detects the timeout is at most one period later.
     rig.advance(2.5 * PERIOD)
     rig.check(FIRST, command_timed_out=1)
-    rig.command(SECOND, time=0.0)  # a stale message that arrives late
+    rig.command(SECOND, time=0.0)  # a message that arrives late
     rig.check(FIRST, command_timed_out=1)
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
-def test_new_command_after_a_stale_one_is_valid_at_once(phase):
+def test_new_command_is_valid_at_once_after_a_timeout(phase):
     rig = Rig(FIRST, time=0.0)
     rig.advance(3 * TIMEOUT + phase * PERIOD)
     rig.check(FIRST, command_timed_out=1)
@@ -69,10 +70,10 @@ def test_new_command_after_a_stale_one_is_valid_at_once(phase):
     rig.check(SECOND, command_timed_out=0)
 
 
-def test_late_command_is_stored_when_it_becomes_stale_at_once():
+def test_late_command_is_stored_before_it_times_out():
     rig = Rig(FIRST, time=0.0)
     rig.advance(4.5 * PERIOD)
-    # Still valid, and stale at the next check.
+    # This command is valid, and stale at the next check.
     rig.command(SECOND, time=rig.context.get_time() - TIMEOUT - 0.25 * PERIOD)
     rig.check(SECOND, command_timed_out=0)
     rig.advance(PERIOD)
@@ -80,8 +81,8 @@ def test_late_command_is_stored_when_it_becomes_stale_at_once():
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 1.0])
-def test_command_is_ignored_when_it_is_in_the_future(phase):
-    """Otherwise it would never time out."""
+def test_command_is_ignored_when_its_time_is_in_the_future(phase):
+    """Such a command would never time out."""
     rig = Rig(FIRST, time=0.0)
     rig.advance(3 * PERIOD + phase * PERIOD)
     for ahead in (1.5 * PERIOD, 1000.0, np.inf):
@@ -92,7 +93,7 @@ def test_command_is_ignored_when_it_is_in_the_future(phase):
 
 
 @pytest.mark.parametrize("phase", [0.0, 0.3, 0.9])
-def test_command_is_valid_when_it_leads_by_less_than_a_period(phase):
+def test_command_is_valid_when_it_is_early_by_less_than_a_period(phase):
     rig = Rig(FIRST, time=0.5 * PERIOD)
     rig.check(FIRST, command_timed_out=0)
     rig.advance((3 + phase) * PERIOD)
@@ -116,21 +117,21 @@ def test_age_of_a_command_is_checked_at_its_limits(age, command_timed_out):
 
 @pytest.mark.parametrize(("size", "command_timed_out"), [(1e6, 0), (1.0005e6, 1)])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_coordinate_is_checked_at_its_limit(sign, size, command_timed_out):
+def test_command_is_valid_up_to_its_largest_coordinate(sign, size, command_timed_out):
     command = np.array([0.0, 0.0, 0.0, sign * size, 0.0, 0.0])
     rig = Rig(command)
     rig.check(START if command_timed_out else command, command_timed_out)
 
 
-@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-def test_measured_pose_must_be_finite_at_initialization(nonsense):
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_measured_pose_must_be_finite_at_initialization(number):
     with pytest.raises(InputError, match="measured pose must be finite"):
-        Rig(FIRST, start=np.full(6, nonsense))
+        Rig(FIRST, start=np.full(6, number))
 
 
-@pytest.mark.parametrize("nonsense", [np.nan, np.inf])
-def test_measured_pose_is_output_before_the_first_command(nonsense):
-    rig = Rig(np.full(6, nonsense))
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_measured_pose_is_output_before_the_first_command(number):
+    rig = Rig(np.full(6, number))
     rig.check(START, command_timed_out=1)
     rig.advance(3 * PERIOD)
     rig.check(START, command_timed_out=1)
@@ -163,8 +164,8 @@ def test_initialization_resets_the_last_valid_pose():
     rig.check(START, command_timed_out=1)
 
 
-@pytest.mark.parametrize(("blend_factor", "held"), [(0.0, SECOND), (0.5, FIRST), (1.0, FIRST)])
-def test_robot_that_was_not_controlled_is_held_where_it_is(blend_factor, held):
+@pytest.mark.parametrize(("blend_factor", "pose"), [(0.0, SECOND), (0.5, FIRST), (1.0, FIRST)])
+def test_measured_pose_is_output_when_the_blend_factor_was_zero(blend_factor, pose):
     rig = Rig(FIRST)
     factor = rig.system.get_blend_factor_input_port().FixValue(rig.context, [1.0])
     rig.advance(2 * PERIOD)
@@ -175,13 +176,13 @@ def test_robot_that_was_not_controlled_is_held_where_it_is(blend_factor, held):
         rig.advance(2 * PERIOD)
     factor.GetMutableData().set_value([1.0])
     rig.advance(2 * PERIOD)
-    rig.check(held, command_timed_out=1)
+    rig.check(pose, command_timed_out=1)
     rig.command(START)
     rig.check(START, command_timed_out=0)
 
 
 @pytest.mark.parametrize(("age", "command_timed_out"), [(0.5 * TIMEOUT, 0), (2.0 * TIMEOUT, 1), (-2.0 * PERIOD, 1)])
-def test_validity_uses_the_start_time_before_the_first_check(age, command_timed_out):
+def test_age_is_relative_to_the_start_before_the_first_check(age, command_timed_out):
     rig, start = Rig(FIRST), 5.0 + 0.5 * PERIOD
     rig.context.SetTime(start)
     rig.command(FIRST, time=start - age)
@@ -190,16 +191,16 @@ def test_validity_uses_the_start_time_before_the_first_check(age, command_timed_
 
 
 @pytest.mark.parametrize(("age", "command_timed_out"), [(0.1, 0), (0.10005, 1)])
-def test_commands_time_out_after_a_tenth_of_a_second_by_default(age, command_timed_out):
+def test_commands_time_out_after_100_ms_by_default(age, command_timed_out):
     rig = Rig(FIRST, time=-age, timeout=())
     assert rig.system.get_command_timed_out_output_port().Eval(rig.context) == [command_timed_out]
 
 
-def test_outputs_are_not_computed_again_between_two_checks():
+def test_outputs_are_computed_once_per_check():
     """Python code in every plant step would slow down the simulation."""
     calls = []
 
-    class Counted(CommandWatchdog):
+    class CountingWatchdog(CommandWatchdog):
         def _calc_safe_pose(self, context, output):
             calls.append(context.get_time())
             super()._calc_safe_pose(context, output)
@@ -207,7 +208,7 @@ def test_outputs_are_not_computed_again_between_two_checks():
     builder = DiagramBuilder()
     hold = builder.AddSystem(ZeroOrderHold(PERIOD, 6))
     time_hold = builder.AddSystem(ZeroOrderHold(PERIOD, 1))
-    system = builder.AddSystem(Counted(PERIOD, TIMEOUT))
+    system = builder.AddSystem(CountingWatchdog(PERIOD, TIMEOUT))
     builder.Connect(hold.get_output_port(), system.get_desired_pose_input_port())
     builder.Connect(time_hold.get_output_port(), system.get_command_time_input_port())
     for name, port in (

@@ -8,6 +8,7 @@ from guiderail.systems.constraint_violation import ConstraintViolation
 
 
 def violation(system, pose):
+    """Return the constraint violation of a pose in the first control step."""
     context = system.CreateDefaultContext()
     system.get_pose_input_port().FixValue(context, pose)
     return system.get_violation_output_port().Eval(context)[0]
@@ -20,7 +21,7 @@ def test_violation_is_the_maximum_over_all_constraints():
     assert violation(system, [1.5, -3.0]) == 2.0
 
 
-def test_violation_is_unconstrained_without_constraints():
+def test_violation_has_its_lower_limit_without_constraints():
     assert ConstraintViolation.UNCONSTRAINED == -1e30
     assert violation(ConstraintViolation(LinearConstraints.none(2), 0.1), [1.0, 2.0]) == -1e30
     far = ConstraintViolation(LinearConstraints.box([-1.0005e30], [np.inf]), 0.1)
@@ -40,13 +41,13 @@ def test_violation_uses_the_constraints_of_the_control_step():
     simulator.Initialize()
     violations = []
     for n in range(52):
-        # Before the events of an instant the constraints of the previous step apply.
+        # Before the events of an instant, the constraints of the previous step apply.
         simulator.AdvanceTo((n + 1) * 0.1)
         violations.append(system.get_violation_output_port().Eval(context)[0])
     np.testing.assert_array_equal(violations, 2.0 - np.minimum(np.arange(52.0), 49.0))
 
 
-def test_constant_constraints_need_no_state():
+def test_system_has_no_state_when_constraints_are_constant():
     system = ConstraintViolation(LinearConstraints.box([0.0], [1.0]), 0.1)
     assert system.CreateDefaultContext().num_discrete_state_groups() == 0
 

@@ -1,4 +1,4 @@
-"""Adversarial test of passivity: reference, bound and surroundings move so as to extract energy."""
+"""Energy tank: an adversary that moves reference, bound and obstacle cannot extract more than the initial energy."""
 
 import numpy as np
 import pytest
@@ -14,59 +14,64 @@ PERIOD = 0.01
 
 
 class Tank:
-    """Tank without a diagram: `step` runs one period and returns the force along x."""
+    """Energy tank with fixed inputs that is stepped without a simulator."""
 
     def __init__(self, capacity=0.5):
         self.system = EnergyTank(STIFFNESS, DAMPING, BOUND, capacity=capacity, period=PERIOD)
         self.context = self.system.CreateDefaultContext()
-        self.put(np.zeros(6), np.zeros(6), BOUND.numbers)
+        self.set_inputs(np.zeros(6), np.zeros(6), BOUND.numbers)
         self.reset()
 
     def reset(self):
+        """Run the initialization event."""
         events = self.system.AllocateDiscreteVariables()
         events.SetFrom(self.context.get_discrete_state())
         self.system._reset(self.context, events)
         self.context.SetDiscreteState(events)
 
-    def put(self, desired, pose, bound):
+    def set_inputs(self, desired, pose, bound):
         self.system.get_desired_pose_input_port().FixValue(self.context, desired)
         self.system.get_pose_input_port().FixValue(self.context, pose)
         self.system.get_max_wrench_input_port().FixValue(self.context, bound)
 
     def step(self, desired, pose, bound):
-        """Return reference and limit of x, and the content after the update."""
-        self.put(desired, pose, bound)
+        """Run one period; return the reference (6,), the admitted bound (8,), and the energy after the update [J]."""
+        self.set_inputs(desired, pose, bound)
         reference = self.system.get_reference_pose_output_port().Eval(self.context)
-        limit = self.system.get_admitted_wrench_output_port().Eval(self.context)
+        wrench = self.system.get_admitted_wrench_output_port().Eval(self.context)
         self.context.SetDiscreteState(self.system.EvalUniquePeriodicDiscreteUpdate(self.context))
-        return reference, limit, self.system.get_energy_output_port().Eval(self.context)[0]
+        return reference, wrench, self.system.get_energy_output_port().Eval(self.context)[0]
 
 
-def extracted(capacity, *, with_tank, seed=0):
-    """Return the energy [J] that a moving obstacle gains along x, while an adversary moves the reference behind it."""
-    tank, rng, x, gained, contents = Tank(capacity), np.random.default_rng(seed), 0.0, 0.0, []
+def extracted_energy(capacity, *, with_tank, seed=0):
+    """Return the energy [J] that an obstacle receives along x from an adversary, and the lowest energy of the tank.
+
+    While the obstacle moves forward, the reference is 0.1 m ahead with the full bound. While the obstacle moves
+    backward, the reference is at the obstacle with a tenth of the bound.
+    """
+    tank, rng, x, received, energies = Tank(capacity), np.random.default_rng(seed), 0.0, 0.0, []
     for _ in range(600):
-        forward = rng.uniform() < 0.8
-        speed = rng.uniform(0.0, 0.05) * (1.0 if forward else -1.0)
-        desired = np.r_[x + 0.1 if forward else x, np.zeros(5)]  # pushes the obstacle along, lets it come back
-        bound = BOUND.numbers * (1.0 if forward else 0.1)
-        reference, limit, content = tank.step(desired, np.r_[x, np.zeros(5)], bound)
-        contents.append(content)
+        is_forward = rng.uniform() < 0.8
+        speed = rng.uniform(0.0, 0.05) * (1.0 if is_forward else -1.0)
+        desired = np.r_[x + 0.1 if is_forward else x, np.zeros(5)]
+        bound = BOUND.numbers * (1.0 if is_forward else 0.1)
+        reference, wrench, energy = tank.step(desired, np.r_[x, np.zeros(5)], bound)
+        energies.append(energy)
         if not with_tank:
-            reference, limit = desired, bound
+            reference, wrench = desired, bound
         for _ in range(10):  # the obstacle moves within the period
-            force = np.clip(STIFFNESS[0] * (reference[0] - x), -limit[0], limit[0]) - DAMPING[0] * speed
-            gained += force * speed * PERIOD / 10
+            force = np.clip(STIFFNESS[0] * (reference[0] - x), -wrench[0], wrench[0]) - DAMPING[0] * speed
+            received += force * speed * PERIOD / 10
             x += speed * PERIOD / 10
-    return gained, min(contents)
+    return received, min(energies)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_surroundings_extract_at_most_the_content(seed):
-    gained, content = extracted(0.2, with_tank=True, seed=seed)
-    assert -1e-9 <= content < 0.01  # the adversary emptied it
-    assert gained <= 0.2 * 1.02
-    assert extracted(0.2, with_tank=False, seed=seed)[0] > 0.4
+def test_extracted_energy_is_at_most_the_initial_energy(seed):
+    received, lowest_energy = extracted_energy(0.2, with_tank=True, seed=seed)
+    assert -1e-9 <= lowest_energy < 0.01  # the adversary emptied the tank
+    assert received <= 0.2 * 1.02
+    assert extracted_energy(0.2, with_tank=False, seed=seed)[0] > 0.4
 
 
 def test_full_tank_passes_reference_and_bound_unchanged():
@@ -77,41 +82,42 @@ def test_full_tank_passes_reference_and_bound_unchanged():
 
 
 def test_lower_bound_applies_at_once_when_the_tank_is_empty():
-    tank, far, pose = Tank(1e-6), np.r_[0.1, np.zeros(5)], np.zeros(6)
-    tank.step(far, pose, BOUND.numbers)
-    reference, wrench, _ = tank.step(far, pose, 0.1 * BOUND.numbers)
+    tank, desired, pose = Tank(1e-6), np.r_[0.1, np.zeros(5)], np.zeros(6)
+    tank.step(desired, pose, BOUND.numbers)
+    reference, wrench, _ = tank.step(desired, pose, 0.1 * BOUND.numbers)
     np.testing.assert_array_equal(wrench[:6], 0.1 * BOUND.axes)
     assert 0.0 < reference[0] < 1e-3
-    _, wrench, content = tank.step(far, pose, BOUND.numbers)
-    assert content >= 0.0
+    _, _, energy = tank.step(desired, pose, BOUND.numbers)
+    assert energy >= 0.0
 
 
-def test_tank_that_is_too_empty_admits_the_share_of_a_motion_that_it_can_pay():
+def test_reference_moves_by_a_share_when_the_energy_is_too_low():
     tank, pose = Tank(0.01), np.zeros(6)
     tank.step(np.r_[0.002, np.zeros(5)], pose, BOUND.numbers)
-    reference, _, content = tank.step(np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
+    reference, _, energy = tank.step(np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
+    # The spring's energy ½ K r² is the initial energy.
     np.testing.assert_allclose(reference, np.r_[np.sqrt(2.0 * 0.01 / 1500.0), np.zeros(5)], rtol=1e-6)
-    assert 0.0 <= content < 1e-6
-    held, _, _ = tank.step(np.r_[-0.1, np.zeros(5)], pose, BOUND.numbers)
-    np.testing.assert_allclose(held, -reference, rtol=1e-3, atol=1e-9)  # the spring's energy is returned on the way
+    assert 0.0 <= energy < 1e-6
+    opposite, _, _ = tank.step(np.r_[-0.1, np.zeros(5)], pose, BOUND.numbers)
+    np.testing.assert_allclose(opposite, -reference, rtol=1e-3, atol=1e-9)  # has the same energy of the spring
 
 
-def test_tank_that_is_too_empty_admits_the_share_of_a_bound_that_it_can_pay():
+def test_bound_rises_by_a_share_when_the_energy_is_too_low():
     tank, pose, desired = Tank(0.004), np.zeros(6), np.r_[0.003, np.zeros(5)]
     tank.step(desired, pose, 0.1 * BOUND.numbers)
-    reference, wrench, content = tank.step(desired, pose, BOUND.numbers)
+    reference, wrench, energy = tank.step(desired, pose, BOUND.numbers)
     np.testing.assert_allclose(reference, desired, rtol=1e-12)
-    # The energy f r − f² / 2 K of a spring that is clipped to f is the content.
+    # The energy f r − f² / 2 K of a spring that is clipped to f is the initial energy.
     limit = 1500.0 * 0.003 - np.sqrt((1500.0 * 0.003) ** 2 - 2.0 * 1500.0 * 0.004)
     share = (limit - 0.9) / (9.0 - 0.9)
     np.testing.assert_allclose(wrench[:6], (0.1 + 0.9 * share) * BOUND.axes, rtol=1e-5)
-    assert 0.0 <= content < 1e-6
+    assert 0.0 <= energy < 1e-6
 
 
-def test_initialization_fills_the_tank_and_restarts_at_the_measured_pose():
+def test_initialization_resets_energy_and_reference():
     tank, pose = Tank(0.01), np.full(6, 0.2)
     tank.step(np.r_[0.1, np.zeros(5)], np.zeros(6), 0.1 * BOUND.numbers)
-    tank.put(pose, pose, BOUND.numbers)
+    tank.set_inputs(pose, pose, BOUND.numbers)
     tank.reset()
     assert tank.system.get_energy_output_port().Eval(tank.context)[0] == 0.01
     reference, wrench, _ = tank.step(pose + np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
@@ -119,9 +125,9 @@ def test_initialization_fills_the_tank_and_restarts_at_the_measured_pose():
     np.testing.assert_array_equal(wrench, BOUND.numbers)
 
 
-def test_motion_starts_at_the_first_finite_pose():
+def test_reference_starts_at_the_first_finite_pose():
     tank, pose = Tank(0.01), np.full(6, 0.2)
-    tank.put(pose, np.full(6, np.nan), BOUND.numbers)
+    tank.set_inputs(pose, np.full(6, np.nan), BOUND.numbers)
     tank.reset()
     tank.step(pose, np.full(6, np.nan), BOUND.numbers)
     reference, *_ = tank.step(pose + np.r_[0.1, np.zeros(5)], pose, BOUND.numbers)
@@ -138,7 +144,7 @@ def test_bound_is_constant_without_an_input():
 
 
 @pytest.mark.parametrize("invalid", [np.nan, -1.0, -np.inf])
-def test_last_valid_limit_remains_in_force_when_one_is_invalid(invalid):
+def test_last_valid_limit_applies_while_the_limit_is_invalid(invalid):
     tank, zero, low = Tank(), np.zeros(6), 0.5 * BOUND.numbers
     tank.step(zero, zero, low)
     for _ in range(3):
@@ -146,40 +152,40 @@ def test_last_valid_limit_remains_in_force_when_one_is_invalid(invalid):
     mixed = np.r_[1.0, np.full(7, invalid)]
     np.testing.assert_array_equal(tank.step(zero, zero, mixed)[1], np.r_[1.0, low[1:]])
     np.testing.assert_array_equal(tank.step(zero, zero, np.zeros(8))[1], np.zeros(8))  # 0 is valid
-    tank.put(zero, zero, np.full(8, invalid))
+    tank.set_inputs(zero, zero, np.full(8, invalid))
     Simulator(tank.system, tank.context).Initialize()
     np.testing.assert_array_equal(tank.step(zero, zero, np.full(8, invalid))[1], np.zeros(8))
 
 
 def test_motion_refills_the_tank_up_to_its_capacity():
     tank = Tank(0.02)
-    _, _, low = tank.step(np.r_[0.005, np.zeros(5)], np.zeros(6), BOUND.numbers)
-    assert low == pytest.approx(0.02 - 0.5 * 1500.0 * 0.005**2)
-    moved = np.r_[0.005, np.zeros(5)]
-    _, _, content = tank.step(moved, moved, BOUND.numbers)
-    assert content == 0.02
+    _, _, energy = tank.step(np.r_[0.005, np.zeros(5)], np.zeros(6), BOUND.numbers)
+    assert energy == pytest.approx(0.02 - 0.5 * 1500.0 * 0.005**2)
+    pose = np.r_[0.005, np.zeros(5)]
+    _, _, energy = tank.step(pose, pose, BOUND.numbers)
+    assert energy == 0.02
 
 
-def test_pose_that_is_not_finite_costs_nothing():
-    """A controller behind the tank notices it, and holds its last valid pose."""
+def test_desired_pose_that_is_not_finite_uses_no_energy():
+    """A controller behind the tank rejects such a pose."""
     tank, desired = Tank(), np.r_[0.001, np.zeros(5)]
     *_, before = tank.step(desired, np.zeros(6), BOUND.numbers)
-    reference, _, content = tank.step(np.full(6, np.nan), np.zeros(6), BOUND.numbers)
+    reference, _, energy = tank.step(np.full(6, np.nan), np.zeros(6), BOUND.numbers)
     assert np.isnan(reference).all()
-    assert content == before
+    assert energy == before
 
 
-def test_content_is_kept_when_the_measured_pose_is_not_finite():
+def test_energy_is_constant_while_measured_pose_is_not_finite():
     tank, desired = Tank(), np.r_[0.05, np.zeros(5)]
-    reference, limit, before = tank.step(desired, np.zeros(6), BOUND.numbers)
+    reference, wrench, before = tank.step(desired, np.zeros(6), BOUND.numbers)
     assert before < 0.1
-    held, lowered, content = tank.step(-desired, np.full(6, np.nan), 0.5 * BOUND.numbers)
-    np.testing.assert_array_equal(held, reference)
-    np.testing.assert_array_equal(lowered[:6], 0.5 * limit[:6])
-    assert content == before
-    reference, limit, content = tank.step(held, np.r_[0.01, np.zeros(5)], 0.5 * BOUND.numbers)
-    assert np.isfinite([*reference, *limit]).all()
-    assert content == pytest.approx(before)  # the motion without a measurement is not counted as dissipation
+    repeated, lowered, energy = tank.step(-desired, np.full(6, np.nan), 0.5 * BOUND.numbers)
+    np.testing.assert_array_equal(repeated, reference)
+    np.testing.assert_array_equal(lowered[:6], 0.5 * wrench[:6])
+    assert energy == before
+    reference, wrench, energy = tank.step(repeated, np.r_[0.01, np.zeros(5)], 0.5 * BOUND.numbers)
+    assert np.isfinite([*reference, *wrench]).all()
+    assert energy == pytest.approx(before)  # the displacement without a measurement does not count as dissipation
 
 
 @pytest.mark.parametrize(

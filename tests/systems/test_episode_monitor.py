@@ -5,14 +5,12 @@ from pydrake.systems.analysis import Simulator
 from guiderail.models.common.errors import InputError
 from guiderail.systems.episode_monitor import TERMINATIONS, EpisodeMonitor, TerminationTerm
 
-SUCCESS = TERMINATIONS.index("success")
-
 PERIOD = 0.1
-BLOCKED = TERMINATIONS.index("blocked")
+SUCCESS, BLOCKED = TERMINATIONS.index("success"), TERMINATIONS.index("blocked")
 
 
 class Episode:
-    """Monitor with one signal value per control step; its output is read as by an environment."""
+    """Monitor with one value of the signal per control step, whose output is read as in an environment."""
 
     def __init__(self, *conditions, size=1):
         self.system = EpisodeMonitor(conditions, PERIOD)
@@ -28,21 +26,22 @@ class Episode:
         self.simulator.Initialize()
 
     def step(self, *values):
-        """Events at the start of a step use the last signal; the signal of this step takes effect at its end."""
+        """Run one control step with these values of the signal at its end; return the termination code."""
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         self.signal.GetMutableData().set_value(values)
         self.steps += 1
         self.simulator.AdvanceTo(self.steps * PERIOD)
-        # An environment may evaluate the output more than once.
+        # An environment may evaluate the output several times.
         self.system.get_termination_output_port().Eval(self.context)
         return int(self.system.get_termination_output_port().Eval(self.context)[0])
 
 
 def above(limit, **parameters):
+    """Return the term that ends an episode as "blocked" when u exceeds `limit`."""
     return TerminationTerm("blocked", {"u": 1}, lambda u: u[0] > limit, **parameters)
 
 
-def test_ports():
+def test_monitor_has_its_ports():
     system = EpisodeMonitor([above(1), TerminationTerm("success", {"v": 3}, lambda v: False)], PERIOD)
     assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["u", "v"]
     assert system.get_signal_input_port("v").size() == 3
@@ -67,12 +66,12 @@ def test_consecutive_steps_are_counted_once_each():
 
 
 def test_steps_are_counted_since_the_last_progress():
-    # The second entry is the condition, the first one the progress.
+    # The first number of u is the progress, and the condition is that the second number is positive.
     stuck = TerminationTerm("blocked", {"u": 2}, lambda u: u[1] > 0, steps=3, progress=lambda u: u[0], min_progress=0.1)
     episode = Episode(stuck, size=2)
-    # Neither a free step nor progress below 0.1 resets the count; larger progress does.
-    moves = [(0, 1), (0, 1), (0.05, 0), (0.5, 1), (0.5, 1), (0.4, 0), (0.55, 1), (0.5, 1)]
-    assert [episode.step(*u) for u in moves] == [0] * 7 + [BLOCKED]
+    # The count continues after a step without the condition and after progress below 0.1. Larger progress resets it.
+    values = [(0, 1), (0, 1), (0.05, 0), (0.5, 1), (0.5, 1), (0.4, 0), (0.55, 1), (0.5, 1)]
+    assert [episode.step(*u) for u in values] == [0] * 7 + [BLOCKED]
 
 
 @pytest.mark.parametrize("index", range(3))
@@ -80,10 +79,10 @@ def test_progress_is_recorded_for_each_term(index):
     stuck = TerminationTerm("blocked", {"u": 2}, lambda u: u[1] > 0, steps=2, progress=lambda u: u[0], min_progress=0.5)
     other = TerminationTerm("spill", {"u": 2}, lambda u: u[1] > 0, steps=99, progress=lambda u: 0.0)
     terms = [other] * index + [stuck] + [other] * (2 - index)
-    # Progress by exactly 0.5 does not reset the count; slightly larger progress does.
-    for moves, reason in (([(0, 1), (0.5, 1), (0.5, 1)], BLOCKED), ([(0, 1), (0.5004, 1), (0.5004, 1)], 0)):
+    # Progress by exactly 0.5 does not reset the count, and progress by 0.5004 does.
+    for values, termination in (([(0, 1), (0.5, 1), (0.5, 1)], BLOCKED), ([(0, 1), (0.5004, 1), (0.5004, 1)], 0)):
         episode = Episode(*terms, size=2)
-        assert [episode.step(*u) for u in moves] == [0, 0, reason]
+        assert [episode.step(*u) for u in values] == [0, 0, termination]
 
 
 def test_any_progress_resets_the_count_by_default():
@@ -125,23 +124,23 @@ def test_constructor_refuses_invalid_arguments(make):
     ("name", "words"), [("", "'blocked' is called"), ("Pouring", "'blocked' of Pouring is called")]
 )
 @pytest.mark.parametrize("functions", [{"condition": lambda v: True}, {"progress": lambda v: 0.0}])
-def test_function_is_refused_when_its_parameters_are_not_the_signals(functions, name, words):
+def test_function_is_refused_when_parameters_are_not_signals(functions, name, words):
     term = TerminationTerm(**{"termination": "blocked", "inputs": {"u": 1}, "condition": lambda u: True} | functions)
     with pytest.raises(InputError, match=f"condition {words}"):
         EpisodeMonitor([term], PERIOD, name)
 
 
-@pytest.mark.parametrize("met", [np.nan, np.inf, np.array([True, True]), np.array([]), None, "yes"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, np.array([True, True]), np.array([]), None, "yes"])
 @pytest.mark.parametrize("parameters", [{}, {"progress": lambda u: -np.inf}])
-def test_condition_is_refused_when_it_is_no_truth_value(met, parameters):
-    episode = Episode(TerminationTerm("success", {"u": 1}, lambda u: met, **parameters))
+def test_condition_is_refused_when_it_returns_no_truth_value(value, parameters):
+    episode = Episode(TerminationTerm("success", {"u": 1}, lambda u: value, **parameters))
     with pytest.raises(InputError, match="the condition 'success' must be true or false"):
         episode.step(0.0)
 
 
-@pytest.mark.parametrize("met", [True, np.True_, 1, 0.5, np.array([True])])
-def test_condition_may_be_one_number(met):
-    assert Episode(TerminationTerm("blocked", {"u": 1}, lambda u: met)).step(0.0) == BLOCKED
+@pytest.mark.parametrize("value", [True, np.True_, 1, 0.5, np.array([True])])
+def test_condition_may_return_a_single_number(value):
+    assert Episode(TerminationTerm("blocked", {"u": 1}, lambda u: value)).step(0.0) == BLOCKED
 
 
 def test_each_term_has_its_own_count():

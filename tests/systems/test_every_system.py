@@ -1,9 +1,9 @@
 """Rules that every LeafSystem of the project satisfies.
 
-- A file defines one exported system, named like the file, with a test file of its own.
-- Each port has a typed and documented getter, and the class docstring lists all ports.
-- Outputs declare their prerequisites and depend on inputs, parameters and discrete state only.
-- Invalid arguments raise an `InputError`.
+- A file defines one exported system with the name of the file, and the system has a test file.
+- Each port has a typed and documented getter, and the docstring of the class lists all ports.
+- Outputs declare their prerequisites and depend only on inputs, parameters and discrete state.
+- The source raises only `InputError`, `PolicyError`, `DivergedError` and `AttributeError`.
 """
 
 import ast
@@ -43,10 +43,12 @@ BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
 
 
 def classes(path):
+    """Return the syntax trees of the classes of a file."""
     return [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef)]
 
 
 def system_names(path):
+    """Return the names of the classes of a file that derive from LeafSystem."""
     return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id == "LeafSystem" for b in c.bases)]
 
 
@@ -60,8 +62,8 @@ def primitive(history):
 
 
 @pytest.fixture(scope="module")
-def built():
-    """Return one instance of each system, with all of its optional ports."""
+def system_by_name():
+    """Return one instance of each system by name, with all optional ports."""
     plant, arm = controller_model(BncWorkcell())
     template, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
@@ -96,7 +98,13 @@ def built():
         systems.ImpedanceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
         systems.ChunkReference(
-            lambda seen: seen, 2, primitive(0).reference, horizon=1, replan_steps=1, covariance_floor=1.0, period=PERIOD
+            lambda observation: observation,
+            2,
+            primitive(0).reference,
+            horizon=1,
+            replan_steps=1,
+            covariance_floor=1.0,
+            period=PERIOD,
         ),
         systems.ChunkSafetyLimiter(
             ChunkGuard(BOX, np.ones(2), np.ones(2), period=PERIOD, start=np.zeros(2)), 4, 2, PERIOD
@@ -128,12 +136,12 @@ def built():
 
 
 @pytest.fixture(params=NAMES)
-def system(request, built):
-    return built[request.param]
+def system(request, system_by_name):
+    return system_by_name[request.param]
 
 
 def ports(system):
-    """Yield kind, name and port of all ports of a system."""
+    """Yield kind ("input" or "output"), name and port of each port of a system."""
     for kind in ("input", "output"):
         for index in range(getattr(system, f"num_{kind}_ports")()):
             port = getattr(system, f"get_{kind}_port")(index)
@@ -141,11 +149,12 @@ def ports(system):
 
 
 def getters(system, kind):
+    """Return the getters of ports of a kind that the class of the system defines, by name."""
     return {name: getattr(system, name) for name in vars(type(system)) if re.fullmatch(rf"get_\w+_{kind}_port", name)}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_file_has_one_exported_and_tested_system_of_its_name(path):
+def test_file_has_one_exported_and_tested_system(path):
     (name,) = system_names(path)
     assert re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() == path.stem
     assert issubclass(getattr(systems, name), LeafSystem)
@@ -173,8 +182,8 @@ def test_importing_one_system_does_not_import_the_others():
     assert finished.stdout.strip() == "False"
 
 
-def test_every_system_has_an_instance_here(built):
-    assert sorted(built) == sorted(NAMES)
+def test_these_tests_cover_every_system(system_by_name):
+    assert sorted(system_by_name) == sorted(NAMES)
 
 
 def test_every_port_has_a_documented_getter(system):
@@ -182,12 +191,12 @@ def test_every_port_has_a_documented_getter(system):
         methods = getters(system, kind)
         method = methods.get(f"get_{name}_{kind}_port")
         if method is not None:
-            returned = method()
+            result = method()
         else:
-            # Ports named by constructor arguments share one getter by name.
+            # Ports whose names are constructor arguments share a getter with the argument `name`.
             (method,) = (m for m in methods.values() if "name" in inspect.signature(m).parameters)
-            returned = method(name)
-        assert returned is port
+            result = method(name)
+        assert result is port
         assert inspect.signature(method).return_annotation is (InputPort if kind == "input" else OutputPort)
         assert inspect.getdoc(method)
 
@@ -205,7 +214,7 @@ def test_documented_ports_are_the_declared_ports(system):
 
 
 def test_output_depends_only_on_declared_prerequisites(system):
-    """Default prerequisites would cause repeated evaluation at every plant step and false direct feedthrough."""
+    """Default prerequisites would cause an evaluation at every plant step and false direct feedthrough."""
     nothing, parameters = system.nothing_ticket(), system.all_parameters_ticket()
     probe = system.DeclareCacheEntry(
         "probe", ValueProducer(allocate=lambda: Value(0), calc=lambda context, value: None), {nothing}
@@ -237,5 +246,5 @@ def test_source_gives_prerequisites_and_raises_input_errors(path):
             if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
                 assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            known = ("InputError", "PolicyError", "DivergedError", "AttributeError")
-            assert node.exc.func.id in known, f"line {node.lineno}"
+            exceptions = ("InputError", "PolicyError", "DivergedError", "AttributeError")
+            assert node.exc.func.id in exceptions, f"line {node.lineno}"

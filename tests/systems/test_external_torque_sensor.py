@@ -25,8 +25,19 @@ def no_errors(sensor):
     return JointTorqueErrors(np.zeros(7), np.zeros(7), np.zeros(7), np.zeros(bodies), np.zeros((bodies, 3)))
 
 
-def measured(arm, *, noise=0.0, drift=0.0, seconds=0.005, velocity=0.0, payload=0.0, seed=1, **errors):
-    """Return the measured torques at home, (7,), with errors by name, and the sensor."""
+def measure(arm, *, noise=0.0, drift=0.0, seconds=0.005, velocity=0.0, payload=0.0, seed=1, **errors):
+    """Return the measured torques (7,) [Nm] at the home posture after `seconds`, and the sensor.
+
+    Args:
+        arm: Plant and arm.
+        noise: Noise of each joint.
+        drift: Drift of each joint.
+        seconds: Time of the measurement [s].
+        velocity: Velocity of each joint [rad/s].
+        payload: Unmodeled mass at the tool [kg].
+        seed: Seed of noise and drift.
+        **errors: Fields of `JointTorqueErrors` that are not zero.
+    """
     plant, model = arm
     sensor = ExternalTorqueSensor(plant, model.tool[0], np.full(7, noise), np.full(7, drift), period=PERIOD)
     simulator = Simulator(sensor)
@@ -40,6 +51,7 @@ def measured(arm, *, noise=0.0, drift=0.0, seconds=0.005, velocity=0.0, payload=
 
 
 def gravity(arm, payload=0.0):
+    """Return the gravity torques (7,) [Nm] at the home posture."""
     plant, model = arm
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, HOME)
@@ -47,25 +59,25 @@ def gravity(arm, payload=0.0):
     return plant.CalcGravityGeneralizedForces(context)
 
 
-def test_contact_torques_are_measured_without_errors(arm):
-    np.testing.assert_allclose(measured(arm)[0], CONTACT, atol=1e-12)
+def test_measurement_is_the_contact_torque_without_errors(arm):
+    np.testing.assert_allclose(measure(arm)[0], CONTACT, atol=1e-12)
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
 def test_position_that_is_not_finite_is_refused(arm, number, monkeypatch):
     monkeypatch.setattr(f"{__name__}.HOME", [*HOME[:6], number])
     with pytest.raises(InputError, match="joint positions and velocities must be finite"):
-        measured(arm)
+        measure(arm)
 
 
-def test_gain_acts_on_gravity_too(arm):
-    """A sensor measures the whole torque of its joint, including the weight of the arm."""
+def test_gain_error_includes_the_gravity_torque(arm):
+    """A sensor measures the total torque of its joint, which includes the weight of the arm."""
     gain = 0.01 * np.arange(7)
-    np.testing.assert_allclose(measured(arm, gain=gain)[0], CONTACT + gain * (CONTACT + gravity(arm)), atol=1e-9)
+    np.testing.assert_allclose(measure(arm, gain=gain)[0], CONTACT + gain * (CONTACT + gravity(arm)), atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("wrong", "words"),
+    ("arguments", "words"),
     [
         ({"gain": np.zeros(6)}, r"gain of joint torque errors must be finite numbers \(7,\)"),
         ({"friction": np.full(7, np.nan)}, "friction"),
@@ -74,41 +86,41 @@ def test_gain_acts_on_gravity_too(arm):
         ({"seed": -1}, "a seed must be a whole number of at least 0, not -1"),
     ],
 )
-def test_errors_are_refused_when_they_are_out_of_range(arm, wrong, words):
+def test_errors_are_refused_when_they_are_out_of_range(arm, arguments, words):
     with pytest.raises(InputError, match=words):
-        measured(arm, **wrong)
+        measure(arm, **arguments)
 
 
-def test_payload_is_measured_as_its_weight(arm):
+def test_payload_adds_its_gravity_torque(arm):
     expected = CONTACT + gravity(arm, 0.5) - gravity(arm)
-    np.testing.assert_allclose(measured(arm, payload=0.5)[0], expected, atol=1e-9)
+    np.testing.assert_allclose(measure(arm, payload=0.5)[0], expected, atol=1e-9)
     assert np.abs(expected - CONTACT).max() > 1.0
 
 
-def test_errors_of_the_model_depend_on_the_configuration(arm):
-    sensor = measured(arm)[1]
+def test_mass_and_center_errors_change_the_gravity_torque(arm):
+    sensor = measure(arm)[1]
     mass = np.array([0.02 * body.default_mass() for body in sensor.bodies])
-    np.testing.assert_allclose(measured(arm, mass=mass)[0], CONTACT + 0.02 * gravity(arm), atol=1e-9)
+    np.testing.assert_allclose(measure(arm, mass=mass)[0], CONTACT + 0.02 * gravity(arm), atol=1e-9)
     center = np.full((len(sensor.bodies), 3), 0.002)
-    assert np.abs(measured(arm, center=center)[0] - CONTACT).max() > 0.05
+    assert np.abs(measure(arm, center=center)[0] - CONTACT).max() > 0.05
 
 
 def test_friction_opposes_the_motion(arm):
     friction = np.full(7, 0.1)
-    np.testing.assert_allclose(measured(arm, friction=friction, velocity=0.0)[0], CONTACT)
-    np.testing.assert_allclose(measured(arm, friction=friction, velocity=0.5)[0], CONTACT - 0.1)
-    np.testing.assert_allclose(measured(arm, friction=friction, velocity=-0.5)[0], CONTACT + 0.1)
+    np.testing.assert_allclose(measure(arm, friction=friction, velocity=0.0)[0], CONTACT)
+    np.testing.assert_allclose(measure(arm, friction=friction, velocity=0.5)[0], CONTACT - 0.1)
+    np.testing.assert_allclose(measure(arm, friction=friction, velocity=-0.5)[0], CONTACT + 0.1)
 
 
 def test_noise_and_drift_repeat_with_their_seed(arm):
-    first = measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=3)[0]
-    np.testing.assert_array_equal(measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=3)[0], first)
-    assert not np.allclose(measured(arm, noise=0.1, drift=0.1, seconds=0.5, seed=4)[0], first)
+    first, repeated, other = (measure(arm, noise=0.1, drift=0.1, seconds=0.5, seed=seed)[0] for seed in (3, 3, 4))
+    np.testing.assert_array_equal(repeated, first)
+    assert not np.allclose(other, first)
 
 
 def test_drift_is_a_random_walk_with_its_deviation(arm):
-    ends = np.array([measured(arm, drift=1.0, seconds=0.995, seed=seed)[0] - CONTACT for seed in range(20)])
-    assert ends.std() == pytest.approx(np.sqrt(0.1), rel=0.25)  # a tenth of the time
+    ends = np.array([measure(arm, drift=1.0, seconds=0.995, seed=seed)[0] - CONTACT for seed in range(20)])
+    assert ends.std() == pytest.approx(np.sqrt(0.1), rel=0.25)  # drift is the deviation after 10 s; here 1 s
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,9 @@ from guiderail.systems.gripper_command import GripperCommand
 LOWER, UPPER, OPENING = np.array([0.0, -1.0]), np.array([0.04, 1.0]), np.array([0.03, 0.5])
 
 
-class Commanded:
+class Rig:
+    """Gripper command with a position input that may be unconnected."""
+
     def __init__(self):
         self.system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
         self.simulator = Simulator(self.system)
@@ -25,47 +27,47 @@ class Commanded:
         return self.system.get_desired_state_output_port().Eval(self.context)
 
 
-def test_initial_opening_is_output_when_not_connected():
-    commanded = Commanded()
-    commanded.advance(0.1)
-    np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
+def test_initial_opening_is_output_when_input_is_unconnected():
+    rig = Rig()
+    rig.advance(0.1)
+    np.testing.assert_array_equal(rig.desired, [0.03, 0.5, 0.0, 0.0])
 
 
-def test_command_is_output_at_once_within_limits():
-    commanded = Commanded()
-    commanded.command([0.01, 0.2])
-    np.testing.assert_array_equal(commanded.desired, [0.01, 0.2, 0.0, 0.0])
-    commanded.command([-5.0, 5.0])
-    np.testing.assert_array_equal(commanded.desired, [0.0, 1.0, 0.0, 0.0])
+def test_command_is_clipped_to_its_limits_and_output_at_once():
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    np.testing.assert_array_equal(rig.desired, [0.01, 0.2, 0.0, 0.0])
+    rig.command([-5.0, 5.0])
+    np.testing.assert_array_equal(rig.desired, [0.0, 1.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_last_position_is_output_when_a_command_is_not_finite(bad):
-    commanded = Commanded()
-    commanded.command([0.01, 0.2])
-    commanded.advance(0.05)
-    commanded.command([bad, 0.4])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_last_position_is_output_when_a_command_is_not_finite(number):
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    rig.advance(0.05)
+    rig.command([number, 0.4])
     for _ in range(3):
-        np.testing.assert_array_equal(commanded.desired, [0.01, 0.4, 0.0, 0.0])
-        commanded.advance(0.05)
+        np.testing.assert_array_equal(rig.desired, [0.01, 0.4, 0.0, 0.0])
+        rig.advance(0.05)
 
 
 @pytest.mark.parametrize("is_initialized", [False, True])
 def test_reset_restores_the_initial_opening(is_initialized):
-    commanded = Commanded()
-    commanded.command([0.01, 0.2])
-    commanded.advance(0.05)
-    commanded.command([np.nan, np.nan])
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    rig.advance(0.05)
+    rig.command([np.nan, np.nan])
     if is_initialized:
-        commanded.context.SetTime(0.0)
-        commanded.simulator.Initialize()
+        rig.context.SetTime(0.0)
+        rig.simulator.Initialize()
     else:
-        commanded.system.SetDefaultContext(commanded.context)
-    np.testing.assert_array_equal(commanded.desired, [0.03, 0.5, 0.0, 0.0])
+        rig.system.SetDefaultContext(rig.context)
+    np.testing.assert_array_equal(rig.desired, [0.03, 0.5, 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [
         {"lower": np.zeros(1)},
         {"opening": np.array([0.05, 0.0])},
@@ -74,8 +76,8 @@ def test_reset_restores_the_initial_opening(is_initialized):
         {"period": 0.0},
     ],
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
-    valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | wrong
+def test_constructor_refuses_arguments_out_of_range(arguments):
+    valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | arguments
     with pytest.raises(InputError):
         GripperCommand(valid.pop("lower"), valid.pop("upper"), valid.pop("opening"), **valid)
 
@@ -101,7 +103,7 @@ def test_arguments_are_copied_and_may_be_lists():
     np.testing.assert_array_equal(system.get_desired_state_output_port().Eval(context), [0.0, 1.0, 0.0, 0.0])
 
 
-def test_ports():
+def test_gripper_command_has_its_ports():
     system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
     assert system.get_position_input_port().get_name() == "position"
     assert system.get_desired_state_output_port().get_name() == "desired_state"

@@ -11,7 +11,7 @@ PERIOD, TIMEOUT = 0.125, 0.5
 
 
 class Rig:
-    """Monitor with a heartbeat input that is set before each step."""
+    """Heartbeat monitor whose heartbeats are set before each step."""
 
     def __init__(self, period=PERIOD):
         self.system, self.period = HeartbeatMonitor(period=period, timeout=TIMEOUT), period
@@ -26,7 +26,7 @@ class Rig:
         self.heartbeats.GetMutableData().set_value(heartbeats)
 
     def step(self, *heartbeats):
-        """Return the fault at this check, before the next one."""
+        """Set the heartbeats, return the fault, and advance to the next check."""
         self.set(*heartbeats)
         fault = self.fault
         self.num_steps += 1
@@ -42,7 +42,7 @@ class Rig:
         return self.system.is_alive(self.context)
 
 
-def test_no_fault_before_the_first_heartbeat():
+def test_no_fault_is_raised_before_the_first_heartbeat():
     rig = Rig()
     assert {rig.step() for _ in range(10)} == {Fault.NONE}
     assert not rig.is_alive
@@ -60,7 +60,7 @@ def test_fault_is_raised_while_a_monitor_is_stopping():
 
 
 def test_fault_is_raised_when_the_heartbeat_times_out():
-    """Ages are 0, 1, … periods; the timeout is four periods, which is no fault yet."""
+    """The ages are 0, 1, … periods. An age of four periods equals the timeout and is no fault."""
     rig = Rig()
     faults = [rig.step(Heartbeat(1, False)) for _ in range(20)]
     assert faults == [Fault.NONE] * 5 + [Fault.MONITOR_STOP] * 15
@@ -77,13 +77,13 @@ def test_monitor_is_alive_up_to_the_timeout(age, is_alive):
     assert rig.fault == (Fault.NONE if is_alive else Fault.MONITOR_STOP)
 
 
-def test_next_heartbeat_of_many_is_a_sign_of_life():
+def test_monitor_is_alive_when_sequence_numbers_are_large():
     rig = Rig()
     assert {rig.step(Heartbeat(10**6 + k, False)) for k in range(10)} == {Fault.NONE}
 
 
 @pytest.mark.parametrize("sequence", [4, 5])
-def test_repeated_or_older_heartbeat_is_no_sign_of_life(sequence):
+def test_repeated_or_older_heartbeat_does_not_prevent_a_timeout(sequence):
     rig = Rig()
     rig.step(Heartbeat(5, False))
     for _ in range(5):
@@ -91,16 +91,16 @@ def test_repeated_or_older_heartbeat_is_no_sign_of_life(sequence):
     assert rig.fault == Fault.MONITOR_STOP
 
 
-def test_missing_monitor_is_noticed_while_another_is_alive():
+def test_missing_monitor_is_a_fault_while_another_is_alive():
     rig = Rig()
     rig.step(Heartbeat(1, False, 7), Heartbeat(1, False, 8))
     faults = [rig.step(Heartbeat(1, False, 7), Heartbeat(2 + k, False, 8)) for k in range(12)]
     assert faults[:4] == [Fault.NONE] * 4
-    missed = round(FORGET_TIME / PERIOD) - 4
-    assert faults[4 : 4 + missed] == [Fault.MONITOR_STOP] * missed
-    assert set(faults[4 + missed :]) == {Fault.NONE}  # replaced
+    fault_steps = round(FORGET_TIME / PERIOD) - 4
+    assert faults[4 : 4 + fault_steps] == [Fault.MONITOR_STOP] * fault_steps
+    assert set(faults[4 + fault_steps :]) == {Fault.NONE}  # the missing monitor is forgotten
     assert rig.is_alive
-    # A monitor that has returned is missed again.
+    # If the forgotten monitor sends a heartbeat, its next timeout is a fault.
     rig.step(Heartbeat(2, False, 7), Heartbeat(90, False, 8))
     faults = [rig.step(Heartbeat(2, False, 7), Heartbeat(91 + k, False, 8)) for k in range(5)]
     assert faults == [Fault.NONE] * 4 + [Fault.MONITOR_STOP]
@@ -113,14 +113,14 @@ def test_silent_monitor_is_forgotten_after_the_forget_time(age, fault):
     assert rig.step(Heartbeat(1, False, 7), Heartbeat(2, False, 8)) == fault
 
 
-def test_last_monitor_is_never_forgotten():
+def test_only_monitor_is_never_forgotten():
     rig = Rig()
     for _ in range(100):
         rig.step(Heartbeat(1, False, 7))
     assert rig.fault == Fault.MONITOR_STOP
 
 
-def test_stop_of_a_missing_monitor_is_forgotten_with_it():
+def test_stop_ends_when_the_missing_monitor_is_forgotten():
     rig = Rig()
     rig.step(Heartbeat(1, True, 7), Heartbeat(1, False, 8))
     for k in range(20):
@@ -133,8 +133,8 @@ def test_number_of_senders_is_limited_to_the_newest():
     for sender in range(3 * MAX_SENDERS):
         rig.step(Heartbeat(1, False, sender))
         senders = rig.context.get_discrete_state(0).value()[::3]
-        known = sorted(senders[np.isfinite(senders)].tolist())
-        assert known == list(range(max(sender + 1 - MAX_SENDERS, 0), sender + 1))
+        stored = sorted(senders[np.isfinite(senders)].tolist())
+        assert stored == list(range(max(sender + 1 - MAX_SENDERS, 0), sender + 1))
     assert rig.is_alive
 
 
@@ -153,9 +153,9 @@ def test_status_fault_takes_precedence():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}, {"timeout": np.inf}, {"timeout": FORGET_TIME}]
+    "arguments", [{"period": 0.0}, {"timeout": 0.0}, {"timeout": np.nan}, {"timeout": np.inf}, {"timeout": FORGET_TIME}]
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        HeartbeatMonitor(**{"period": PERIOD, "timeout": TIMEOUT} | wrong)
+        HeartbeatMonitor(**{"period": PERIOD, "timeout": TIMEOUT} | arguments)
     HeartbeatMonitor(period=PERIOD, timeout=0.9995 * FORGET_TIME)

@@ -8,7 +8,7 @@ from guiderail.systems.history_buffer import HistoryBuffer
 
 
 class Counter(LeafSystem):
-    """Output the number of periods started, like a movement primitive outputs the command of its step."""
+    """Output the number of the current period, as a movement primitive outputs the command of its step."""
 
     def __init__(self, period):
         super().__init__()
@@ -21,7 +21,7 @@ class Counter(LeafSystem):
         state.set_value([round(context.get_time() / self.period)])
 
 
-def test_history_of_one_output_is_the_last_one():
+def test_history_of_length_one_is_the_last_output():
     system = HistoryBuffer(1, 1, 0.1)
     simulator = Simulator(system)
     port = system.get_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
@@ -38,17 +38,18 @@ def system():
 
 
 def history(system, context):
+    """Return the history (3, 2), the oldest output first."""
     return system.get_history_output_port().Eval(context).reshape(3, 2)
 
 
-def test_ports(system):
+def test_buffer_has_its_ports(system):
     inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
     assert inputs == ["output", "initial_output"]
     assert [system.get_output_port(i).get_name() for i in range(system.num_output_ports())] == ["history"]
     assert system.get_history_output_port().size() == 6
 
 
-def test_no_direct_feedthrough(system):
+def test_buffer_has_no_direct_feedthrough(system):
     assert not system.HasAnyDirectFeedthrough()
 
 
@@ -75,7 +76,7 @@ def test_output_that_fills_the_history_must_be_finite(system, inputs):
         simulator.Initialize()
 
 
-def test_history_is_filled_with_initial_output_when_connected(system):
+def test_history_is_filled_with_initial_output_if_connected(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_output_input_port().FixValue(context, [1.0, -2.0])
@@ -108,7 +109,7 @@ def test_each_command_is_stored_exactly_once(period):
     simulator.Initialize()
     for n in range(1, 400):
         simulator.AdvanceTo((n + 0.5) * period)
-        # After instant n the newest stored command is n − 1.
+        # After instant n, the newest stored command is n − 1.
         assert buffer.get_history_output_port().Eval(context)[-1] == n - 1
 
 

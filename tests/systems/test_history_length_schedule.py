@@ -9,7 +9,7 @@ PERIOD = 0.125
 
 
 def lengths_under(forces, **arguments):
-    """Return the history length after each control step with the given forces."""
+    """Return the history length after each control step with these forces along z [N]."""
     system = HistoryLengthSchedule([1, 2, 5, 10], PERIOD, **arguments)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -28,17 +28,17 @@ def test_length_decreases_in_contact_and_increases_after_dwell():
     assert lengths == [10, 10, 5, 2, 1, 1, 1, 1, 2, 2, 2, 5, 5, 5, 10]
 
 
-def test_length_is_constant_when_force_noise_crosses_a_threshold():
-    noisy = 1.5 + 0.4 * np.array([1, -1] * 20)
-    assert set(lengths_under(noisy)) == {10}
-    assert lengths_under([3.0, 3.0, 3.0, *noisy], dwell_steps=1)[3:] == [1] * 40
+def test_length_is_constant_when_noise_is_between_the_thresholds():
+    forces = 1.5 + 0.4 * np.array([1, -1] * 20)
+    assert set(lengths_under(forces)) == {10}
+    assert lengths_under([3.0, 3.0, 3.0, *forces], dwell_steps=1)[3:] == [1] * 40
 
 
 def test_contact_restarts_the_dwell_steps():
     assert lengths_under([3, 3, 3, 0, 0, 3, 0, 0], dwell_steps=3)[2:] == [1] * 6
 
 
-def test_torque_is_not_contact():
+def test_torque_without_force_is_no_contact():
     assert lengths_under([0.0] * 5) == [10] * 5
 
 
@@ -50,7 +50,6 @@ def test_contact_begins_above_2_N_and_ends_at_1_N_by_default():
 
 
 def test_length_increases_after_10_free_steps_by_default():
-    # The step at time zero is in free space too.
     assert lengths_under([3.0] * 3 + [0.0] * 20)[2:] == [1] * 10 + [2] * 10 + [5]
 
 
@@ -68,7 +67,7 @@ def test_initialization_restores_the_longest_length():
     simulator.AdvanceTo(2 * PERIOD)
     assert length.Eval(context)[0] == 1
     context.SetTime(0.0)
-    wrench.GetMutableData().set_value([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # neither starts nor ends contact
+    wrench.GetMutableData().set_value([1.5, 0.0, 0.0, 0.0, 0.0, 0.0])  # 1.5 N neither starts nor ends a contact
     simulator.Initialize()
     assert length.Eval(context)[0] == 5
     simulator.AdvanceTo(2 * PERIOD)
@@ -97,6 +96,6 @@ def test_constructor_refuses_arguments_out_of_range(arguments):
         HistoryLengthSchedule(arguments.pop("lengths", [1, 2]), PERIOD, **arguments)
 
 
-def test_constructor_accepts_limiting_arguments():
+def test_constructor_accepts_arguments_at_their_limits():
     HistoryLengthSchedule([1], PERIOD, contact_threshold=0.0, release_threshold=0.0, dwell_steps=1, wrench_size=1)
     HistoryLengthSchedule([1], PERIOD, contact_threshold=1.0, release_threshold=1.0)

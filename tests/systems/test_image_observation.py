@@ -6,7 +6,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.image_observation import ImageObservation
 
 
-def test_observation_is_the_image_by_channel_and_the_state():
+def test_observation_is_the_channels_of_the_image_and_the_state():
     system = ImageObservation(width=4, height=3, state_size=2)
     context, image = system.CreateDefaultContext(), ImageRgba8U(4, 3)
     image.mutable_data[:] = np.arange(48).reshape(3, 4, 4)
@@ -17,6 +17,6 @@ def test_observation_is_the_image_by_channel_and_the_state():
     np.testing.assert_array_equal(observation[36:], [0.5, -2.0])
 
 
-def test_no_pixels_are_refused():
+def test_constructor_refuses_an_image_without_pixels():
     with pytest.raises(InputError, match="at least 1"):
         ImageObservation(0, 3, 2)

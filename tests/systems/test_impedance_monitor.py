@@ -8,6 +8,7 @@ LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
 
 
 def read(wrench, limits=LIMITS):
+    """Return the contact force [N] and the saturation of an impedance wrench (6,)."""
     monitor = ImpedanceMonitor(limits)
     context = monitor.CreateDefaultContext()
     monitor.get_impedance_wrench_input_port().FixValue(context, wrench)
@@ -15,7 +16,7 @@ def read(wrench, limits=LIMITS):
     return force.Eval(context)[0], saturation.Eval(context)[0]
 
 
-def test_contact_force_is_the_norm_of_the_force_alone():
+def test_contact_force_is_the_norm_of_the_force():
     assert read([3.0, 4.0, 12.0, 2.0, 2.0, 2.0]) == (13.0, 0.0)
 
 
@@ -28,7 +29,7 @@ def test_saturation_is_reported_when_any_axis_is_at_its_limit(axis, sign):
         assert read(wrench)[1] == expected
 
 
-def test_saturation_begins_at_exactly_999_thousandths_of_a_limit():
+def test_saturation_begins_at_exactly_0_999_of_a_limit():
     limits = np.full(6, 1000.0)
     assert read([np.nextafter(999.0, 0.0)] + [0.0] * 5, limits)[1] == 0.0
     assert read([999.0] + [0.0] * 5, limits)[1] == 1.0

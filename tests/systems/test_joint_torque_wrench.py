@@ -17,81 +17,78 @@ def arm():
     return controller_model(BncWorkcell())
 
 
-def estimate(arm, wrench, seconds=0.005, **options):
-    """Return the estimate from the joint torques of a wrench (6,), force first."""
+class Rig:
+    """Estimator in a simulator, with fixed joint positions and external torques."""
+
+    def __init__(self, arm, torque, **options):
+        plant, model = arm
+        arguments = {"period": 0.01, "time_constant": 0.0} | options
+        self.system = JointTorqueWrench(plant, model.target, model.tool_center, **arguments)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+        self.positions = self.system.get_positions_input_port().FixValue(self.context, READY_POSTURE)
+        self.torque = self.system.get_external_torque_input_port().FixValue(self.context, torque)
+
+    def wrench_at(self, time):
+        """Advance to a time [s] and return the wrench (6,)."""
+        self.simulator.AdvanceTo(time)
+        return self.system.get_wrench_output_port().Eval(self.context).copy()
+
+
+def jacobian(arm):
+    """Return the Jacobian (6, 7) of the tool center in the axes of the target, rotational rows first."""
     plant, model = arm
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, READY_POSTURE)
-    J = plant.CalcJacobianSpatialVelocity(
+    return plant.CalcJacobianSpatialVelocity(
         context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), model.target, model.target
     )
-    system = JointTorqueWrench(
-        plant, model.target, model.tool_center, **({"period": 0.01, "time_constant": 0.0} | options)
-    )
-    simulator = Simulator(system)
-    system.get_positions_input_port().FixValue(simulator.get_mutable_context(), READY_POSTURE)
-    torque = J.T @ np.concatenate([wrench[3:], wrench[:3]])
-    system.get_external_torque_input_port().FixValue(simulator.get_mutable_context(), torque)
-    simulator.AdvanceTo(seconds)
-    assert not system.HasAnyDirectFeedthrough()
-    return system.get_wrench_output_port().Eval(simulator.get_context()).copy()
 
 
-def test_wrench_is_recovered_from_its_joint_torques(arm):
+def estimate(arm, wrench, **options):
+    """Return the estimate from the joint torques of a wrench (6,), force first."""
+    return Rig(arm, jacobian(arm).T @ np.concatenate([wrench[3:], wrench[:3]]), **options).wrench_at(0.005)
+
+
+def test_estimator_has_no_direct_feedthrough(arm):
+    assert not Rig(arm, np.zeros(7)).system.HasAnyDirectFeedthrough()
+
+
+def test_wrench_is_estimated_from_its_joint_torques(arm):
     wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
     np.testing.assert_allclose(estimate(arm, wrench, damping=0.0), wrench, atol=1e-9)
     np.testing.assert_allclose(estimate(arm, wrench), wrench, rtol=0.05, atol=0.05)
 
 
-def test_damping_has_its_documented_default_and_reduces_the_estimate(arm):
-    wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
-    plant, model = arm
-    context = plant.CreateDefaultContext()
-    plant.SetPositions(context, READY_POSTURE)
-    J = plant.CalcJacobianSpatialVelocity(
-        context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), model.target, model.target
-    )
+def test_default_damping_reduces_the_estimate(arm):
+    wrench, J = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3]), jacobian(arm)
     damped = np.linalg.solve(J @ J.T + 1e-4 * np.eye(6), J @ J.T @ np.concatenate([wrench[3:], wrench[:3]]))
     np.testing.assert_allclose(estimate(arm, wrench), [*damped[3:], *damped[:3]], rtol=1e-9)
 
 
-def test_no_time_constant_means_no_filter(arm):
-    plant, model = arm
-    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.0)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_positions_input_port().FixValue(context, READY_POSTURE)
-    torque = system.get_external_torque_input_port().FixValue(context, np.linspace(-1.0, 1.0, 7))
-    simulator.AdvanceTo(0.005)
-    first = system.get_wrench_output_port().Eval(context).copy()
-    torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
-    simulator.AdvanceTo(0.015)
-    np.testing.assert_allclose(system.get_wrench_output_port().Eval(context), 2.0 * first, atol=1e-12)
+def test_estimate_is_not_filtered_when_the_time_constant_is_zero(arm):
+    rig = Rig(arm, np.linspace(-1.0, 1.0, 7))
+    first = rig.wrench_at(0.005)
+    rig.torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
+    np.testing.assert_allclose(rig.wrench_at(0.015), 2.0 * first, atol=1e-12)
 
 
 def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
-    plant, model = arm
-    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1, damping=0.0)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_positions_input_port().FixValue(context, READY_POSTURE)
-    torque = system.get_external_torque_input_port().FixValue(context, np.linspace(-1.0, 1.0, 7))
-    output = system.get_wrench_output_port()
-    simulator.AdvanceTo(0.005)
-    first = output.Eval(context).copy()
+    rig = Rig(arm, np.linspace(-1.0, 1.0, 7), time_constant=0.1, damping=0.0)
+    first = rig.wrench_at(0.005)
     assert np.linalg.norm(first) > 0.1
-    torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
-    simulator.AdvanceTo(0.055)  # events at 10, 20, 30, 40 and 50 ms
-    np.testing.assert_allclose(output.Eval(context), first * (2.0 - np.exp(-0.5)), atol=1e-9)
-    context.SetTime(0.0)
-    simulator.Initialize()
-    np.testing.assert_array_equal(output.Eval(context), np.zeros(6))
-    simulator.AdvanceTo(0.005)  # the first sample initializes the filter again
-    np.testing.assert_allclose(output.Eval(context), 2.0 * first, atol=1e-9)
+    rig.torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
+    # Five samples, at 10, 20, 30, 40 and 50 ms.
+    np.testing.assert_allclose(rig.wrench_at(0.055), first * (2.0 - np.exp(-0.5)), atol=1e-9)
+    rig.context.SetTime(0.0)
+    rig.simulator.Initialize()
+    np.testing.assert_array_equal(rig.system.get_wrench_output_port().Eval(rig.context), np.zeros(6))
+    # The first sample after the initialization restarts the filter.
+    np.testing.assert_allclose(rig.wrench_at(0.005), 2.0 * first, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [
         {"period": 0.0},
         {"time_constant": -1.0},
@@ -100,43 +97,30 @@ def test_filter_is_a_first_order_low_pass_from_the_first_sample(arm):
         {"damping": np.inf},
     ],
 )
-def test_constructor_refuses_arguments_out_of_range(arm, wrong):
+def test_constructor_refuses_arguments_out_of_range(arm, arguments):
     with pytest.raises(InputError):
-        estimate(arm, np.zeros(6), **wrong)
+        estimate(arm, np.zeros(6), **arguments)
 
 
 @pytest.mark.parametrize("port", ["positions", "external_torque"])
 def test_sample_is_skipped_when_it_is_not_finite(arm, port):
-    plant, model = arm
-    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.01, time_constant=0.1)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    valid_values = {"positions": READY_POSTURE, "external_torque": np.linspace(-1.0, 1.0, 7)}
-    values = {name: system.GetInputPort(name).FixValue(context, value) for name, value in valid_values.items()}
-    simulator.AdvanceTo(0.025)
-    before = system.get_wrench_output_port().Eval(context).copy()
-    values[port].GetMutableData().set_value(np.full(7, np.nan))
-    simulator.AdvanceTo(0.035)
-    np.testing.assert_array_equal(system.get_wrench_output_port().Eval(context), before)
-    values[port].GetMutableData().set_value(valid_values[port])
-    values["external_torque"].GetMutableData().set_value(2.0 * valid_values["external_torque"])
-    simulator.AdvanceTo(1.0)
-    assert np.isfinite(system.get_wrench_output_port().Eval(context)).all()
-    assert np.linalg.norm(system.get_wrench_output_port().Eval(context) - before) > 0.1
+    rig = Rig(arm, np.linspace(-1.0, 1.0, 7), time_constant=0.1)
+    before = rig.wrench_at(0.025)
+    value = rig.positions if port == "positions" else rig.torque
+    value.GetMutableData().set_value(np.full(7, np.nan))
+    np.testing.assert_array_equal(rig.wrench_at(0.035), before)
+    rig.positions.GetMutableData().set_value(READY_POSTURE)
+    rig.torque.GetMutableData().set_value(np.linspace(-2.0, 2.0, 7))
+    after = rig.wrench_at(1.0)
+    assert np.isfinite(after).all()
+    assert np.linalg.norm(after - before) > 0.1
 
 
-@pytest.mark.parametrize("size", [1e5, 1e150, 1e308])
-def test_filter_forgets_a_false_sample_of_any_size(arm, size):
-    plant, model = arm
-    system = JointTorqueWrench(plant, model.target, model.tool_center, period=0.005, time_constant=0.02)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_positions_input_port().FixValue(context, READY_POSTURE)
-    torque = system.get_external_torque_input_port().FixValue(context, np.zeros(7))
-    simulator.AdvanceTo(0.012)
-    torque.GetMutableData().set_value(np.full(7, -size))
-    simulator.AdvanceTo(0.017)
-    assert np.linalg.norm(system.get_wrench_output_port().Eval(context)) > 1e3
-    torque.GetMutableData().set_value(np.zeros(7))
-    simulator.AdvanceTo(0.217)
-    assert np.linalg.norm(system.get_wrench_output_port().Eval(context)) < 10.0
+@pytest.mark.parametrize("torque", [1e5, 1e150, 1e308])
+def test_single_false_sample_decays_in_the_filter(arm, torque):
+    rig = Rig(arm, np.zeros(7), period=0.005, time_constant=0.02)
+    rig.wrench_at(0.012)
+    rig.torque.GetMutableData().set_value(np.full(7, -torque))
+    assert np.linalg.norm(rig.wrench_at(0.017)) > 1e3
+    rig.torque.GetMutableData().set_value(np.zeros(7))
+    assert np.linalg.norm(rig.wrench_at(0.217)) < 10.0

@@ -19,29 +19,48 @@ def primitive(history=3, upper=0.5):
     return LcNsKmp(reference, history=history, horizon=8, constraints=constraints)
 
 
+def unsolvable(*arguments):
+    """Replace a solver that finds no solution."""
+    raise UnsolvableError("no solution")
+
+
+def failing_at(step, predict):
+    """Return a `predict` that finds no solution in this control step."""
+    return lambda index, *arguments: unsolvable() if index == step else predict(index, *arguments)
+
+
+def simulate(p, gain=None, action=(0.0, 0.0)):
+    """Return the system of a primitive, its simulator, the context, and the value of the null-space action."""
+    system = LcNsKmpSystem(p, gain, PERIOD)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    return system, simulator, context, system.get_null_space_action_input_port().FixValue(context, action)
+
+
 def names(system, kind):
+    """Return the names of the input or output ports of a system."""
     count = getattr(system, f"num_{kind}_ports")()
     return [getattr(system, f"get_{kind}_port")(i).get_name() for i in range(count)]
 
 
-def test_ports():
+def test_system_has_its_ports():
     system = LcNsKmpSystem(primitive(), None, PERIOD)
     assert names(system, "input") == ["null_space_action", "history", "motion_time", "reference_window"]
     assert names(system, "output") == ["command", "constraint_violation", "fallback"]
     assert system.get_history_input_port().size() == 6
     assert system.get_command_output_port().size() == 2
     assert system.get_reference_window_input_port().size() == 9 * (2 + 4)
-    without = LcNsKmpSystem(primitive(history=0), None, PERIOD)
-    assert names(without, "input") == ["null_space_action", "motion_time", "reference_window"]
+    without_history = LcNsKmpSystem(primitive(history=0), None, PERIOD)
+    assert names(without_history, "input") == ["null_space_action", "motion_time", "reference_window"]
     with pytest.raises(InputError, match="history"):
-        without.get_history_input_port()
+        without_history.get_history_input_port()
 
 
-def test_window_of_three_outputs_has_their_covariances():
+def test_window_of_three_outputs_has_covariances_of_nine_entries():
     times, means, covariances = PERIOD * np.arange(50), np.zeros((50, 3)), np.tile(np.eye(3), (50, 1, 1))
     reference = ReferenceTrajectory(times, means, covariances)
-    three = LcNsKmp(reference, history=0, horizon=8, constraints=LinearConstraints.none(3))
-    assert LcNsKmpSystem(three, None, PERIOD).get_reference_window_input_port().size() == 9 * (3 + 9)
+    p = LcNsKmp(reference, history=0, horizon=8, constraints=LinearConstraints.none(3))
+    assert LcNsKmpSystem(p, None, PERIOD).get_reference_window_input_port().size() == 9 * (3 + 9)
 
 
 def test_command_is_the_prediction_at_the_control_step():
@@ -56,7 +75,7 @@ def test_command_is_the_prediction_at_the_control_step():
     np.testing.assert_array_equal(system.gain, gain)
     system.gain[:] = 0.0  # a copy
     simulator.Initialize()
-    for step in (0, 7, 29, 30):  # 29 * PERIOD / PERIOD is less than 29
+    for step in (0, 7, 29, 30):  # in floating point, 29 * PERIOD / PERIOD < 29
         simulator.AdvanceTo(PERIOD * (step + 0.5))
         expected = p.predict(step, gain * [0.5, -1.0], past).output
         np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
@@ -67,11 +86,8 @@ def test_command_is_the_prediction_at_the_control_step():
 def test_command_is_computed_once_per_control_step():
     calls = []
     p = primitive(history=0)
-    predict, p.predict = p.predict, lambda *a: calls.append(a[0]) or predict(*a)
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    predict, p.predict = p.predict, lambda step, *arguments: calls.append(step) or predict(step, *arguments)
+    system, simulator, context, _ = simulate(p)
     simulator.Initialize()
     for k in range(1, 41):
         simulator.AdvanceTo(k * PERIOD / 4 + 1e-6)
@@ -81,7 +97,7 @@ def test_command_is_computed_once_per_control_step():
 
 
 def loop(history):
-    """Return KGRL or sKGRL wired as in a guidance diagram, with the command logged at each control instant."""
+    """Return a diagram of KGRL or, with a history, sKGRL, connected as in a guidance diagram, and the primitive."""
     builder = DiagramBuilder()
     p = primitive(history)
     system = builder.AddSystem(LcNsKmpSystem(p, np.array([20.0, 20.0]), PERIOD))
@@ -119,14 +135,7 @@ def test_closed_loop_is_the_recursion_of_algorithm_3(history):
 
 def test_last_command_is_repeated_when_there_is_no_solution():
     p = primitive(history=0)
-    predict = p.predict
-
-    def failing(step, *arguments):
-        if step == 5:
-            raise UnsolvableError("no")
-        return predict(step, *arguments)
-
-    p.predict = failing
+    p.predict = failing_at(5, p.predict)
     system = LcNsKmpSystem(p, None, PERIOD)
     builder = DiagramBuilder()
     builder.AddSystem(system)
@@ -146,20 +155,13 @@ def test_last_command_is_repeated_when_there_is_no_solution():
 
 
 def test_fallback_satisfies_the_constraints_of_its_step():
-    """The last command may violate the constraints of the next step, so the fallback is projected again."""
+    """The last command may violate the constraints of the next step, so each fallback is a projection."""
     upper = np.linspace(0.3, -0.4, 50)
     c = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).c, (50, 1)) - upper[:, None]
     G = np.tile(LinearConstraints.box([-np.inf, -np.inf], [0.0, np.inf]).G, (50, 1, 1))
     p = LcNsKmp(primitive().reference, history=0, horizon=8, constraints=LinearConstraints(G, c))
-
-    def unsolvable(*arguments):
-        raise UnsolvableError("no")
-
     p.predict = unsolvable
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    system, simulator, context, _ = simulate(p)
     for step in range(50):
         simulator.AdvanceTo(step * PERIOD + 1e-6)
         assert system.get_command_output_port().Eval(context)[0] <= upper[step] + 1e-9
@@ -167,18 +169,12 @@ def test_fallback_satisfies_the_constraints_of_its_step():
         assert system.get_fallback_output_port().Eval(context)[0] == 1.0
 
 
-def test_fallback_satisfies_moving_constraints_if_no_problem_can_be_solved(monkeypatch):
-    def unsolvable(*arguments):
-        raise UnsolvableError("no")
-
+def test_fallback_satisfies_moving_bounds_if_every_solver_fails(monkeypatch):
     lower = np.column_stack([np.linspace(-1.0, 1.0, 50), np.full(50, -1.0)])
     p = LcNsKmp(primitive().reference, history=0, horizon=8, constraints=LinearConstraints.box(lower, lower + 0.5))
-    system = LcNsKmpSystem(p, None, PERIOD)
+    system, simulator, context, _ = simulate(p)
     p.predict = unsolvable
     monkeypatch.setattr("guiderail.models.primitives.constraints.solve_least_norm", unsolvable)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
     for step in range(50):
         simulator.AdvanceTo(step * PERIOD + 1e-6)
         assert system.get_constraint_violation_output_port().Eval(context)[0] <= 1e-9
@@ -187,10 +183,6 @@ def test_fallback_satisfies_moving_constraints_if_no_problem_can_be_solved(monke
 
 def test_first_fallback_satisfies_the_constraints():
     p = primitive(history=0, upper=-0.5)
-
-    def unsolvable(*arguments):
-        raise UnsolvableError("no")
-
     p.predict = unsolvable
     system = LcNsKmpSystem(p, None, PERIOD)
     context = system.CreateDefaultContext()
@@ -200,15 +192,8 @@ def test_first_fallback_satisfies_the_constraints():
 
 def test_initialization_restores_step_and_initial_command():
     p = primitive(history=0)
-
-    def unsolvable(*arguments):
-        raise UnsolvableError("no")
-
     predict = p.predict
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    action = system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    system, simulator, context, action = simulate(p)
     simulator.AdvanceTo(20.5 * PERIOD)
     p.predict = unsolvable
     context.SetTime(0.0)
@@ -218,22 +203,15 @@ def test_initialization_restores_step_and_initial_command():
     p.predict = predict
     action.GetMutableData()
     np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(0, np.zeros(2)).output)
-    context.SetTime(29 * PERIOD)  # 29 * PERIOD / PERIOD is less than 29
+    context.SetTime(29 * PERIOD)  # in floating point, 29 * PERIOD / PERIOD < 29
     simulator.Initialize()
     np.testing.assert_array_equal(system.get_command_output_port().Eval(context), predict(29, np.zeros(2)).output)
 
 
-def test_initialization_at_a_later_time_keeps_the_last_command_for_fallbacks():
+def test_fallback_after_a_later_initialization_is_last_command():
     p = primitive(history=0)
     predict = p.predict
-
-    def unsolvable(*arguments):
-        raise UnsolvableError("no")
-
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    action = system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
+    system, simulator, context, action = simulate(p)
     simulator.AdvanceTo(7.5 * PERIOD)
     simulator.Initialize()
     p.predict = unsolvable
@@ -243,31 +221,17 @@ def test_initialization_at_a_later_time_keeps_the_last_command_for_fallbacks():
 
 def test_fallback_of_the_second_step_is_the_first_command():
     p = primitive(history=0)
-    predict = p.predict
-
-    def failing(step, *arguments):
-        if step == 1:
-            raise UnsolvableError("no")
-        return predict(step, *arguments)
-
-    p.predict = failing
-    system = LcNsKmpSystem(p, np.full(2, 20.0), PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    action = [0.5, -1.0]
-    system.get_null_space_action_input_port().FixValue(context, action)
+    predict, p.predict = p.predict, failing_at(1, p.predict)
+    system, simulator, context, _ = simulate(p, np.full(2, 20.0), [0.5, -1.0])
     simulator.AdvanceTo(1.5 * PERIOD)
-    expected = predict(0, 20.0 * np.array(action)).output
+    expected = predict(0, np.array([10.0, -20.0])).output
     assert (expected != p.reference.means[0]).any()
     np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
 
 
 def test_connected_reference_window_replaces_the_reference():
     p, action = primitive(history=0), np.array([0.5, -1.0])
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_null_space_action_input_port().FixValue(context, action)
+    system, simulator, context, _ = simulate(p, action=action)
     rng = np.random.default_rng(3)
     means, factors = 0.1 * rng.normal(size=(9, 2)), 0.1 * rng.normal(size=(9, 2, 2))
     covariances = factors @ np.swapaxes(factors, 1, 2) + 0.01 * np.eye(2)
@@ -279,7 +243,7 @@ def test_connected_reference_window_replaces_the_reference():
 
 
 @pytest.mark.parametrize("length", [2.0, 4.0, 0.0, 1.5, np.nan])
-def test_history_length_is_refused_when_no_primitive_has_it(length):
+def test_history_length_is_refused_when_no_primitive_matches(length):
     system = LcNsKmpSystem(primitive(history=3), None, PERIOD, shorter=[(primitive(history=1), np.ones(2))])
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, np.zeros(2))
@@ -309,7 +273,7 @@ def test_history_length_selects_the_primitive():
 
 
 @pytest.mark.parametrize("history", [0, 3, 4])
-def test_constructor_refuses_a_history_that_is_not_shorter(history):
+def test_constructor_refuses_an_additional_history_out_of_range(history):
     with pytest.raises(InputError, match="shorter history has 1 to 2"):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(primitive(history), np.ones(2))])
 
@@ -318,12 +282,12 @@ def test_constructor_refuses_a_history_that_is_not_shorter(history):
     ("shorter", "words"),
     [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "have the same length")],
 )
-def test_constructor_refuses_primitives_with_other_constraints(shorter, words):
+def test_constructor_refuses_inconsistent_primitives(shorter, words):
     with pytest.raises(InputError, match=words):
-        LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(one, np.ones(2)) for one in shorter])
+        LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(p, np.ones(2)) for p in shorter])
 
 
-def test_window_is_refused_when_the_primitives_have_different_horizons():
+def test_window_is_refused_when_primitives_differ_in_horizon():
     longest = primitive(history=2)
     other = LcNsKmp(longest.reference, horizon=3, history=1, constraints=longest.constraints)
     system = LcNsKmpSystem(longest, None, PERIOD, shorter=[(other, np.ones(2))])
@@ -368,13 +332,10 @@ def test_constructor_refuses_arguments_out_of_range(gain, period, words):
 
 def test_connected_motion_time_determines_the_step():
     p, action = primitive(history=0), np.array([0.5, -1.0])
-    system = LcNsKmpSystem(p, None, PERIOD)
-    simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_null_space_action_input_port().FixValue(context, action)
+    system, simulator, context, _ = simulate(p, action=action)
     time = system.get_motion_time_input_port().FixValue(context, [4 * PERIOD])
     simulator.AdvanceTo(7.5 * PERIOD)
-    for step in (4, 5, 2, 29):  # 29 * PERIOD / PERIOD is less than 29
+    for step in (4, 5, 2, 29):  # in floating point, 29 * PERIOD / PERIOD < 29
         time.GetMutableData().set_value([step * PERIOD])
         command = system.get_command_output_port().Eval(context)
         np.testing.assert_array_equal(command, p.predict(step, action).output)

@@ -10,7 +10,7 @@ X_WT = RigidTransform(RotationMatrix.MakeYRotation(0.2), [0.1, 0.2, 0.3])
 X_WP = RigidTransform(RotationMatrix.MakeXRotation(-2.1), [0.0, 0.3, 0.0])
 
 
-def test_pose_is_that_of_the_body_in_the_target_frame():
+def test_pose_is_the_pose_of_the_body_in_the_target_frame():
     plant = MultibodyPlant(0.0)
     body = plant.AddRigidBody("body", SpatialInertia.SolidSphereWithMass(1.0, 0.1))
     plant.Finalize()

@@ -10,12 +10,14 @@ KEYS = [("KeyA", "KeyD"), ("KeyS", "KeyW")]
 
 
 class Gamepad:
+    """Stub of the state of a gamepad that is not connected."""
+
     index = None
     axes: tuple[float, ...] = ()
 
 
 class Browser:
-    """Stub of Meshcat: a real instance opens a port, and no operator moves its sliders."""
+    """Stub of Meshcat, because a real instance opens a port and needs an operator that moves the sliders."""
 
     def __init__(self):
         self.sliders, self.gamepad = {}, Gamepad()
@@ -51,7 +53,7 @@ def test_action_follows_the_sliders_once_per_period(browser):
     np.testing.assert_array_equal(action.Eval(simulator.get_context()), [-0.5, 0.75])
 
 
-def test_gamepad_axis_overrides_its_slider_when_moved(browser):
+def test_gamepad_axis_overrides_the_slider_when_deflected(browser):
     system = MeshcatDevice(browser, AXES, KEYS, 0.1)
     browser.sliders["input 1"] = 0.5
     browser.gamepad.index, browser.gamepad.axes = 0, (0.02, 0.9)

@@ -1,4 +1,4 @@
-"""Tests of the system alone; `tests/diagrams/stations/test_mujoco.py` tests the physics."""
+"""MuJoCo gantry as a system; `tests/diagrams/stations/test_mujoco.py` tests the physics."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.systems import MovedBodies, MujocoGantry
 
-FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # far above the jack
+FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # pose 50 mm above the jack
 
 
 @pytest.fixture(scope="module")
@@ -22,7 +22,8 @@ def station():
     return MujocoStation(BncWorkcell())
 
 
-def advanced(station, desired, steps):
+def simulate(station, desired, steps):
+    """Return the context after plant steps with a desired pose, from the pose `FREE`."""
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     station.set_pose(context, FREE)
@@ -32,46 +33,50 @@ def advanced(station, desired, steps):
     return context
 
 
-def test_tool_reaches_a_free_pose_without_contact_force(station):
+def test_tool_reaches_a_pose_in_free_space_without_wrench(station):
     desired = FREE + [0.01, -0.005, 0.01, 0.2, 0.05, -0.05]
-    context = advanced(station, desired, 60)
+    context = simulate(station, desired, 60)
     np.testing.assert_allclose(station.get_pose_output_port().Eval(context), desired, atol=1e-5)
     np.testing.assert_allclose(station.get_wrench_output_port().Eval(context), 0.0, atol=1e-9)
 
 
 def test_motor_forces_are_within_their_limits(station):
-    context = advanced(station, FREE + [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1)
-    pushed = station.gantry.get_impedance_wrench_output_port().Eval(station.gantry.GetMyContextFromRoot(context))
-    assert pushed[0] == pytest.approx(Impedance().limits[0])
+    context = simulate(station, FREE + [1.0, 0.0, 0.0, 0.0, 0.0, 0.0], 1)
+    wrench = station.gantry.get_impedance_wrench_output_port().Eval(station.gantry.GetMyContextFromRoot(context))
+    assert wrench[0] == pytest.approx(Impedance().limits[0])
 
 
-def test_restored_state_continues_identically(station):
-    """A copy of time, state and parameters continues bit for bit identically."""
-    context = advanced(station, FREE - [0.0, 0.0, 0.04, 0.0, 0.0, 0.0], 20)
+def test_simulation_is_bitwise_equal_after_restoring_its_state(station):
+    context = simulate(station, FREE - [0.0, 0.0, 0.04, 0.0, 0.0, 0.0], 20)
     copy = station.CreateDefaultContext()
     station.get_desired_pose_input_port().FixValue(copy, FREE)
     station.get_desired_pose_input_port().FixValue(context, FREE)
     copy.SetTimeStateAndParametersFrom(context)
-    advanced(station, FREE, 5)  # another simulation in between
+    simulate(station, FREE, 5)  # another simulation in between
     poses = []
-    for one in (context, copy):
-        simulator = Simulator(station, one)
-        simulator.reset_context(one)
-        simulator.AdvanceTo(one.get_time() + 10 * PLANT_PERIOD)
-        poses.append(station.get_pose_output_port().Eval(one))
+    for root in (context, copy):
+        simulator = Simulator(station, root)
+        simulator.reset_context(root)
+        simulator.AdvanceTo(root.get_time() + 10 * PLANT_PERIOD)
+        poses.append(station.get_pose_output_port().Eval(root))
     np.testing.assert_array_equal(*poses)
 
 
-def pressed(workcell, modulus):
-    """Return the penetration [m] of a clamp next to its holes into the table under 19.5 N."""
+def penetration(workcell, modulus):
+    """Return the penetration [m] into the table of a clamp next to its holes under 19.5 N.
+
+    Args:
+        workcell: Workcell of the clamp.
+        modulus: Factor of the contact stiffness.
+    """
     station = MujocoStation(workcell)
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
     top = np.array([2.0 * MM, 1.5 * MM, 12.0 * MM, 0.0, 0.0, 0.0])
-    below = top - [0.0, 0.0, 19.5 / Impedance().stiffness[2], 0.0, 0.0, 0.0]
+    desired = top - [0.0, 0.0, 19.5 / Impedance().stiffness[2], 0.0, 0.0, 0.0]
     station.set_pose(context, top)
     station.set_contact(context, 1.0, modulus)
-    station.get_desired_pose_input_port().FixValue(context, below)
+    station.get_desired_pose_input_port().FixValue(context, desired)
     simulator.Initialize()
     simulator.AdvanceTo(1.0)
     assert station.get_wrench_output_port().Eval(context)[2] == pytest.approx(19.5, abs=0.01)
@@ -80,13 +85,12 @@ def pressed(workcell, modulus):
 
 def test_contact_stiffness_scales_with_the_modulus():
     workcell = GridClampWorkcell()
-    nominal = pressed(workcell, 1.0)
+    nominal = penetration(workcell, 1.0)
     for modulus in (0.1, 3.0, 10.0, 30.0):
-        assert pressed(workcell, modulus) * modulus == pytest.approx(nominal, rel=1e-2)
+        assert penetration(workcell, modulus) * modulus == pytest.approx(nominal, rel=1e-2)
 
 
-def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
-    """A higher modulus before must leave no trace in the model."""
+def test_model_is_unchanged_by_an_earlier_higher_modulus(station):
     model = station.gantry.model
     names = ("jnt_stiffness", "dof_damping", "geom_solref", "geom_friction")
     before = {name: getattr(model, name).copy() for name in names} | {"timestep": model.opt.timestep}
@@ -106,11 +110,11 @@ def test_step_is_nominal_when_the_modulus_is_at_most_one(station):
 @pytest.mark.parametrize(
     ("factors", "words"),
     [
-        *(((wrong, 1.0), "friction must be finite and not negative") for wrong in (-0.1, np.nan, np.inf)),
-        *(((1.0, wrong), "stiffness must be finite and positive") for wrong in (0.0, -1.0, np.nan, np.inf)),
+        *(((factor, 1.0), "friction must be finite and not negative") for factor in (-0.1, np.nan, np.inf)),
+        *(((1.0, factor), "stiffness must be finite and positive") for factor in (0.0, -1.0, np.nan, np.inf)),
     ],
 )
-def test_factor_of_the_contact_is_refused_out_of_range(station, factors, words):
+def test_contact_factors_are_refused_out_of_range(station, factors, words):
     context = station.CreateDefaultContext()
     with pytest.raises(InputError, match=words):
         station.set_contact(context, *factors)

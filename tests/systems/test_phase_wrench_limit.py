@@ -1,4 +1,4 @@
-"""Tests of the system alone; `tests/diagrams/tasks/test_phase_limits.py` tests the physics."""
+"""Wrench limit of each phase as a system; `tests/diagrams/tasks/test_phase_limits.py` tests the physics."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ LOW = np.array([2.0, 2.0, 3.0, 0.5, 0.5, 0.5, np.linalg.norm([2.0, 2.0, 3.0]), n
 
 
 class Rig:
-    """The system between sources of a state and of a task's limit."""
+    """System with sources of the state and of the task's limit."""
 
     def __init__(self, state=0.0, task=None, limits=(HIGH, LOW)):
         builder = DiagramBuilder()
@@ -36,11 +36,11 @@ class Rig:
         return port.Eval(self.system.GetMyContextFromRoot(self.context)).copy()
 
     def set(self, source, values):
-        own = source.GetMyMutableContextFromRoot(self.context)
-        source.get_mutable_source_value(own).SetFromVector(values)
+        source_context = source.GetMyMutableContextFromRoot(self.context)
+        source.get_mutable_source_value(source_context).SetFromVector(values)
 
     def run(self, steps):
-        """Return the bound after each of some steps, (steps, 8)."""
+        """Run control steps; return the bound after each step, (steps, 8)."""
         bounds = []
         for _ in range(steps):
             self.step += 1
@@ -50,21 +50,21 @@ class Rig:
 
 
 @pytest.mark.parametrize(("state", "expected"), [(0.0, HIGH), (1.0, LOW)])
-def test_episode_begins_with_limit_of_its_state(state, expected):
+def test_bound_starts_at_the_limit_of_the_first_state(state, expected):
     rig = Rig(state)
     np.testing.assert_array_equal(rig.bound, expected)
     np.testing.assert_array_equal(rig.run(3), [expected] * 3)
 
 
-def test_first_update_takes_limit_of_state_at_once():
-    """A state machine may set its first state at the initialization of this system."""
+def test_first_update_applies_the_limit_of_its_state_at_once():
+    """A state machine may set its first state at the same instant at which this system is initialized."""
     rig = Rig(0.0)
     rig.set(rig.source, [1.0])
     np.testing.assert_array_equal(rig.run(1)[0], LOW)
 
 
 @pytest.mark.parametrize(("first", "last"), [(HIGH, LOW), (LOW, HIGH)])
-def test_limit_changes_at_bounded_rate_in_both_directions(first, last):
+def test_bound_changes_at_the_largest_rate(first, last):
     rig = Rig(limits=(first, last))
     rig.run(2)
     rig.set(rig.source, [1.0])
@@ -72,17 +72,17 @@ def test_limit_changes_at_bounded_rate_in_both_directions(first, last):
     changes = np.abs(np.diff(bounds, axis=0)) / (RATE * PERIOD)
     assert changes.max() <= 1.0 + 1e-9
     moving = changes.max(axis=1) > 0.0
-    # All steps but the last one use the whole rate.
+    # Each step except the last has the largest rate.
     np.testing.assert_allclose(changes.max(axis=1)[moving][:-1], 1.0)
     np.testing.assert_array_equal(bounds[-1], last)
     assert (bounds >= np.minimum(HIGH, LOW) - 1e-12).all()
     assert (bounds <= np.maximum(HIGH, LOW) + 1e-12).all()
-    # The norms never clip a wrench inside the limits of the axes, whose energy the tank accounts for.
+    # A wrench within the limits of the axes is within the limits of the norms. The energy tank uses only the axes.
     assert (np.linalg.norm(bounds[:, :3], axis=1) <= bounds[:, 6] + 1e-9).all()
     assert (np.linalg.norm(bounds[:, 3:6], axis=1) <= bounds[:, 7] + 1e-9).all()
 
 
-def test_lower_limit_of_task_applies_at_once():
+def test_lower_limit_of_the_task_applies_at_once():
     rig = Rig(task=np.full(8, 100.0))
     np.testing.assert_array_equal(rig.run(2)[-1], HIGH)
     rig.set(rig.task, np.full(8, 0.3))
@@ -99,7 +99,7 @@ def test_unknown_state_has_the_lowest_limits(state):
     np.testing.assert_array_equal(rig.run(2)[-1], LOW)
 
 
-def test_every_state_of_many_has_its_own_limit():
+def test_each_of_1100_states_has_its_own_limit():
     limits = np.tile(LOW, (1100, 1))
     limits[-1] = HIGH
     np.testing.assert_array_equal(Rig(1099.0, limits=limits).bound, HIGH)
@@ -116,7 +116,7 @@ def test_limits_are_copied_and_may_be_lists():
     PhaseWrenchLimit([HIGH.tolist()], RATE, period=PERIOD)
 
 
-def test_reset_forgets_the_limit_of_last_episode():
+def test_initialization_resets_the_bound():
     rig = Rig(1.0)
     rig.run(2)
     rig.set(rig.source, [0.0])
@@ -143,7 +143,7 @@ def test_reset_forgets_the_limit_of_last_episode():
         ({"period": 0.0}, "period must be positive"),
     ],
 )
-def test_constructor_refuses_what_is_out_of_range(change, words):
+def test_constructor_refuses_arguments_out_of_range(change, words):
     arguments = {"limits": np.zeros((2, 8)), "max_rate": RATE, "period": PERIOD}
     PhaseWrenchLimit(**arguments)
     PhaseWrenchLimit(**arguments | {"max_rate": np.full(8, 1e-3)})

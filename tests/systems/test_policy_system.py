@@ -1,4 +1,4 @@
-"""Policy as a system: observation, order of events, and equality with an environment."""
+"""Policy as a system: observation, order of events, and equality of simulator and environment."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ PERIOD = 2.0**-5
 
 
 class Counter(LeafSystem):
-    """Number of periods started: 1 after the discrete updates of time zero, n + 1 after those of n · PERIOD."""
+    """Output the number of started periods: n + 1 after the discrete updates of time n · PERIOD."""
 
     def __init__(self):
         super().__init__()
@@ -30,7 +30,7 @@ class Counter(LeafSystem):
 
 
 class Loop:
-    """Counter observed by a policy, and a zero-order hold of its action."""
+    """Counter that a policy observes, and a zero-order hold of the action."""
 
     def __init__(self, policy, action_repeat=1):
         builder = DiagramBuilder()
@@ -52,29 +52,30 @@ class Loop:
         return float(system.get_output_port().Eval(system.GetMyContextFromRoot(self.context))[0])
 
     def run(self, steps):
-        """Return the action during each of the next control steps."""
+        """Run control steps; return the action during each step."""
         actions = []
         for _ in range(steps):
-            # In the middle of a step all events of its first instant are over.
+            # In the middle of a step, all events of its first instant have been handled.
             n = int(self.context.get_time() / PERIOD + 0.5)
             self.simulator.AdvanceTo((n + 0.5) * PERIOD)
             actions.append(self.read(self.hold))
         return actions
 
 
-def tenth(observation):
+def scaled_policy(observation):
+    """Return the observation divided by 16, which is exact in binary."""
     return observation / 16.0
 
 
 def test_action_is_set_before_discrete_updates_of_its_instant():
-    """The policy observes the counter before the instant; the hold samples the new action at the same instant."""
-    assert Loop(tenth).run(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
+    """The policy observes the counter before the instant, and the hold samples the new action at the instant."""
+    assert Loop(scaled_policy).run(5) == [0.0, 1 / 16, 2 / 16, 3 / 16, 4 / 16]
 
 
 def test_discrete_update_would_delay_the_action_by_one_period():
-    """Counterexample: with a discrete update the action is one step late, so the unrestricted update is needed."""
+    """Counterexample that shows why the system uses an unrestricted update."""
 
-    class Late(LeafSystem):
+    class DiscretePolicy(LeafSystem):
         def __init__(self):
             super().__init__()
             self.observation = self.DeclareVectorInputPort("observation", 1)
@@ -82,12 +83,12 @@ def test_discrete_update_would_delay_the_action_by_one_period():
             self.DeclarePeriodicDiscreteUpdateEvent(PERIOD, 0.0, self.decide)
 
         def decide(self, context, discrete_state):
-            discrete_state.set_value(tenth(self.observation.Eval(context)))
+            discrete_state.set_value(scaled_policy(self.observation.Eval(context)))
 
     builder = DiagramBuilder()
-    counter, late, hold = (builder.AddSystem(s) for s in (Counter(), Late(), ZeroOrderHold(PERIOD, 1)))
-    builder.Connect(counter.get_output_port(), late.get_input_port())
-    builder.Connect(late.get_output_port(), hold.get_input_port())
+    counter, policy, hold = (builder.AddSystem(s) for s in (Counter(), DiscretePolicy(), ZeroOrderHold(PERIOD, 1)))
+    builder.Connect(counter.get_output_port(), policy.get_input_port())
+    builder.Connect(policy.get_output_port(), hold.get_input_port())
     simulator = Simulator(builder.Build())
     simulator.AdvanceTo(3.5 * PERIOD)
     assert hold.get_output_port().Eval(hold.GetMyContextFromRoot(simulator.get_context())) == [2 / 16]
@@ -95,9 +96,9 @@ def test_discrete_update_would_delay_the_action_by_one_period():
 
 def test_action_is_constant_until_the_next_action_period():
     calls = []
-    loop = Loop(lambda observation: calls.append(observation) or tenth(observation), action_repeat=4)
+    loop = Loop(lambda observation: calls.append(observation) or scaled_policy(observation), action_repeat=4)
     assert loop.run(10) == [0.0] * 4 + [4 / 16] * 4 + [8 / 16] * 2
-    assert [c.tolist() for c in calls] == [[0.0], [4.0], [8.0]]
+    assert [observation.tolist() for observation in calls] == [[0.0], [4.0], [8.0]]
 
 
 def test_action_is_zero_before_the_first_update_and_after_reset():
@@ -109,12 +110,12 @@ def test_action_is_zero_before_the_first_update_and_after_reset():
     assert loop.run(2) == [1.0] * 2
 
 
-def test_no_direct_feedthrough():
-    assert not PolicySystem(tenth, 3, 3, PERIOD).HasAnyDirectFeedthrough()
+def test_system_has_no_direct_feedthrough():
+    assert not PolicySystem(scaled_policy, 3, 3, PERIOD).HasAnyDirectFeedthrough()
 
 
-def test_policy_gets_the_observation_of_an_environment():
-    """A vector is float32; an image has no alpha channel and is a copy that remains valid."""
+def test_policy_observes_arrays_as_in_an_environment():
+    """A vector is float32. An image has no alpha channel and is a copy."""
     observations = []
 
     def policy(observation):
@@ -140,10 +141,10 @@ def test_action_is_clipped_to_the_action_space():
 
 
 @pytest.mark.parametrize(
-    "returned", [[np.nan], [np.inf], [0.0, 0.0], 0.0, [[0.0]], [], None, "forward", (np.zeros(1), None)]
+    "action", [[np.nan], [np.inf], [0.0, 0.0], 0.0, [[0.0]], [], None, "forward", (np.zeros(1), None)]
 )
-def test_policy_error_is_raised_when_no_action_is_returned(returned):
-    loop = Loop(lambda observation: returned)
+def test_policy_error_is_raised_when_the_action_is_invalid(action):
+    loop = Loop(lambda observation: action)
     with pytest.raises(PolicyError, match="the robot must stop"):
         loop.run(1)
     assert loop.read(loop.system) == 0.0
@@ -162,11 +163,11 @@ def test_exception_of_the_policy_is_propagated():
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        PolicySystem(tenth, *arguments)
+        PolicySystem(scaled_policy, *arguments)
 
 
 @pytest.mark.parametrize("action_repeat", [1, 5])
-def test_simulator_gives_bitwise_the_results_of_the_environment(action_repeat):
+def test_simulator_and_environment_have_bitwise_equal_results(action_repeat):
     """The policy depends on the complete observation of the narrow passage under sKGRL."""
     steps = 30
 
@@ -192,13 +193,13 @@ def test_simulator_gives_bitwise_the_results_of_the_environment(action_repeat):
     simulator.Initialize()
     for n in range(steps):
         simulator.AdvanceTo((n + 1) * task.control_period)
-        own = diagram.GetMyContextFromRoot(context)
-        np.testing.assert_array_equal(diagram.GetOutputPort("desired_pose").Eval(own), commanded[n])
-        np.testing.assert_array_equal(diagram.GetOutputPort("pose").Eval(own), measured[n])
+        task_context = diagram.GetMyContextFromRoot(context)
+        np.testing.assert_array_equal(diagram.GetOutputPort("desired_pose").Eval(task_context), commanded[n])
+        np.testing.assert_array_equal(diagram.GetOutputPort("pose").Eval(task_context), measured[n])
     assert np.abs(np.diff(commanded, axis=0)).max() > 0.0
 
 
 @pytest.mark.parametrize("policy", [None, 5, "connector"])
-def test_constructor_refuses_a_policy_that_is_no_function(policy):
+def test_constructor_refuses_a_policy_that_is_not_a_function(policy):
     with pytest.raises(InputError, match="a policy is a function from an observation to an action, not"):
         PolicySystem(policy, 1, 1, PERIOD)

@@ -1,4 +1,4 @@
-"""Publisher of desired poses."""
+"""Publisher of desired poses in the frame of the robot's base."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ POSE = np.array([0.125, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def publish(state, pose=POSE):
-    """Return the calls of three periods in a state of the arm: positions of poses, and "stop"."""
+    """Return the calls of three periods in a state of the arm: the position of each pose [m], or "stop"."""
     calls = []
     system = PosePublisher(
         lambda X, time: calls.append(tuple(X.translation())), lambda: calls.append("stop"), X_BaseTarget, period=0.5
@@ -27,7 +27,7 @@ def publish(state, pose=POSE):
 
 
 @pytest.mark.parametrize("state", [ArmState.RAMPING, ArmState.RUNNING])
-def test_controlled_arm_receives_the_pose_in_its_base_frame(state):
+def test_pose_is_sent_in_the_base_frame_while_arm_is_controlled(state):
     assert publish(state) == [(0.625, 0.0, 0.25)] * 3
 
 
@@ -41,5 +41,5 @@ def test_nothing_is_sent_before_the_arm_is_controlled():
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_pose_that_is_not_finite_stops_the_robot(value):
+def test_robot_is_stopped_when_the_pose_is_not_finite(value):
     assert publish(ArmState.RUNNING, np.full(6, value)) == ["stop"] * 3

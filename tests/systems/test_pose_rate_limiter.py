@@ -6,12 +6,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.pose_rate_limiter import PoseRateLimiter
 
 PERIOD, SPEED, ANGULAR_SPEED = 0.125, 0.25, 0.5
-STEP, TURN = PERIOD * SPEED, PERIOD * ANGULAR_SPEED  # exact in binary
+STEP, TURN = PERIOD * SPEED, PERIOD * ANGULAR_SPEED  # largest changes in a period [m, rad], exact in binary
 MEASURED = np.array([0.1, -0.2, 0.3, 1.0, 0.0, 0.0])
 
 
 class Rig:
-    """Limiter at the measured pose, with its inputs fixed by the test."""
+    """Limiter of a robot at the pose `MEASURED`, with fixed inputs."""
 
     def __init__(self, desired, blend_factor=0.0):
         self.system = PoseRateLimiter(period=PERIOD, speed=SPEED, angular_speed=ANGULAR_SPEED)
@@ -23,14 +23,19 @@ class Rig:
         self.simulator.Initialize()
 
     def advance(self, steps=1):
-        """Advance by periods; return the limited pose before the update at the end of each."""
+        """Advance by periods; return the limited pose at the end of each period, before the update, (steps, 6)."""
         poses = []
         for _ in range(steps):
             self.simulator.AdvanceTo(self.simulator.get_context().get_time() + PERIOD)
-            poses.append(self.system.get_limited_pose_output_port().Eval(self.simulator.get_context()).copy())
+            poses.append(self.limited_pose)
         return np.array(poses)
 
+    @property
+    def limited_pose(self):
+        return self.system.get_limited_pose_output_port().Eval(self.simulator.get_context()).copy()
+
     def start_blending(self):
+        """Advance by a period with a blend factor of 0, then set the blend factor to 0.1."""
         self.advance()
         self.blend_factor.GetMutableData().set_value([0.1])
         return self
@@ -40,15 +45,15 @@ class Rig:
 def test_measured_pose_is_output_while_blend_factor_is_zero(blend_factor):
     rig = Rig(np.zeros(6), blend_factor)
     np.testing.assert_array_equal(rig.advance(3), np.tile(MEASURED, (3, 1)))
-    pushed = MEASURED + 0.05
-    rig.pose.GetMutableData().set_value(pushed)
-    np.testing.assert_array_equal(rig.advance()[0], pushed)
+    other_pose = MEASURED + 0.05
+    rig.pose.GetMutableData().set_value(other_pose)
+    np.testing.assert_array_equal(rig.advance()[0], other_pose)
 
 
-def test_output_starts_at_the_measured_pose_if_blending_at_once():
+def test_output_starts_at_measured_pose_if_blend_factor_is_one():
     rig = Rig(MEASURED + [10.0, 0.0, 0.0, 0.0, 0.0, 0.0], blend_factor=1.0)
     step = np.array([SPEED * PERIOD, 0.0, 0.0, 0.0, 0.0, 0.0])
-    first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context()).copy()
+    first = rig.limited_pose
     np.testing.assert_allclose(first, MEASURED + step, atol=1e-12)
     np.testing.assert_allclose(np.diff([first, *rig.advance(4)], axis=0), np.tile(step, (4, 1)), atol=1e-12)
 
@@ -67,7 +72,7 @@ def test_initialization_restarts_at_the_measured_pose():
 def test_output_moves_in_a_straight_line_within_speed_limit():
     goal = np.array([0.4, 0.2, 0.3, 0.5, 0.3, 0.0])
     rig = Rig(goal).start_blending()
-    first = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
+    first = rig.limited_pose
     assert np.linalg.norm((first - MEASURED)[:3]) <= SPEED * PERIOD + 1e-12
     assert np.abs((first - MEASURED)[3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
     poses = rig.advance(30)
@@ -75,11 +80,11 @@ def test_output_moves_in_a_straight_line_within_speed_limit():
     assert np.linalg.norm(steps[:, :3], axis=1).max() <= SPEED * PERIOD + 1e-12
     assert np.abs(steps[:, 3:]).max() <= ANGULAR_SPEED * PERIOD + 1e-12
     np.testing.assert_array_equal(poses[-1], goal)
-    across = np.cross(poses[:, :3] - MEASURED[:3], (goal - MEASURED)[:3])
-    np.testing.assert_allclose(across, 0.0, atol=1e-12)
+    deviations = np.cross(poses[:, :3] - MEASURED[:3], (goal - MEASURED)[:3])
+    np.testing.assert_allclose(deviations, 0.0, atol=1e-12)
 
 
-def test_angles_turn_in_the_shorter_direction():
+def test_angles_change_in_the_shorter_direction():
     rig = Rig(np.array([*MEASURED[:3], -3.1, 0.0, 0.0]))
     rig.pose.GetMutableData().set_value([*MEASURED[:3], 3.1, 0.0, 0.0])
     poses = rig.start_blending().advance(4)
@@ -92,8 +97,7 @@ def test_pose_within_the_speed_limits_is_output_unchanged():
     for step in range(5):
         desired = MEASURED + [0.9 * SPEED * PERIOD * step, 0.0, 0.0, 0.9 * ANGULAR_SPEED * PERIOD * step, 0.0, 0.0]
         rig.desired.GetMutableData().set_value(desired)
-        now = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
-        np.testing.assert_array_equal(now, desired)
+        np.testing.assert_array_equal(rig.limited_pose, desired)
         rig.advance()
 
 
@@ -117,30 +121,29 @@ def test_pose_at_the_speed_limits_is_output_unchanged(linear, angular):
 )
 def test_change_above_a_speed_limit_is_reduced_to_it(linear, angular, limited_linear, limited_angular):
     pose = first_pose([*STEP * np.array(linear), -3.125, *TURN * np.array(angular)])
-    turned = 2.0 * np.pi - 6.25  # less than TURN
-    expected = [*STEP * np.array(limited_linear), 3.125 + turned, *TURN * np.array(limited_angular)]
+    change = 2.0 * np.pi - 6.25  # from 3.125 rad to −3.125 rad in the shorter direction, less than TURN
+    expected = [*STEP * np.array(limited_linear), 3.125 + change, *TURN * np.array(limited_angular)]
     np.testing.assert_allclose(pose, expected, rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 @pytest.mark.parametrize("axis", [3, 4, 5])
-def test_each_angle_is_limited_while_the_position_rests(axis, sign):
+def test_each_angle_is_limited_while_the_position_is_constant(axis, sign):
     desired = MEASURED.copy()
     desired[axis] += 1.0005 * sign * TURN
     rig = Rig(desired, blend_factor=1.0)
     expected = MEASURED.copy()
     expected[axis] += sign * TURN
-    now = rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context())
-    np.testing.assert_allclose(now, expected, rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(rig.limited_pose, expected, rtol=0.0, atol=1e-12)
 
 
-def test_pose_is_output_unchanged_if_its_translation_exceeds_the_angular_step():
+def test_position_within_its_limit_is_output_without_rounding():
     system = PoseRateLimiter(period=PERIOD, speed=100.0, angular_speed=0.01)
     context, rng = system.CreateDefaultContext(), np.random.default_rng(0)
     system.get_blend_factor_input_port().FixValue(context, [1.0])
     system.get_pose_input_port().FixValue(context, MEASURED)
     context.SetDiscreteState(MEASURED)
-    for position in rng.uniform(-1e-6, 1e-6, (20, 3)):  # differs from its sum of last pose and change
+    for position in rng.uniform(-1e-6, 1e-6, (20, 3)):  # the sum of last position and change would have rounding errors
         desired = np.concatenate([position, MEASURED[3:]])
         system.get_desired_pose_input_port().FixValue(context, desired)
         np.testing.assert_array_equal(system.get_limited_pose_output_port().Eval(context), desired)
@@ -151,10 +154,10 @@ def first_pose(desired):
     rig = Rig(np.array(desired), blend_factor=1.0)
     rig.pose.GetMutableData().set_value([0.0, 0.0, 0.0, 3.125, 0.0, 0.0])
     rig.simulator.Initialize()
-    return rig.system.get_limited_pose_output_port().Eval(rig.simulator.get_context()).copy()
+    return rig.limited_pose
 
 
-def test_default_speeds_are_a_quarter_of_a_meter_and_one_and_a_half_radians_per_second():
+def test_default_speeds_are_0_25_m_per_s_and_1_5_rad_per_s():
     system = PoseRateLimiter(period=PERIOD)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -167,11 +170,11 @@ def test_default_speeds_are_a_quarter_of_a_meter_and_one_and_a_half_radians_per_
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"period": 0.0}, *({name: value} for name in ("speed", "angular_speed") for value in (0.0, np.inf))]
+    "arguments", [{"period": 0.0}, *({name: value} for name in ("speed", "angular_speed") for value in (0.0, np.inf))]
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        PoseRateLimiter(**({"period": PERIOD} | wrong))
+        PoseRateLimiter(**({"period": PERIOD} | arguments))
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])

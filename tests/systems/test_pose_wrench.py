@@ -1,4 +1,4 @@
-"""The wrench has the same power as the generalized forces, for any pose and velocity."""
+"""Wrench that has the same power as generalized forces of the pose coordinates."""
 
 import numpy as np
 import pytest
@@ -21,9 +21,9 @@ def test_wrench_has_the_power_of_the_generalized_forces(angles):
     for change in np.eye(6):
         after = pose_to_transform(pose + STEP * change)
         before = pose_to_transform(pose - STEP * change)
-        turn = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
-        moved = np.concatenate([after.translation() - before.translation(), turn.angle() * turn.axis()]) / (2 * STEP)
-        assert moved @ wrench == pytest.approx(change @ force, abs=1e-6)
+        rotation = (after.rotation() @ before.rotation().inverse()).ToAngleAxis()
+        displacement = np.concatenate([after.translation() - before.translation(), rotation.angle() * rotation.axis()])
+        assert displacement / (2 * STEP) @ wrench == pytest.approx(change @ force, abs=1e-6)
 
 
 def test_wrench_is_finite_at_a_singular_pose():

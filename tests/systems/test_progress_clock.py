@@ -11,6 +11,7 @@ RULE = StateProgress((0.01, 0.1), 4)
 
 
 def steps(rule, poses, command=(0.0, 0.0)):
+    """Return the step after each control step with these measured poses."""
     step, result = 0, []
     for k, pose in enumerate(poses):
         step = rule.next_step(step, k + 1, np.array(command), np.array(pose))
@@ -18,22 +19,22 @@ def steps(rule, poses, command=(0.0, 0.0)):
     return result
 
 
-def test_progress_is_the_clock_while_the_robot_is_near():
+def test_progress_follows_the_clock_while_the_robot_is_near():
     assert steps(RULE, [[0.0099, 0.0]] * 5) == [1, 2, 3, 4, 5]
     assert steps(StateProgress((0.01, 0.1), 0), [[1.0, 0.0]] * 5) == [1, 2, 3, 4, 5]
 
 
-def test_progress_waits_while_the_robot_is_not_near_and_until_the_largest_lag():
-    away, near = [0.0101, 0.0], [0.0, 0.0]
-    assert steps(RULE, [near, away, away, near, away]) == [1, 1, 1, 2, 2]
-    assert steps(RULE, [away] * 8) == [0, 0, 0, 0, 1, 2, 3, 4]  # four steps behind the clock from then on
+def test_progress_waits_up_to_the_largest_lag_if_robot_is_far():
+    far, near = [0.0101, 0.0], [0.0, 0.0]
+    assert steps(RULE, [near, far, far, near, far]) == [1, 1, 1, 2, 2]
+    assert steps(RULE, [far] * 8) == [0, 0, 0, 0, 1, 2, 3, 4]  # the lag is at most four steps
     assert steps(RULE, [[np.nan, 0.0]] * 3) == [0, 0, 0]
 
 
-@pytest.mark.parametrize(("angle", "waits"), [(0.099, False), (0.101, True)])
-def test_angles_of_a_pose_have_a_tolerance_of_their_own(angle, waits):
+@pytest.mark.parametrize(("angle", "is_waiting"), [(0.099, False), (0.101, True)])
+def test_angles_of_a_pose_have_a_separate_tolerance(angle, is_waiting):
     command, pose = np.zeros(6), np.array([0.0, 0.009, 0.0, 2.0 * np.pi, angle, 0.0])
-    assert (RULE.next_step(3, 4, command, pose) == 3) == waits
+    assert (RULE.next_step(3, 4, command, pose) == 3) == is_waiting
     assert RULE.next_step(3, 4, command, np.array([0.0, 0.0101, 0.0, 0.0, 0.0, 0.0])) == 3
 
 
@@ -43,15 +44,15 @@ def test_angles_of_a_pose_have_a_tolerance_of_their_own(angle, waits):
         ((0.0, 0.1), 3, "tolerance"),
         ((0.1, np.nan), 3, "tolerance"),
         ((0.1,), 3, "tolerance"),
-        *(((1.0, 1.0), wrong, "lag") for wrong in (-1, 2.5, np.nan, np.inf)),
+        *(((1.0, 1.0), lag, "lag") for lag in (-1, 2.5, np.nan, np.inf)),
     ],
 )
-def test_rule_raises_when_an_argument_is_out_of_range(tolerance, max_lag, match):
+def test_rule_refuses_arguments_out_of_range(tolerance, max_lag, match):
     with pytest.raises(InputError, match=match):
         StateProgress(tolerance, max_lag)
 
 
-def test_motion_time_is_state_and_begins_at_zero():
+def test_motion_time_is_zero_at_each_initialization():
     system = ProgressClock(RULE, 2, PERIOD)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -69,14 +70,14 @@ def test_motion_time_is_state_and_begins_at_zero():
     assert times == [0, 1, 2, 2, 2, 2, 3, 4] * 2
 
 
-def test_system_raises_when_the_period_is_not_positive():
+def test_constructor_refuses_a_period_of_zero():
     with pytest.raises(InputError):
         ProgressClock(RULE, 2, 0.0)
 
 
 @pytest.mark.parametrize(("pose", "lag"), [([0.0, 0.0], 0), ([1.0, 0.0], 4)])
-def test_steps_are_whole_for_a_period_that_is_not_exact_in_binary(pose, lag):
-    period = 0.02  # 29 * period / period is less than 29
+def test_steps_are_exact_when_the_period_is_inexact_in_binary(pose, lag):
+    period = 0.02  # in floating point, 29 * period / period < 29
     system = ProgressClock(RULE, 2, period)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()

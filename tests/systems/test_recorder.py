@@ -13,7 +13,7 @@ PERIOD = 0.25  # exact in binary, so that events coincide
 
 @pytest.fixture
 def ramp():
-    """Recorder of a command that counts its periods (0, 1, 2, …), and of the time."""
+    """Return a simulator and a recorder of a held command (0, 1, 2, …) and of the time in periods."""
     builder = DiagramBuilder()
     line = PiecewisePolynomial.FirstOrderHold([0.0, 100.0], np.array([[0.0, 400.0]]))
     source = builder.AddSystem(TrajectorySource(line))
@@ -26,10 +26,11 @@ def ramp():
 
 
 def read(simulator, recorder):
+    """Return the recording of the recorder in the simulator's diagram."""
     return recorder.recording(recorder.GetMyContextFromRoot(simulator.get_context()))
 
 
-def test_sample_contains_a_command_and_its_result(ramp):
+def test_sample_has_a_command_and_the_measurement_after_it(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(3.5 * PERIOD)
     recording = read(simulator, recorder)
@@ -72,7 +73,7 @@ def test_reset_clears_the_samples(ramp):
     assert len(read(simulator, recorder).times) == 0
 
 
-def test_initialization_clears_the_samples_and_the_times_begin_there(ramp):
+def test_initialization_restarts_samples_and_times(ramp):
     simulator, recorder = ramp
     simulator.AdvanceTo(2.5 * PERIOD)
     simulator.get_mutable_context().SetTime(8 * PERIOD)

@@ -1,4 +1,4 @@
-"""Tests of the system alone; `tests/diagrams/tasks/test_bounded_force.py` tests the physics."""
+"""Reference governor as a system; `tests/diagrams/tasks/test_bounded_force.py` tests the physics."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,11 @@ from guiderail.systems import ReferenceGovernor
 
 STIFFNESS, DAMPING = np.r_[np.full(3, 1500.0), np.full(3, 30.0)], np.r_[np.full(3, 95.0), np.full(3, 0.5)]
 BOUND = WrenchBound(np.array([9.0, 9.0, 15.0, 1.0, 2.0, 3.0]), 17.0, 3.5, 2.5e4)  # [x y z Rx Ry Rz]
+ZEROS = np.zeros(6)
 
 
-REST = np.zeros(6)
-
-
-def governed(desired, velocity=REST, pose=REST, max_wrench=None):
+def reference_pose(desired, velocity=ZEROS, pose=ZEROS, max_wrench=None):
+    """Return the reference pose (6,) of the governor."""
     system = ReferenceGovernor(STIFFNESS, DAMPING, 1.5, 0.01, BOUND)
     context = system.CreateDefaultContext()
     system.get_desired_pose_input_port().FixValue(context, desired)
@@ -24,33 +23,33 @@ def governed(desired, velocity=REST, pose=REST, max_wrench=None):
     return system.get_reference_pose_output_port().Eval(context)
 
 
-def test_output_equals_desired_pose_inside_bound():
+def test_reference_is_the_desired_pose_within_the_bound():
     pose, change = np.full(6, 0.3), np.r_[0.003, -0.002, 0.004, 0.02, 0.01, -0.01]
-    np.testing.assert_allclose(governed(pose + change, pose=pose), pose + change, atol=1e-15)
+    np.testing.assert_allclose(reference_pose(pose + change, pose=pose), pose + change, atol=1e-15)
 
 
 def test_angles_have_the_limits_of_their_axes():
-    reference = governed(np.r_[0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # Rz
+    reference = reference_pose(np.r_[0.0, 0.0, 0.0, 1.0, 0.0, 0.0])  # Rz
     assert STIFFNESS[3] * reference[3] == pytest.approx(3.0)
-    reference = governed(np.r_[0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # Rx
+    reference = reference_pose(np.r_[0.0, 0.0, 0.0, 0.0, 0.0, 1.0])  # Rx
     assert STIFFNESS[5] * reference[5] == pytest.approx(1.0)
 
 
 def test_max_wrench_lowers_the_bound():
     down = np.r_[0.0, 0.0, -1.0, 0.0, 0.0, 0.0]
-    assert STIFFNESS[2] * governed(down)[2] == pytest.approx(-15.0)
+    assert STIFFNESS[2] * reference_pose(down)[2] == pytest.approx(-15.0)
     lower = np.r_[4.0, 4.0, 6.0, np.full(3, np.inf), np.inf, np.inf]
-    assert STIFFNESS[2] * governed(down, max_wrench=lower)[2] == pytest.approx(-6.0)
-    assert STIFFNESS[2] * governed(down, max_wrench=np.full(8, 100.0))[2] == pytest.approx(-15.0)
-    np.testing.assert_array_equal(governed(down, max_wrench=np.full(8, np.nan)), 0.0)
+    assert STIFFNESS[2] * reference_pose(down, max_wrench=lower)[2] == pytest.approx(-6.0)
+    assert STIFFNESS[2] * reference_pose(down, max_wrench=np.full(8, 100.0))[2] == pytest.approx(-15.0)
+    np.testing.assert_array_equal(reference_pose(down, max_wrench=np.full(8, np.nan)), 0.0)
 
 
-def test_motion_leaves_less_for_the_spring():
+def test_spring_force_is_reduced_by_damping_and_speed_limit():
     down, velocity = np.r_[0.0, 0.0, -1.0, 0.0, 0.0, 0.0], np.r_[0.0, 0.0, 0.05, 0.0, 0.0, 0.0]
-    against = STIFFNESS[2] * governed(down, velocity)[2]
-    assert against == pytest.approx(-15.0 + (15.0 + 95.0) * 0.05)
-    towards = STIFFNESS[2] * governed(down, -velocity)[2]
-    assert against < towards < 0.0  # and not faster than an impact allows
+    force_while_moving_up = STIFFNESS[2] * reference_pose(down, velocity)[2]
+    assert force_while_moving_up == pytest.approx(-15.0 + (15.0 + 95.0) * 0.05)
+    force_while_moving_down = STIFFNESS[2] * reference_pose(down, -velocity)[2]
+    assert force_while_moving_up < force_while_moving_down < 0.0  # the speed limit reduces the force further
 
 
 @pytest.mark.parametrize(
@@ -66,7 +65,7 @@ def test_motion_leaves_less_for_the_spring():
         ({"step": 0.0}, "period must be positive"),
     ],
 )
-def test_governor_raises_when_an_argument_is_invalid(change, words):
+def test_constructor_refuses_arguments_out_of_range(change, words):
     arguments = {"stiffness": STIFFNESS, "damping": DAMPING, "mass": 1.5, "step": 0.01, "bound": BOUND}
     ReferenceGovernor(**arguments | {"mass": 0.01})
     with pytest.raises(InputError, match=words):

@@ -30,8 +30,8 @@ def test_poses_are_relative_to_the_reference_body(plant):
     system.get_body_poses_input_port().FixValue(context, plant.get_body_poses_output_port().Eval(plant_context))
     poses = system.get_relative_poses_output_port().Eval(context).reshape(2, 6)
     X_AB = X_WA.inverse() @ X_WB
-    turn = X_AB.rotation().ToAngleAxis()
-    np.testing.assert_allclose(poses[0], [*X_AB.translation(), *(turn.angle() * turn.axis())], atol=1e-12)
+    rotation = X_AB.rotation().ToAngleAxis()
+    np.testing.assert_allclose(poses[0], [*X_AB.translation(), *(rotation.angle() * rotation.axis())], atol=1e-12)
     np.testing.assert_allclose(poses[1], np.zeros(6), atol=1e-12)
 
 

@@ -23,7 +23,7 @@ def context(system):
     return context
 
 
-def test_ports(system):
+def test_reward_system_has_its_ports(system):
     inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
     outputs = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
     assert inputs == ["pose", "last_pose"]
@@ -61,9 +61,9 @@ def test_each_term_is_evaluated_once_for_all_ports():
     assert len(calls) == 1
 
 
-def test_term_that_changes_its_argument_does_not_affect_others():
-    changed = RewardTerm("changed", {"u": 1}, lambda u: u.fill(9.0) or 0.0)
-    system = RewardSystem([changed, RewardTerm("u", {"u": 1}, lambda u: u[0])])
+def test_term_that_modifies_its_argument_does_not_affect_others():
+    modifying = RewardTerm("modifying", {"u": 1}, lambda u: u.fill(9.0) or 0.0)
+    system = RewardSystem([modifying, RewardTerm("u", {"u": 1}, lambda u: u[0])])
     context = system.CreateDefaultContext()
     system.get_signal_input_port("u").FixValue(context, [2.0])
     assert system.get_reward_output_port().Eval(context) == [2.0]
@@ -96,13 +96,13 @@ def test_constructor_refuses_invalid_terms(terms):
         (None, "reward term 'a' of own must be one number, and it is None"),
     ],
 )
-def test_evaluation_refuses_a_term_that_is_not_one_finite_number(value, message):
+def test_evaluation_refuses_a_term_that_is_no_finite_number(value, message):
     system = RewardSystem([RewardTerm("a", {}, lambda: value)], "own")
     with pytest.raises(InputError, match=message):
         system.get_reward_output_port().Eval(system.CreateDefaultContext())
 
 
-def test_term_may_be_an_array_with_one_number():
+def test_term_may_be_an_array_with_a_single_number():
     system = RewardSystem([RewardTerm("a", {}, lambda: [[2]])])
     assert system.get_reward_output_port().Eval(system.CreateDefaultContext()) == [2.0]
 

@@ -22,7 +22,8 @@ def system(template):
     return SctInputMapping(template, FRAMES, PERIOD)
 
 
-def requested(system, action, state, pose=POSE, frames=None):
+def requested_pose(system, action, state, pose=POSE, frames=None):
+    """Return the requested pose (6,)."""
     context = system.CreateDefaultContext()
     system.get_action_input_port().FixValue(context, action)
     system.get_pose_input_port().FixValue(context, pose)
@@ -39,19 +40,19 @@ def test_input_mapping_has_its_ports(system):
 
 
 @pytest.mark.parametrize("state", [0, 1, 2])
-def test_input_mapping_displaces_by_the_law(system, template, state):
+def test_requested_pose_is_displaced_by_the_template(system, template, state):
     action = np.array([0.3, 0.9, -0.4])
     X_WE = pose_to_transform(POSE)
     expected = template.displace(X_WE, template.map(state, action, X_WE, FRAMES, PERIOD))
-    np.testing.assert_allclose(requested(system, action, state), transform_to_pose(expected), atol=1e-15)
+    np.testing.assert_allclose(requested_pose(system, action, state), transform_to_pose(expected), atol=1e-15)
 
 
 def test_input_mapping_depends_on_the_state(system):
-    towards = np.array([0.0, 1.0, 0.0])
-    moved = requested(system, towards, 1) - POSE
-    tilted = requested(system, towards, 2) - POSE
-    np.testing.assert_allclose(moved, [0.0, 0.15 * PERIOD, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(tilted, [0.0, 0.0, 0.0, 0.0, 0.0, -0.8 * PERIOD], atol=1e-12)
+    action = np.array([0.0, 1.0, 0.0])
+    translation = requested_pose(system, action, 1) - POSE
+    tilt = requested_pose(system, action, 2) - POSE
+    np.testing.assert_allclose(translation, [0.0, 0.15 * PERIOD, 0.0, 0.0, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(tilt, [0.0, 0.0, 0.0, 0.0, 0.0, -0.8 * PERIOD], atol=1e-12)
 
 
 def test_input_mapping_uses_a_frame_set_by_a_reset(system):
@@ -60,9 +61,9 @@ def test_input_mapping_uses_a_frame_set_by_a_reset(system):
     with pytest.raises(InputError, match="the template has no frame lid"):
         system.frames.set(context, {"mug_tip": RigidTransform([0.5, -0.06, 0.0]), "lid": RigidTransform()})
     np.testing.assert_array_equal(system.frames.eval(context)["mug_tip"].translation(), before)
-    # With the mug at the side instead of ahead, the same input is across the bearing and causes no tilt.
-    aside = requested(system, np.array([0.0, 1.0, 0.0]), 2, frames={"mug_tip": RigidTransform([0.5, -0.06, 0.0])})
-    np.testing.assert_allclose(aside, POSE, atol=1e-12)
+    # With the mug at the side, the input is perpendicular to the direction of the mug and causes no tilt.
+    pose = requested_pose(system, np.array([0.0, 1.0, 0.0]), 2, frames={"mug_tip": RigidTransform([0.5, -0.06, 0.0])})
+    np.testing.assert_allclose(pose, POSE, atol=1e-12)
 
 
 def test_input_mapping_refuses_an_unknown_frame(system):
@@ -70,14 +71,14 @@ def test_input_mapping_refuses_an_unknown_frame(system):
         system.frames.set(system.CreateDefaultContext(), {"cup": RigidTransform()})
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_input_mapping_returns_nan_for_a_nan_action(system, bad):
-    assert np.isnan(requested(system, np.array([0.0, bad, 0.0]), 1)).all()
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_requested_pose_is_nan_when_the_action_is_not_finite(system, number):
+    assert np.isnan(requested_pose(system, np.array([0.0, number, 0.0]), 1)).all()
 
 
 @pytest.mark.parametrize("state", [-1.0, -0.5, 0.99, 3.0, np.nan, np.inf])
-def test_input_mapping_returns_nan_for_an_unknown_state(system, state):
-    assert np.isnan(requested(system, np.zeros(3), state)).all()
+def test_requested_pose_is_nan_when_the_state_is_unknown(system, state):
+    assert np.isnan(requested_pose(system, np.zeros(3), state)).all()
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan")])

@@ -12,8 +12,8 @@ PERIOD = 2.0**-7
 FRAMES = {"mug_tip": RigidTransform([0.0, 0.1, 0.0])}
 
 
-def at(distance):
-    """Return a pose `distance` [m] in front of the mug."""
+def pose_at(distance):
+    """Return a pose at this distance [m] in front of the mug."""
     return np.array([0.0, 0.1 - distance, 0.0, 0.0, 0.0, 0.0])
 
 
@@ -23,18 +23,20 @@ def template():
 
 
 class Rig:
+    """State machine that starts at a distance from the mug [m]."""
+
     def __init__(self, template, start):
         self.system = SctStateMachine(template, FRAMES, PERIOD)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        self.system.get_initial_pose_input_port().FixValue(self.context, at(start))
-        self.pose = self.system.get_pose_input_port().FixValue(self.context, at(start))
+        self.system.get_initial_pose_input_port().FixValue(self.context, pose_at(start))
+        self.pose = self.system.get_pose_input_port().FixValue(self.context, pose_at(start))
         self.simulator.Initialize()
         self.steps = 0
 
     def step(self, distance):
-        """Return the state after the events of the instant with this `distance`."""
-        self.pose.GetMutableData().set_value(at(distance))
+        """Set the distance from the mug [m], run the events of the next instant, and return the state."""
+        self.pose.GetMutableData().set_value(pose_at(distance))
         self.steps += 1
         self.simulator.AdvanceTo((self.steps + 0.5) * PERIOD)
         return self.state()
@@ -67,15 +69,15 @@ def test_state_machine_returns_with_hysteresis(template):
     assert [rig.step(d) for d in (0.26, 0.24, 0.26, 0.28, 0.24, 0.10, 0.07, 0.10, 0.40)] == [0, 1, 1, 0, 1, 1, 2, 2, 2]
 
 
-def test_state_machine_makes_one_transition_an_instant(template):
+def test_state_machine_makes_at_most_one_transition_per_instant(template):
     rig = Rig(template.without_active_constraints(), 0.4)
     assert [rig.step(0.05) for _ in range(3)] == [1, 2, 2]
 
 
-def test_transition_waits_until_constraints_are_reachable(template):
-    """An upright thermos near the mug needs longer than a period to reach the tilt of pouring."""
+def test_transition_waits_until_the_constraints_are_reachable(template):
+    """The rotation of an upright thermos to the tilt of pouring takes longer than a period."""
     rig = Rig(template, 0.2)
-    X_WE = RigidTransform(at(0.05)[:3])
+    X_WE = RigidTransform(pose_at(0.05)[:3])
     tilted = template.project(2, X_WE, FRAMES)
     assert not template.can_enter(2, X_WE, FRAMES, PERIOD)
     assert [rig.step(0.05) for _ in range(3)] == [1, 1, 1]
@@ -88,11 +90,11 @@ def test_transition_waits_until_constraints_are_reachable(template):
 def test_distance_and_progress_equal_those_of_the_template(template):
     rig = Rig(template, 0.4)
     rig.step(0.24)
-    X_WE = RigidTransform(at(0.24)[:3])
+    X_WE = RigidTransform(pose_at(0.24)[:3])
     assert rig.system.get_transition_distance_output_port().Eval(rig.context)[0] == pytest.approx(0.24)
     progress = rig.system.get_progress_output_port().Eval(rig.context)[0]
     assert progress == pytest.approx(template.progress(1, X_WE, FRAMES))
-    # 5 per meter from 0.40 m on, continuous at the transition.
+    # The progress increases by 5 per meter from a distance of 0.40 m and is continuous at the transition.
     assert progress == pytest.approx(5.0 * (0.40 - 0.24))
 
 

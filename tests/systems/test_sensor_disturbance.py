@@ -12,7 +12,7 @@ PERIOD = 0.125
 
 
 def readings(seed=0, scale=1.0, bias=0.0, **options):
-    """Return the outputs just before each instant for a measurement equal to the time."""
+    """Return the outputs just before each instant, (8,), if the measurement is the time."""
     builder = DiagramBuilder()
     ramp = builder.AddSystem(TrajectorySource(PiecewisePolynomial.FirstOrderHold([0.0, 10.0], [[0.0, 10.0]])))
     sensor = builder.AddSystem(SensorDisturbance(PERIOD, **{"noise": np.zeros(1), **options}))
@@ -43,10 +43,10 @@ def test_measurement_is_delayed_by_whole_periods():
 
 
 def test_noise_has_its_deviation_and_repeats_with_its_seed():
-    first = readings(seed=3, noise=np.array([0.1])) - TIMES
+    first, repeated, other = (readings(seed=seed, noise=np.array([0.1])) - TIMES for seed in (3, 3, 4))
     assert 0.02 < first.std() < 0.3
-    np.testing.assert_array_equal(readings(seed=3, noise=np.array([0.1])) - TIMES, first)
-    assert not np.allclose(readings(seed=4, noise=np.array([0.1])) - TIMES, first)
+    np.testing.assert_array_equal(repeated, first)
+    assert not np.allclose(other, first)
 
 
 def test_initialization_restarts_noise_and_delay():
@@ -70,15 +70,15 @@ def test_initialization_restarts_noise_and_delay():
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [{"noise": np.array([-1.0])}, {"delay": -1}, {"delay": 1.5}, {"configuration_size": -1}, {"period": 0.0}],
 )
-def test_constructor_refuses_arguments_out_of_range(wrong):
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        SensorDisturbance(**{"period": PERIOD, "noise": np.zeros(1), **wrong})
+        SensorDisturbance(**{"period": PERIOD, "noise": np.zeros(1), **arguments})
 
 
-def test_delay_of_an_episode_is_at_most_the_largest():
+def test_delay_of_an_episode_is_at_most_the_constructor_argument():
     sensor = SensorDisturbance(PERIOD, np.zeros(1), delay=3)
     simulator = Simulator(sensor)
     context = simulator.get_mutable_context()
@@ -90,16 +90,16 @@ def test_delay_of_an_episode_is_at_most_the_largest():
         for step in range(6):
             measured.GetMutableData().set_value([float(step)])
             simulator.AdvanceTo((step + 0.5) * PERIOD)
-        # The measurement of the last sample, step 5, is one period old when the delay is 1.
+        # The newest sample is that of step 5, which is output if the delay is 1.
         assert sensor.get_disturbed_measurement_output_port().Eval(context)[0] == 6 - delay
-    for wrong in (0, 1.5, 4, np.nan):
+    for delay in (0, 1.5, 4, np.nan):
         with pytest.raises(InputError, match="from 1 to 3"):
-            sensor.set_delay(context, wrong)
+            sensor.set_delay(context, delay)
 
 
 def test_drift_is_a_random_walk_with_its_deviation():
     drifts = np.array([readings(seed=seed, drift=np.array([1.0])) - TIMES for seed in range(60)])
-    assert drifts[:, -1].std() == pytest.approx(np.sqrt(0.1), rel=0.3)  # one second of ten
+    assert drifts[:, -1].std() == pytest.approx(np.sqrt(0.1), rel=0.3)  # drift is the deviation after 10 s; here 1 s
     assert np.abs(np.diff(drifts)).mean() < 0.5 * np.abs(drifts[:, -1]).mean()
 
 
@@ -118,23 +118,23 @@ def test_bias_depends_on_the_configuration():
     np.testing.assert_allclose(sensor.get_disturbed_measurement_output_port().Eval(context), expected)
 
 
-def test_numbers_of_a_sensor_have_errors_of_their_own():
-    """Noise, drift and rounding of one number each, as computed from the seed."""
+def test_each_number_has_its_own_errors_computed_from_the_seed():
+    """The first number has noise, the second a drift, and the third is rounded."""
     noise, drift, resolution = np.array([0.1, 0.0, 0.0]), np.array([0.0, 0.2, 0.0]), np.array([0.0, 0.0, 0.25])
     sensor = SensorDisturbance(PERIOD, noise, drift=drift, resolution=resolution)
     simulator = Simulator(sensor)
     context = simulator.get_mutable_context()
     sensor.get_measurement_input_port().FixValue(context, [1.0, 2.0, 3.3])
     sensor.set_error(context, np.array([2.0, 0.5, 1.0]), np.array([0.1, -0.2, 0.0]), 7)
-    parameters = noise.copy(), drift.copy()
-    for given in (noise, drift, resolution):
-        given[:] = 9.0  # the sensor has copies
+    noise_copy, drift_copy = noise.copy(), drift.copy()
+    for argument in (noise, drift, resolution):
+        argument[:] = 9.0  # without effect: the sensor has copies
     walk = np.zeros(3)
     for step in range(1, 1002):
         simulator.AdvanceTo((step - 0.5) * PERIOD)
         rng = np.random.default_rng([7, step])
-        sample = parameters[0] * rng.standard_normal(3)
-        walk += np.sqrt(PERIOD / 10.0) * parameters[1] * rng.standard_normal(3)
+        sample = noise_copy * rng.standard_normal(3)
+        walk += np.sqrt(PERIOD / 10.0) * drift_copy * rng.standard_normal(3)
         expected = np.array([2.1, 0.8, 3.25]) + sample + walk
         disturbed = sensor.get_disturbed_measurement_output_port().Eval(context)
         np.testing.assert_allclose(disturbed, expected, rtol=1e-12)
@@ -151,7 +151,7 @@ def test_constructor_refuses_magnitudes_out_of_range(name, magnitudes):
         SensorDisturbance(PERIOD, **{"noise": np.zeros(2), name: np.array(magnitudes)})
 
 
-def test_noise_of_one_number_needs_no_drift():
+def test_noise_is_sampled_when_there_is_no_drift():
     sensor = SensorDisturbance(PERIOD, np.array([0.1, 0.0]))
     simulator = Simulator(sensor)
     context = simulator.get_mutable_context()
@@ -172,5 +172,5 @@ def test_constant_measurement_arrives_after_the_delay():
         simulator.AdvanceTo((step - 0.5) * PERIOD)
         values.append(sensor.get_disturbed_measurement_output_port().Eval(context)[0])
     assert values == [0.0, 0.0, 5.0, 5.0]
-    configuration.GetMutableData().set_value([3.0, 4.0])  # without a gradient
+    configuration.GetMutableData().set_value([3.0, 4.0])  # without effect: the gradient is zero
     assert sensor.get_disturbed_measurement_output_port().Eval(context)[0] == 5.0

@@ -1,4 +1,4 @@
-"""Ports and clock of the watchdog; `tests/models/control/test_state_estimator.py` tests its law."""
+"""Status watchdog as a system: ports and clock; `tests/models/control/test_state_estimator.py` tests the estimator."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ PERIOD = 1.0 / 256.0
 LIMITS = StatusLimits(velocity=(1.0, 1.0))
 TOLERANCE = (1.0, 0.5)
 CLOCK = 1000.0  # robot time at local time zero [s]
-SETTLED = round(LIMITS.settling_time / PERIOD) + 3
+SETTLING_STEPS = round(LIMITS.settling_time / PERIOD) + 3
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +38,7 @@ def plant():
 
 
 class Rig:
-    """Watchdog of a robot that is driven at constant speed, with a status just before each check."""
+    """Watchdog of a robot that moves at constant speed and sends a status just before each check."""
 
     def __init__(self, plant, has_clock=False):
         self.system = StatusWatchdog(plant, LIMITS, TOLERANCE, period=PERIOD)
@@ -50,15 +50,16 @@ class Rig:
         self.step, self.wall, self.has_clock = 0, 5000.0, has_clock
         self.simulator.Initialize()
 
-    def status(self, **changed):
+    def status(self, **changes):
+        """Return the status at this step with changed fields. Velocities vary by rounding, so they are not frozen."""
         time = self.step * PERIOD
         velocities = np.array([0.1, 0.2]) + 1e-12 * (-1) ** self.step
         return replace(
-            JointStatus(CLOCK + time, 0.3 + 0.1 * time * np.array([1, 2]), velocities, np.zeros(2)), **changed
+            JointStatus(CLOCK + time, 0.3 + 0.1 * time * np.array([1, 2]), velocities, np.zeros(2)), **changes
         )
 
     def set(self, status, gap=PERIOD):
-        """Set the newest status and the clock, and the torque that keeps the speed."""
+        """Set the newest status, the clock and the torque of constant speed; return the fault."""
         self.wall += gap
         self.port.GetMutableData().set_value(status or object())
         if self.has_clock:
@@ -75,7 +76,8 @@ class Rig:
         return fault
 
     def settle(self):
-        for _ in range(SETTLED):
+        """Run checks until no fault is reported."""
+        for _ in range(SETTLING_STEPS):
             self.check(self.status())
         assert self.fault == Fault.NONE
         return self
@@ -98,7 +100,7 @@ def test_valid_status_is_output_at_once(plant):
     assert rig["age"][0] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_no_status_is_a_fault(plant):
+def test_missing_status_is_a_fault(plant):
     rig = Rig(plant)
     assert rig.check(None) == Fault.NO_STATUS
     np.testing.assert_array_equal(rig["estimated_state"], 0.0)
@@ -114,7 +116,7 @@ def test_faulty_status_is_not_output(plant):
 
 
 def test_velocity_is_predicted_from_the_torque(plant):
-    """With the inertia at the accepted positions and the damping of the joints."""
+    """The prediction uses the inertia at the accepted positions and the damping of the joints."""
     rig = Rig(plant).settle()
     rig.set(rig.status())
     rig.torque.GetMutableData().set_value([1.0, -0.5])
@@ -135,7 +137,7 @@ def test_dynamics_are_those_of_the_plant(plant):
     np.testing.assert_allclose(drag, plant.CalcBiasTerm(context) + [0.25, -0.3])
 
 
-def test_own_delay_is_no_status_fault_with_a_clock(plant):
+def test_delay_of_this_program_is_no_fault_with_a_clock(plant):
     rig = Rig(plant, has_clock=True).settle()
     for gap in (3, 1, 4):
         rig.step += gap - 1
@@ -145,21 +147,21 @@ def test_own_delay_is_no_status_fault_with_a_clock(plant):
         rig.simulator.AdvanceTo(rig.context.get_time() + PERIOD)
 
 
-def test_long_own_delay_is_a_missed_deadline(plant):
+def test_long_delay_of_this_program_is_a_missed_deadline(plant):
     rig = Rig(plant, has_clock=True).settle()
     rig.step += 51
     assert rig.set(rig.status(), 52 * PERIOD) == Fault.DEADLINE_MISSED
 
 
-def test_unchanged_clock_input_is_not_used_twice(plant):
+def test_unchanged_clock_input_is_ignored(plant):
     rig = Rig(plant, has_clock=True).settle()
     rig.check(rig.status())
     rig.simulator.AdvancePendingEvents()
     rig.port.GetMutableData().set_value(rig.status(time=rig.status().time + 0.9 * LIMITS.max_lead))
-    assert rig.fault == Fault.NONE  # it would be in the future of the previous check
+    assert rig.fault == Fault.NONE  # with the clock input, this status would be from the future
 
 
-def test_infinite_clock_input_is_not_used(plant):
+def test_infinite_clock_input_is_ignored(plant):
     rig = Rig(plant, has_clock=True).settle()
     rig.wall = np.inf
     assert rig.check(rig.status()) == Fault.NONE
@@ -167,7 +169,7 @@ def test_infinite_clock_input_is_not_used(plant):
 
 @pytest.mark.parametrize("has_clock", [False, True])
 def test_initialization_keeps_the_state(plant, has_clock):
-    """It does not change the robot, whose velocity must be known to damp it."""
+    """The robot is unchanged by an initialization, and damping needs its velocity."""
     rig = Rig(plant, has_clock=has_clock).settle()
     outputs = {name: rig[name].copy() for name in ("estimated_state", "velocity", "external_torque", "fault", "age")}
     assert rig["velocity"].any()
@@ -181,9 +183,8 @@ def test_initialization_keeps_the_state(plant, has_clock):
 def test_ports_have_their_documented_sizes(plant):
     system = StatusWatchdog(plant, LIMITS, TOLERANCE, period=PERIOD)
     outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
-    assert {port.get_name(): port.size() for port in outputs} == {
-        **{"estimated_state": 4, "velocity": 2, "external_torque": 2, "fault": 1, "age": 1}
-    }
+    sizes = {"estimated_state": 4, "velocity": 2, "external_torque": 2, "fault": 1, "age": 1}
+    assert {port.get_name(): port.size() for port in outputs} == sizes
     assert (system.get_torque_input_port().size(), system.get_clock_input_port().size()) == (2, 1)
     torque = system.get_torque_input_port().get_index()
     assert not any(system.HasDirectFeedthrough(torque, port.get_index()) for port in outputs)

@@ -28,14 +28,14 @@ def plant():
 
 
 class Rig:
-    """Limiter of a moving arm without faults, in state RUNNING by default."""
+    """Limiter of a moving arm without faults, initially in the state RUNNING by default."""
 
     def __init__(self, plant, running=True, **options):
         self.plant = plant
         self.system = TorqueSafetyLimiter(plant, LIMITS, period=PERIOD, **options)
         self.simulator = Simulator(self.system)
         self.context = self.simulator.get_mutable_context()
-        ok = {
+        self.valid = {
             "torque": COMMANDED,
             "estimated_state": [*POSTURE, *SPEED],
             "external_torque": np.zeros(n),
@@ -47,8 +47,9 @@ class Rig:
             "velocity": SPEED,
             "command_timed_out": [0.0],
         }
-        self.ports = {name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in ok.items()}
-        self.ok = ok
+        self.ports = {
+            name: self.system.GetInputPort(name).FixValue(self.context, value) for name, value in self.valid.items()
+        }
         if running:
             self.simulator.Initialize()
             self.advance(LIMITS.ramp_time + 4 * PERIOD)
@@ -74,6 +75,7 @@ class Rig:
         return Fault(int(self["fault"][0]))
 
     def damping(self, velocity=SPEED):
+        """Return the damping torque (7,) at this velocity [rad/s], without limits."""
         context = self.plant.CreateDefaultContext()
         self.plant.SetPositions(context, POSTURE)
         momentum = self.plant.CalcMassMatrix(context) @ velocity
@@ -86,7 +88,7 @@ def test_commanded_torque_is_passed_through_without_faults(plant):
     assert (rig.fault, rig["is_sending"][0], rig["not_following"][0]) == (Fault.NONE, 1.0, 0.0)
 
 
-def test_torque_ramps_up_once_the_status_is_valid(plant):
+def test_torque_ramps_up_when_the_status_becomes_valid(plant):
     rig = Rig(plant, running=False)
     rig.set(status_fault=[Fault.NO_STATUS])
     rig.simulator.Initialize()
@@ -108,7 +110,7 @@ def test_torque_ramps_up_once_the_status_is_valid(plant):
     np.testing.assert_allclose(np.diff(shares), PERIOD / LIMITS.ramp_time)
 
 
-WRONG = {
+FAULTS = {
     Fault.STALE: {"status_fault": [Fault.STALE]},
     Fault.VELOCITY_LIMIT: {"estimated_state": [*POSTURE, *SPEED[:-1], -1.01]},
     Fault.WORKSPACE_LIMIT: {"pose": [0.0, 0.0, 0.31, 0.0, 0.0, 0.0]},
@@ -127,15 +129,15 @@ def test_unknown_status_fault_stops_the_arm(plant, code):
     assert (rig.arm_state, rig.fault, rig["is_holding"][0]) == (ArmState.DAMPING, Fault.MALFORMED, 1.0)
 
 
-@pytest.mark.parametrize("fault", WRONG, ids=lambda fault: fault.name)
-def test_fault_stops_the_arm_at_once_until_resume(plant, fault):
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_fault_stops_the_arm_until_a_resume(plant, fault):
     rig = Rig(plant)
-    rig.set(**WRONG[fault])
+    rig.set(**FAULTS[fault])
     assert rig.fault == fault
     assert (rig["safe_torque"] * rig["safe_torque"] <= 400.0).all()
     assert not np.isclose(rig["safe_torque"], COMMANDED).any()
     rig.advance(2 * PERIOD)
-    rig.set(**{name: rig.ok[name] for name in WRONG[fault]})
+    rig.set(**{name: rig.valid[name] for name in FAULTS[fault]})
     assert (rig.arm_state, rig.fault, rig["blend_factor"][0]) == (ArmState.DAMPING, fault, 0.0)
     np.testing.assert_allclose(rig["safe_torque"], np.clip(rig.damping(), -20.0, 20.0), atol=1e-12)
     with pytest.raises(InputError, match="is damping"):
@@ -173,51 +175,52 @@ NOT_FINITE = {
 }
 
 
-@pytest.mark.parametrize("blend_factor", ["none", "some", "all"])
-@pytest.mark.parametrize("what", NOT_FINITE)
-def test_non_finite_input_is_a_fault_with_finite_torque(plant, what, blend_factor):
-    """In each arm state, at the stop, and until the arm is off."""
-    wrong, fault = NOT_FINITE[what]
-    rig = Rig(plant, running=blend_factor == "all")
-    if blend_factor != "all":
+@pytest.mark.parametrize("state", [ArmState.WAITING, ArmState.RAMPING, ArmState.RUNNING])
+@pytest.mark.parametrize("name", NOT_FINITE)
+def test_non_finite_input_is_a_fault_with_finite_torque(plant, name, state):
+    """The torque is finite in each state of the arm, at the stop, and until the arm is off."""
+    inputs, fault = NOT_FINITE[name]
+    rig = Rig(plant, running=state == ArmState.RUNNING)
+    if state != ArmState.RUNNING:
         rig.simulator.Initialize()
-        rig.advance(0.5 * LIMITS.ramp_time if blend_factor == "some" else 0.0)
-    rig.set(**wrong)
+        rig.advance(0.5 * LIMITS.ramp_time if state == ArmState.RAMPING else 0.0)
+    assert rig.arm_state == state
+    rig.set(**inputs)
     assert np.isfinite(rig["safe_torque"]).all()
-    if blend_factor == "none" and what == "desired_pose":
-        assert rig.fault == Fault.NONE  # the desired pose is not followed yet
+    if state == ArmState.WAITING and name == "desired_pose":
+        assert rig.fault == Fault.NONE  # a waiting arm does not follow the desired pose
         return
     assert rig.fault == fault
     for _ in range(round(LIMITS.damping_time / PERIOD) + 4):
         rig.advance(PERIOD)
         assert np.isfinite(rig["safe_torque"]).all()
         assert rig.fault == fault
-    assert rig.arm_state == (ArmState.WAITING if blend_factor == "none" else ArmState.OFF)
+    assert rig.arm_state == (ArmState.WAITING if state == ArmState.WAITING else ArmState.OFF)
 
 
-@pytest.mark.parametrize("wrong", [{"estimated_state": POSITION}, {"velocity": [*SPEED[:-1], np.inf]}])
-def test_unknown_velocity_or_posture_is_not_damped(plant, wrong):
+@pytest.mark.parametrize("inputs", [{"estimated_state": POSITION}, {"velocity": [*SPEED[:-1], np.inf]}])
+def test_damping_torque_is_zero_at_unknown_velocity_or_posture(plant, inputs):
     rig = Rig(plant)
-    rig.set(status_fault=[Fault.NOT_FINITE], **wrong)
+    rig.set(status_fault=[Fault.NOT_FINITE], **inputs)
     for _ in range(3):
         np.testing.assert_array_equal(rig["safe_torque"], 0.0)
         rig.advance(PERIOD)
     assert rig.arm_state == ArmState.DAMPING
 
 
-@pytest.mark.parametrize("unknown", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("velocity", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("running", [False, True])
-def test_commanded_torque_is_not_damped_at_unknown_velocity(plant, unknown, running):
+def test_commanded_torque_is_not_damped_at_unknown_velocity(plant, velocity, running):
     rig = Rig(plant, running=running)
     if not running:
         rig.simulator.Initialize()
         rig.advance(0.5 * LIMITS.ramp_time)
-    rig.set(velocity=[*SPEED[:-1], unknown])
+    rig.set(velocity=[*SPEED[:-1], velocity])
     assert rig.arm_state == (ArmState.RUNNING if running else ArmState.RAMPING)
     np.testing.assert_array_equal(rig["safe_torque"], rig["blend_factor"][0] * COMMANDED)
 
 
-def test_torque_that_overflows_is_zero(plant):
+def test_damping_torque_is_zero_for_a_joint_that_overflows(plant):
     rig = Rig(plant)
     velocity = 1e308 * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0, 0.0])
     rig.set(velocity=velocity, status_fault=[Fault.FROZEN])
@@ -228,7 +231,7 @@ def test_torque_that_overflows_is_zero(plant):
         np.testing.assert_array_equal(rig["safe_torque"], expected)
 
 
-def test_stop_damps_the_estimated_velocity_and_not_the_reported(plant):
+def test_stop_damps_the_estimated_not_the_reported_velocity(plant):
     rig = Rig(plant)
     rig.set(estimated_state=[*POSTURE, *(-5.0 * SPEED)], velocity=0.5 * SPEED, status_fault=[Fault.FROZEN])
     for _ in range(3):
@@ -236,14 +239,15 @@ def test_stop_damps_the_estimated_velocity_and_not_the_reported(plant):
         rig.advance(PERIOD)
 
 
-def test_damping_multiplies_the_velocity_by_its_decay(plant):
+def test_damping_reduces_the_velocity_by_its_decay(plant):
     rig = Rig(plant)
+    rig.set(velocity=0.5 * SPEED)  # slow enough that no torque limit is active
     rig.system.stop(rig.context)
     context = plant.CreateDefaultContext()
     plant.SetPositions(context, POSTURE)
     M = plant.CalcMassMatrix(context)
-    slowed = SPEED + PERIOD * np.linalg.solve(M, rig.damping())
-    np.testing.assert_allclose(slowed, np.exp(-PERIOD / LIMITS.decay_time) * SPEED)
+    velocity = 0.5 * SPEED + PERIOD * np.linalg.solve(M, rig["safe_torque"])
+    np.testing.assert_allclose(velocity, np.exp(-PERIOD / LIMITS.decay_time) * 0.5 * SPEED)
 
 
 def test_resume_is_refused_while_a_fault_is_present(plant):
@@ -267,12 +271,12 @@ def test_commanded_torque_fades_out_when_the_status_is_old(plant):
     for age in (0.0, 1.0, 1.5, 2.0, 3.0, np.inf):
         rig.set(status_age=[age * PERIOD])
         sent.append(rig["safe_torque"])
-    commanded = rig.ok["torque"]
+    commanded = rig.valid["torque"]
     np.testing.assert_allclose(sent, np.outer([1.0, 1.0, 0.5, 0.0, 0.0, 0.0], commanded))
     assert rig.fault == Fault.NONE
 
 
-def test_zero_torque_then_nothing_is_sent_without_status(plant):
+def test_zero_torque_and_then_no_torque_is_sent_without_status(plant):
     rig = Rig(plant)
     rig.set(status_fault=[Fault.STALE])
     sent = []
@@ -299,8 +303,8 @@ def test_stop_damps_the_arm(plant):
     assert (rig.arm_state, rig.fault) == (ArmState.OFF, Fault.USER_STOP)
 
 
-def test_stop_sends_nothing_to_a_waiting_arm(plant):
-    """Before the first accepted status there is no velocity to damp and no torque to revoke."""
+def test_no_torque_is_sent_when_a_waiting_arm_is_stopped(plant):
+    """Before the first valid status, the velocity is unknown and no torque has been sent."""
     rig = Rig(plant, running=False)
     rig.set(status_fault=[Fault.NO_STATUS])
     rig.simulator.Initialize()
@@ -320,14 +324,14 @@ def test_resume_is_refused_when_the_arm_is_not_stopped(plant):
         rig.system.resume(rig.context)
 
 
-def test_default_limits_are_unchanged():
+def test_limits_have_their_documented_defaults():
     limits = SafetyLimits(velocity=(1.0,), torque=(1.0,), external_torque=(1.0,))
     assert (limits.force, limits.lower, limits.upper) == (60.0, (-0.2, -0.2, -0.1), (0.2, 0.2, 0.3))
     assert (limits.damping_time, limits.decay_time, limits.ramp_time) == (0.2, 0.02, 0.5)
 
 
 @pytest.mark.parametrize(
-    "wrong",
+    "arguments",
     [
         {"velocity": (1.0,) * 6},
         {"torque": (20.0,) * 8},
@@ -346,9 +350,9 @@ def test_default_limits_are_unchanged():
         {"upper": (0.2, 0.2, np.inf)},
     ],
 )
-def test_limits_refuse_values_out_of_range(wrong):
+def test_limits_refuse_values_out_of_range(arguments):
     with pytest.raises(InputError):
-        replace(LIMITS, **wrong)
+        replace(LIMITS, **arguments)
 
 
 def test_constructor_refuses_limits_of_another_arm(plant):
@@ -381,7 +385,7 @@ def test_outputs_have_their_sizes_and_direct_feedthrough(plant):
         **{"safe_torque": n, "fault": 1, "arm_state": 1, "blend_factor": 1, "is_sending": 1, "is_holding": 1},
         "not_following": 1,
     }
-    at_once = {
+    feedthrough = {
         port.get_name(): {
             system.get_input_port(i).get_name()
             for i in range(system.num_input_ports())
@@ -390,7 +394,7 @@ def test_outputs_have_their_sizes_and_direct_feedthrough(plant):
         for port in outputs
     }
     measured = {"estimated_state", "external_torque", "wrench", "pose", "desired_pose", "torque"}
-    assert at_once == {
+    assert feedthrough == {
         "safe_torque": measured | {"status_fault", "status_age", "velocity"},
         "fault": measured | {"status_fault", "status_age"},
         "arm_state": set(),
@@ -410,7 +414,7 @@ def test_arm_waits_before_the_initialization(plant):
 @pytest.mark.parametrize("time", [None, 0.0])
 @pytest.mark.parametrize("arm_state", [ArmState.RAMPING, ArmState.RUNNING])
 def test_initialization_stops_an_arm_that_is_controlled(plant, arm_state, time):
-    """The driver may repeat the last torque forever, so silence is no stop."""
+    """Without damping torques, the driver could apply the last torque forever."""
     rig = Rig(plant, running=arm_state == ArmState.RUNNING)
     if arm_state == ArmState.RAMPING:
         rig.simulator.Initialize()
@@ -424,7 +428,7 @@ def test_initialization_stops_an_arm_that_is_controlled(plant, arm_state, time):
     assert (rig.arm_state, rig.fault) == (ArmState.OFF, Fault.INITIALIZED)
 
 
-def test_initialization_does_not_end_a_stop(plant):
+def test_initialization_continues_a_stop(plant):
     rig = Rig(plant)
     rig.system.stop(rig.context)
     for arm_state in (ArmState.DAMPING, ArmState.OFF):
@@ -451,8 +455,8 @@ def test_not_following_is_set_when_commands_time_out(plant):
     assert (rig.arm_state, rig["not_following"][0]) == (ArmState.RUNNING, 1.0)
 
 
-ABOVE = 1.001
-BEYOND = {
+ABOVE = 1.001  # factor of a limit
+BEYOND_LIMIT = {
     "velocity": {"estimated_state": [*POSTURE, *SPEED[:-1], ABOVE]},
     "velocity, negative": {"estimated_state": [*POSTURE, -ABOVE, *SPEED[1:]]},
     "external torque": {"external_torque": [-10.0 * ABOVE, *np.zeros(n - 1)]},
@@ -466,12 +470,11 @@ BEYOND = {
 }
 
 
-@pytest.mark.parametrize("what", BEYOND)
-def test_fault_is_raised_just_beyond_each_limit(plant, what):
-    """Values exactly at the limits are no fault; see above."""
+@pytest.mark.parametrize("limit", BEYOND_LIMIT)
+def test_fault_is_raised_just_beyond_each_limit(plant, limit):
     rig = Rig(plant)
     assert rig.fault == Fault.NONE
-    rig.set(**BEYOND[what])
+    rig.set(**BEYOND_LIMIT[limit])
     assert rig.fault != Fault.NONE
 
 
@@ -482,8 +485,8 @@ def test_torque_just_beyond_its_limit_is_clipped(plant):
 
 
 @pytest.mark.parametrize("state", [ArmState.DAMPING, ArmState.OFF])
-def test_damping_lasts_for_its_time(plant, state):
-    """The last damping torque is sent in the step that reaches the damping time, and not in the next."""
+def test_damping_lasts_for_the_damping_time(plant, state):
+    """The last damping torque is sent in the step in which the damping time ends."""
     rig, steps = Rig(plant), round(LIMITS.damping_time / PERIOD)
     rig.system.stop(rig.context)
     rig.advance((steps - (state == ArmState.DAMPING)) * PERIOD)
@@ -492,7 +495,7 @@ def test_damping_lasts_for_its_time(plant, state):
 
 
 @pytest.mark.parametrize(("steps", "is_sending"), [(12, 1.0), (13, 0.0)])
-def test_zero_torque_is_sent_for_its_time(plant, steps, is_sending):
+def test_zero_torque_is_sent_for_the_zero_torque_time(plant, steps, is_sending):
     assert 12 * PERIOD <= ZERO_TORQUE_TIME == 0.05 < 13 * PERIOD
     rig = Rig(plant)
     rig.set(status_fault=[Fault.STALE])
@@ -515,7 +518,7 @@ def test_driver_holds_the_arm_after_a_status_fault(plant, fault):
     rig = Rig(plant, can_hold=True)
     assert rig["is_holding"][0] == 0.0
     rig.set(status_fault=[fault])
-    assert rig["is_holding"][0] == 1.0  # at once
+    assert rig["is_holding"][0] == 1.0
     rig.advance(PERIOD)
     rig.set(status_fault=[0.0])
     assert (rig["is_holding"][0], rig.arm_state) == (1.0, ArmState.DAMPING)
@@ -526,7 +529,7 @@ def test_driver_holds_the_arm_after_a_status_fault(plant, fault):
 
 
 @pytest.mark.parametrize("can_hold", [True, False])
-def test_driver_does_not_hold_without_a_status_fault(plant, can_hold):
+def test_driver_does_not_hold_after_another_fault_or_if_waiting(plant, can_hold):
     rig = Rig(plant, can_hold=can_hold)
     rig.set(wrench=[61.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     assert (rig.fault, rig["is_holding"][0]) == (Fault.FORCE_LIMIT, 0.0)
@@ -536,6 +539,6 @@ def test_driver_does_not_hold_without_a_status_fault(plant, can_hold):
     waiting.set(status_fault=[Fault.NO_STATUS])
     waiting.simulator.Initialize()
     assert waiting["is_holding"][0] == 0.0
-    without = Rig(plant)
-    without.set(status_fault=[Fault.FROZEN])
-    assert without["is_holding"][0] == 0.0
+    cannot_hold = Rig(plant)
+    cannot_hold.set(status_fault=[Fault.FROZEN])
+    assert cannot_hold["is_holding"][0] == 0.0

@@ -1,4 +1,4 @@
-"""Sensor on a moving wrist: only external contact of the tool may be measured."""
+"""Wrench sensor on a moving wrist, which measures only the external contact of the tool."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ R_WAXES = RotationMatrix(RollPitchYaw(0.3, -0.2, 0.9))
 
 
 class SwingingTool:
-    """Pendulum with a bob of two bodies welded to its rod at the wrist; the center of compliance is elsewhere."""
+    """Pendulum whose tool, two welded bodies, is fixed to the rod at the wrist; frame P on the tool is the center."""
 
     def __init__(self, time_constant=0.0, has_weight=True):
         builder = DiagramBuilder()
@@ -52,6 +52,7 @@ class SwingingTool:
         self.center, self.wrist = center, wrist
 
     def push(self, force, torque):
+        """Apply a force [N] and a torque [Nm] in world axes to the origin of P."""
         applied = ExternallyAppliedSpatialForce()
         applied.body_index = self.tool.index()
         applied.p_BoBq_B = self.X_ToolP.translation()
@@ -74,7 +75,7 @@ def test_wrench_is_zero_when_the_tool_swings_freely(has_weight):
         np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
 
 
-def test_wrench_is_the_push_at_the_center_of_a_swinging_tool():
+def test_wrench_is_the_applied_wrench_while_the_tool_swings():
     swinging = SwingingTool()
     swinging.joint.set_angle(swinging.plant_context, 0.5)
     force, torque = np.array([1.0, -2.0, 3.0]), np.array([0.1, 0.2, -0.3])
@@ -92,7 +93,7 @@ def test_filter_is_a_first_order_low_pass():
     np.testing.assert_allclose(swinging.wrench, np.zeros(6), atol=1e-9)
     swinging.push([0.0, 0.0, 2.0], [0.0, 0.0, 0.0])
     swinging.simulator.AdvanceTo(0.06 + 0.5 * PERIOD)
-    samples = 51  # the events at 10 … 60 ms
+    samples = 51  # at 10, 11, …, 60 ms
     expected = 2.0 * (1.0 - np.exp(-samples * PERIOD / 0.05))
     assert np.linalg.norm(swinging.wrench[:3]) == pytest.approx(expected, rel=1e-6)
     swinging.simulator.Initialize()
@@ -114,7 +115,7 @@ def test_constructor_refuses_arguments_out_of_range(period, time_constant):
         WrenchSensor(swinging.plant, swinging.wrist, [swinging.tool], swinging.center, R_WAXES, period, time_constant)
 
 
-def test_constructor_refuses_a_tool_at_another_joint():
+def test_constructor_refuses_a_body_that_is_not_at_the_wrist():
     swinging = SwingingTool()
     rod = swinging.plant.GetBodyByName("rod")
     with pytest.raises(InputError, match="child of"):

@@ -11,6 +11,7 @@ BIAS = np.array([3.0, -2.0, 1.0, 0.3, -0.2, 0.1])
 
 @pytest.fixture
 def tare():
+    """Return a tare of a measured wrench `BIAS`, its simulator, the context, and the value of the wrench."""
     system = WrenchTare(PERIOD, skipped=2, averaged=4)
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -32,7 +33,7 @@ def test_bias_is_removed_after_the_last_averaged_sample(tare):
     np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), contact, atol=1e-12)
 
 
-def test_skipped_samples_do_not_count_and_the_others_are_averaged(tare):
+def test_offset_is_the_mean_of_the_samples_after_the_skipped(tare):
     system, simulator, context, port = tare
     for step, value in enumerate([100.0, 100.0, 1.0, 2.0, 3.0, 6.0]):
         port.GetMutableData().set_value(np.full(6, value))
@@ -42,7 +43,7 @@ def test_skipped_samples_do_not_count_and_the_others_are_averaged(tare):
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])
-def test_samples_that_are_not_finite_do_not_count(tare, number):
+def test_samples_that_are_not_finite_are_ignored(tare, number):
     system, simulator, context, port = tare
     for step, value in enumerate([100.0, 100.0, 1.0, number, 2.0, 3.0, 6.0]):
         assert not system.is_tared(context)
@@ -53,7 +54,7 @@ def test_samples_that_are_not_finite_do_not_count(tare, number):
     np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), [-3.0, *np.zeros(5)])
 
 
-def test_initialization_tares_again(tare):
+def test_initialization_restarts_the_tare(tare):
     system, simulator, context, port = tare
     simulator.AdvanceTo(PERIOD * 8)
     port.GetMutableData().set_value(2.0 * BIAS)
@@ -64,8 +65,10 @@ def test_initialization_tares_again(tare):
     np.testing.assert_allclose(system.get_tared_wrench_output_port().Eval(context), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("wrong", [(0.0, 1, 1), (PERIOD, -1, 1), (PERIOD, 0, 0), (PERIOD, 0.5, 1), (PERIOD, 0, np.nan)])
-def test_constructor_refuses_arguments_out_of_range(wrong):
+@pytest.mark.parametrize(
+    "arguments", [(0.0, 1, 1), (PERIOD, -1, 1), (PERIOD, 0, 0), (PERIOD, 0.5, 1), (PERIOD, 0, np.nan)]
+)
+def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
-        WrenchTare(*wrong)
+        WrenchTare(*arguments)
     WrenchTare(PERIOD, 0, 1)

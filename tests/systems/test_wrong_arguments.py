@@ -1,4 +1,4 @@
-"""Arguments of the wrong type, size or plant are refused with one sentence when a system is made."""
+"""Constructors of systems refuse arguments of the wrong type, size or plant with one sentence."""
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ GAINS = systems.ImpedanceGains(STIFFNESS, LIMITS, posture=np.zeros(6))
 
 
 def gantry(*, finalize=True):
+    """Return a plant of three prismatic and three revolute axes with a welded hand, and the last axis's body."""
     plant = MultibodyPlant(0.0)
     parent = plant.world_body()
     for i, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
@@ -37,7 +38,7 @@ def gantry(*, finalize=True):
     return plant, parent
 
 
-def wrench_sensor(*, wrist=None, tool=None, center=None, axes=None, period=PERIOD, time_constant=0.1):
+def make_wrench_sensor(*, wrist=None, tool=None, center=None, axes=None, period=PERIOD, time_constant=0.1):
     axes = RotationMatrix() if axes is None else axes
     tool = [TOOL, HAND] if tool is None else tool
     return systems.WrenchSensor(PLANT, wrist or JOINT, tool, center or FRAME, axes, period, time_constant)
@@ -52,7 +53,7 @@ def primitive(history=0):
 
 PLANT, TOOL = gantry()
 _, OTHER_TOOL = gantry()
-UNFINISHED, UNFINISHED_TOOL = gantry(finalize=False)
+DRAFT, DRAFT_TOOL = gantry(finalize=False)  # a plant that is not finalized
 WORLD, FRAME = PLANT.world_frame(), TOOL.body_frame()
 
 
@@ -62,7 +63,7 @@ WORLD, FRAME = PLANT.world_frame(), TOOL.body_frame()
         (PLANT, FRAME, FRAME, GAINS, "can move: give a frame that is fixed in the world"),
         (PLANT, WORLD, OTHER_TOOL.body_frame(), GAINS, "tool_center is the frame body5 of another plant"),
         (PLANT, WORLD, TOOL, GAINS, "tool_center is a frame of the plant, such as body.body_frame"),
-        (UNFINISHED, UNFINISHED.world_frame(), UNFINISHED_TOOL.body_frame(), GAINS, "must be finalized"),
+        (DRAFT, DRAFT.world_frame(), DRAFT_TOOL.body_frame(), GAINS, "must be finalized"),
         (None, WORLD, FRAME, GAINS, "a plant is a MultibodyPlant, not None"),
         (PLANT, WORLD, FRAME, STIFFNESS, "the gains of an impedance are ImpedanceGains"),
     ],
@@ -79,14 +80,14 @@ def test_impedance_refuses_a_stiffness_frame_of_another_plant():
         )
 
 
-def test_other_systems_check_plant_and_frames_too():
+def test_controller_and_wrench_refuse_frames_of_another_plant():
     with pytest.raises(InputError, match="of another plant"):
         systems.CartesianPositionController(PLANT, WORLD, OTHER_TOOL.body_frame(), posture=np.zeros(6))
     with pytest.raises(InputError, match="of another plant"):
         systems.JointTorqueWrench(PLANT, WORLD, OTHER_TOOL.body_frame(), period=PERIOD, time_constant=0.0)
 
 
-BODY, OTHER, RAW = PLANT.GetBodyByName("body0"), OTHER_TOOL, UNFINISHED_TOOL
+BODY, OTHER = PLANT.GetBodyByName("body0"), OTHER_TOOL
 JOINT, HAND = PLANT.GetJointByName("joint5"), PLANT.GetBodyByName("hand")
 ZEROS = np.zeros(6)
 
@@ -97,7 +98,7 @@ ZEROS = np.zeros(6)
         (lambda: systems.ContactDetector(PLANT, [OTHER], [BODY], PERIOD), "the body body5 of another plant"),
         (lambda: systems.ContactDetector(PLANT, [TOOL], [], PERIOD), "obstacles is a list of at least one body"),
         (lambda: systems.ContactDetector(PLANT, TOOL, [BODY], PERIOD), "bodies is a list of at least one body"),
-        (lambda: systems.ContactDetector(UNFINISHED, [RAW], [RAW], PERIOD), "must be finalized"),
+        (lambda: systems.ContactDetector(DRAFT, [DRAFT_TOOL], [DRAFT_TOOL], PERIOD), "must be finalized"),
         (lambda: systems.MeasuredPose(PLANT, OTHER, RigidTransform()), "the body body5 of another plant"),
         (lambda: systems.MeasuredPose(PLANT, FRAME, RigidTransform()), "body has bodies of the plant"),
         (lambda: systems.MeasuredPose(PLANT, TOOL, np.eye(4)), "X_WT is a RigidTransform"),
@@ -105,14 +106,14 @@ ZEROS = np.zeros(6)
         (lambda: systems.RelativePoses(PLANT, [TOOL], OTHER), "reference has the body body5 of another plant"),
         (lambda: systems.ExternalTorqueSensor(PLANT, OTHER, ZEROS, ZEROS, period=PERIOD), "of another plant"),
         (lambda: systems.ExternalTorqueSensor(PLANT, WORLD.body(), ZEROS, ZEROS, period=PERIOD), "is the world"),
-        (lambda: systems.StatusWatchdog(UNFINISHED, StatusLimits(ONES), ONES, period=PERIOD), "must be finalized"),
-        (lambda: systems.TorqueSafetyLimiter(UNFINISHED, SAFETY, period=PERIOD), "must be finalized"),
-        (lambda: wrench_sensor(tool=[OTHER, HAND]), "tool has the body body5 of another plant"),
-        (lambda: wrench_sensor(tool=TOOL), "tool is a list of at least one body"),
-        (lambda: wrench_sensor(tool=[TOOL]), "welded to it: add hand"),
-        (lambda: wrench_sensor(wrist="joint5"), "a wrist is a joint of the plant, not 'joint5'"),
-        (lambda: wrench_sensor(center=WORLD), "the center world must be fixed to a body"),
-        (lambda: wrench_sensor(axes=RigidTransform()), "R_WAxes is a RotationMatrix"),
+        (lambda: systems.StatusWatchdog(DRAFT, StatusLimits(ONES), ONES, period=PERIOD), "must be finalized"),
+        (lambda: systems.TorqueSafetyLimiter(DRAFT, SAFETY, period=PERIOD), "must be finalized"),
+        (lambda: make_wrench_sensor(tool=[OTHER, HAND]), "tool has the body body5 of another plant"),
+        (lambda: make_wrench_sensor(tool=TOOL), "tool is a list of at least one body"),
+        (lambda: make_wrench_sensor(tool=[TOOL]), "welded to it: add hand"),
+        (lambda: make_wrench_sensor(wrist="joint5"), "a wrist is a joint of the plant, not 'joint5'"),
+        (lambda: make_wrench_sensor(center=WORLD), "the center world must be fixed to a body"),
+        (lambda: make_wrench_sensor(axes=RigidTransform()), "R_WAxes is a RotationMatrix"),
     ],
 )
 def test_systems_refuse_wrong_bodies(build, message):
@@ -193,9 +194,12 @@ def test_history_refuses_sizes_beyond_its_limit(outputs, length):
         (lambda: systems.CommandWatchdog(PERIOD, pose_size="6"), "pose_size must be a whole number"),
         (lambda: systems.PoseRateLimiter(period=None), "a system's period must be a number, not None"),
         (lambda: systems.HistoryLengthSchedule([1], PERIOD, dwell_steps=np.nan), "dwell_steps must be a whole"),
-        (lambda: wrench_sensor(period="a"), "a system's period must be a number, not 'a'"),
-        (lambda: wrench_sensor(time_constant=None), "time_constant must be a number, not None"),
-        (lambda: systems.PolicySystem(lambda seen: seen, None, 2, PERIOD), "the size of an observation must be"),
+        (lambda: make_wrench_sensor(period="a"), "a system's period must be a number, not 'a'"),
+        (lambda: make_wrench_sensor(time_constant=None), "time_constant must be a number, not None"),
+        (
+            lambda: systems.PolicySystem(lambda y: y, None, 2, PERIOD),
+            "the size of an observation must be",
+        ),
     ],
 )
 def test_systems_refuse_arguments_of_another_type(build, message):

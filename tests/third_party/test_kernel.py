@@ -1,4 +1,4 @@
-"""A kernel that is registered from outside is used by an environment."""
+"""Environments with a kernel that is registered outside of the package."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from guiderail.models.primitives import SquaredExponential
 
 
 class RationalQuadratic:
-    """k(ζ, ζ') = (1 + ‖ζ − ζ'‖² / (2 a ℓ²))⁻ᵃ."""
+    """Rational quadratic kernel k(ζ, ζ') = (1 + ‖ζ − ζ'‖² / (2 a ℓ²))⁻ᵃ."""
 
     stationary = True
 
@@ -24,11 +24,13 @@ class RationalQuadratic:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def registered():
+def registration():
+    """Register the kernel for the tests of this file."""
     register_kernel("lab_rational_quadratic", RationalQuadratic)
 
 
 def primitive(**options):
+    """Return the movement primitive of the narrow passage under KGRL with environment options."""
     return make_prior_knowledge("NarrowPassage", guidance="kgrl", **options).demonstrations.primitive(history=False)
 
 
@@ -40,19 +42,19 @@ def test_environment_uses_a_registered_kernel():
     assert primitive(**options) is primitive(**options)
     env = make_env("NarrowPassage", guidance="kgrl", **options)
     env.reset(seed=0)
-    outside = make_env("NarrowPassage", guidance="kgrl")
-    outside.reset(seed=0)
+    default_env = make_env("NarrowPassage", guidance="kgrl")
+    default_env.reset(seed=0)
     action = np.ones(env.action_space.shape)
-    assert env.step(action)[4]["constraint_violation"] != outside.step(action)[4]["constraint_violation"]
+    assert env.step(action)[4]["constraint_violation"] != default_env.step(action)[4]["constraint_violation"]
     env.close()
-    outside.close()
+    default_env.close()
 
 
 def test_environment_uses_the_thesis_kernel_by_default():
     assert primitive().kernel == SquaredExponential(0.5)
 
 
-def test_kernel_that_is_a_plain_function_is_refused():
+def test_kernel_is_refused_when_it_is_a_function():
     register_kernel("lab_function", lambda a, b: np.subtract.outer(a, b))
     with pytest.raises(InputError, match=r"'lab_function' can't be made of length_scale.*: register a class"):
         primitive(kernel="lab_function")

@@ -1,4 +1,4 @@
-"""A package with a task, guidance and a learner of its own, as a lab would install it."""
+"""Package `peglab` of another lab, installed with its own task, guidance, kernel and learner."""
 
 import json
 import os
@@ -12,50 +12,54 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent / "peglab"
-LINES = 180
+MAX_LINES = 180
 
 
 @pytest.fixture(scope="module")
 def lab(tmp_path_factory):
-    """A fresh environment with the package installed; what is heavy is borrowed from the one that runs this test."""
+    """Yield a function that runs an interpreter of a new virtual environment with the package and returns its output.
+
+    The virtual environment imports guiderail and the libraries from the interpreter of this test.
+    """
     folder = tmp_path_factory.mktemp("lab")
     environment = folder / "env"
     venv.create(environment, with_pip=False, symlinks=True)
     purelib = sysconfig.get_path("purelib", vars={"base": str(environment), "platbase": str(environment)})
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--target", purelib]
     subprocess.run([*pip, str(PACKAGE)], check=True)
-    # The libraries, and guiderail with its entry points, as this interpreter has them.
-    borrowed = [sysconfig.get_path("purelib"), *site.getsitepackages(), *(p for p in sys.path if p.endswith("src"))]
-    Path(purelib, "borrowed.pth").write_text("\n".join(dict.fromkeys(borrowed)) + "\n")
+    # Folders of this interpreter with the libraries, and with guiderail and its entry points.
+    shared = [sysconfig.get_path("purelib"), *site.getsitepackages(), *(p for p in sys.path if p.endswith("src"))]
+    Path(purelib, "shared.pth").write_text("\n".join(dict.fromkeys(shared)) + "\n")
 
     variables = os.environ | {"OMP_NUM_THREADS": "1", "DRAKE_ALLOW_NETWORK": "meshcat:lcm"}
     variables.pop("PYTHONPATH", None)
-    served = subprocess.Popen(
-        [str(environment / "bin" / "python"), str(Path(__file__).parents[1] / "served.py")],
+    server = subprocess.Popen(
+        [str(environment / "bin" / "python"), str(Path(__file__).parents[1] / "fork_server.py")],
         cwd=folder, env=variables, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
-    assert served.stdout.readline() == "ready\n"
+    assert server.stdout.readline() == "ready\n"
 
     def run(*arguments, code=0):
-        served.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder), "environment": {}}) + "\n")
-        served.stdin.flush()
-        result = json.loads(served.stdout.readline())
+        server.stdin.write(json.dumps({"arguments": arguments, "folder": str(folder), "environment": {}}) + "\n")
+        server.stdin.flush()
+        result = json.loads(server.stdout.readline())
         assert result["returncode"] == code, result["stdout"] + result["stderr"]
         return result["stdout"] if code == 0 else result["stderr"]
 
     run.folder = folder
     yield run
-    served.stdin.close()
-    served.wait()
+    server.stdin.close()
+    server.wait()
 
 
 def guiderail(lab, *arguments, code=0):
-    """The command, as it is installed."""
+    """Run the command `guiderail` in the virtual environment; return its output, or its errors if `code` is not 0."""
     return lab("-c", "from guiderail.tools.cli.main import main; main()", *arguments, code=code)
 
 
 @pytest.fixture(scope="module")
-def trained(lab):
+def run_folder(lab):
+    """Return the folder of a run that is trained for three episodes."""
     guiderail(
         lab, "train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "3",
         "--env", "width=0.16", "--out", "run",
@@ -63,26 +67,26 @@ def trained(lab):
     return lab.folder / "run"
 
 
-def test_it_is_small_enough_to_be_worth_it():
+def test_package_is_short():
     files = (PACKAGE / "peglab.py", PACKAGE / "pyproject.toml")
-    assert sum(len(path.read_text().splitlines()) for path in files) <= LINES
+    assert sum(len(path.read_text().splitlines()) for path in files) <= MAX_LINES
 
 
-def test_no_file_of_guiderail_names_it():
+def test_guiderail_does_not_name_the_package():
     root = Path(__file__).parents[2]
     for folder in ("models", "systems", "diagrams", "tools", "src"):
         assert not [path for path in (root / folder).rglob("*.py") if "peglab" in path.read_text()]
 
 
-def test_it_is_listed(lab):
-    there = json.loads(guiderail(lab, "list", "--json"))
-    assert "peglab/Slot" in there["tasks"]
-    assert "peglab_offset" in there["tasks"]["peglab/Slot"]["guidance"]
-    assert "peglab_hill_climbing" in there["learners"]
-    assert [option["name"] for option in there["tasks"]["peglab/Slot"]["options"]] == ["width"]
+def test_list_has_task_guidance_and_learner(lab):
+    catalog = json.loads(guiderail(lab, "list", "--json"))
+    assert "peglab/Slot" in catalog["tasks"]
+    assert "peglab_offset" in catalog["tasks"]["peglab/Slot"]["guidance"]
+    assert "peglab_hill_climbing" in catalog["learners"]
+    assert [option["name"] for option in catalog["tasks"]["peglab/Slot"]["options"]] == ["width"]
 
 
-def test_gymnasium_makes_it(lab):
+def test_gymnasium_makes_the_task(lab):
     code = (
         "import gymnasium; env = gymnasium.make('guiderail.diagrams:peglab/Slot-v0', guidance='peglab_offset', "
         "reach=0.02, width=0.2); env.reset(seed=0); print(env.step([1.0, 0.0])[4]['control_steps'])"
@@ -90,23 +94,25 @@ def test_gymnasium_makes_it(lab):
     assert lab("-c", code).split() == ["5"]
 
 
-def test_a_wrong_option_gets_a_sentence(lab):
-    said = guiderail(lab, "train", "peglab/Slot", "--env", "width=3", "--out", "wrong", code=2)
-    assert "width must be at most 0.3" in said
-    said = guiderail(lab, "train", "peglab/Slot", "--guidance", "sct", "--out", "wrong", code=2)
-    assert "needs a shared control template, which peglab/Slot" in said
+def test_train_refuses_an_invalid_option_with_one_sentence(lab):
+    message = guiderail(lab, "train", "peglab/Slot", "--env", "width=3", "--out", "wrong", code=2)
+    assert "width must be at most 0.3" in message
+    message = guiderail(lab, "train", "peglab/Slot", "--guidance", "sct", "--out", "wrong", code=2)
+    assert "needs a shared control template, which peglab/Slot" in message
 
 
-def test_it_is_trained_resumed_and_evaluated(lab, trained):
+def test_run_is_resumed_and_evaluated(lab, run_folder):
     guiderail(lab, "train", "--resume", "--episodes", "4", "--out", "run", "--no-pictures")
     result = json.loads(guiderail(lab, "evaluate", "run", "--episodes", "2", "--json"))
     assert result["episodes"] == 2
     assert result["max_commanded_violation"] <= 1e-9
 
 
-def test_a_setting_of_its_learner_is_validated(lab):
-    words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
-    guiderail(lab, *words, "--set", "deviation=0.1", "--out", "careful", "--no-pictures")
+TRAIN = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
+
+
+def test_settings_of_the_learner_are_validated(lab):
+    guiderail(lab, *TRAIN, "--set", "deviation=0.1", "--out", "careful", "--no-pictures")
     assert "deviation: 0.1" in (lab.folder / "careful" / "config.yaml").read_text()
     for setting, sentence in (
         (
@@ -116,12 +122,12 @@ def test_a_setting_of_its_learner_is_validated(lab):
         ("deviaton=1", "did you mean deviation?"),
         ("learning_rate=0.1", "peglab_hill_climbing has no setting 'learning_rate'"),
     ):
-        assert sentence in guiderail(lab, *words, "--set", setting, "--out", "refused", code=2)
-    said = guiderail(lab, *words, "--preset", "tqc_contact", "--out", "refused", code=2)
-    assert "settings that peglab_hill_climbing does not have: leave --preset out" in said
+        assert sentence in guiderail(lab, *TRAIN, "--set", setting, "--out", "refused", code=2)
+    message = guiderail(lab, *TRAIN, "--preset", "tqc_contact", "--out", "refused", code=2)
+    assert "settings that peglab_hill_climbing does not have: leave --preset out" in message
 
 
-def test_the_python_api_trains_it(lab):
+def test_python_function_trains_the_task(lab):
     code = (
         "import guiderail\n"
         "settings = {'algorithm': 'peglab_hill_climbing', 'episodes': 2, 'width': 0.2, 'pictures': False}\n"
@@ -133,14 +139,13 @@ def test_the_python_api_trains_it(lab):
     assert lab("-c", code).strip() == "peglab/Slot"
 
 
-def test_its_kernel_is_a_choice(lab):
-    words = ("train", "peglab/Slot", "--guidance", "kgrl", "--algorithm", "peglab_hill_climbing", "--episodes", "1")
-    own = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel_parameters={mixture: 2.0}")
-    guiderail(lab, *words, *own, "--out", "smoother", "--no-pictures")
-    assert "kernel: peglab_rational_quadratic" in (lab.folder / "smoother" / "config.yaml").read_text()
+def test_training_uses_the_kernel_of_the_package(lab):
+    kernel = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel_parameters={mixture: 2.0}")
+    guiderail(lab, *TRAIN, *kernel, "--out", "kernel", "--no-pictures")
+    assert "kernel: peglab_rational_quadratic" in (lab.folder / "kernel" / "config.yaml").read_text()
 
 
-def test_policies_are_judged_in_its_environment_of_other_origin(lab):
+def test_evaluate_accepts_an_environment_without_guiderail(lab):
     code = (
         "import guiderail, peglab\n"
         "evaluation = guiderail.evaluate(lambda point: -3 * point, peglab.Reach(), 8)\n"
@@ -149,18 +154,18 @@ def test_policies_are_judged_in_its_environment_of_other_origin(lab):
     assert lab("-c", code).split() == ["1.0", "True", "zero", "uniform_random", "constant"]
 
 
-def test_its_function_is_a_policy_of_the_command(lab):
+def test_evaluate_accepts_a_function_in_a_file_as_policy(lab):
     (lab.folder / "lab_policies.py").write_text("import numpy as np\ndef ahead(observation):\n    return np.ones(2)\n")
-    words = ("evaluate", "lab_policies.py:ahead", "--task", "peglab/Slot", "--episodes", "2", "--baselines", "none")
-    assert json.loads(guiderail(lab, *words, "--json"))["episodes"] == 2
+    command = ("evaluate", "lab_policies.py:ahead", "--task", "peglab/Slot", "--episodes", "2", "--baselines", "none")
+    assert json.loads(guiderail(lab, *command, "--json"))["episodes"] == 2
 
 
-def test_it_is_replayed(lab, trained):
+def test_visualize_writes_the_page_of_a_run(lab, run_folder):
     guiderail(lab, "visualize", "run", "--episodes", "1", "--html", "page.html")
     assert "peglab/Slot" in (lab.folder / "page.html").read_text()
 
 
-def test_it_is_studied(lab, trained):
+def test_study_of_the_task_writes_its_results(lab):
     (lab.folder / "study.yaml").write_text(
         """
 name: slot
@@ -178,7 +183,7 @@ eval_set:
     assert list((lab.folder / "study").glob("*.csv"))
 
 
-def test_learned_skill_is_a_plain_diagram(lab, trained):
+def test_policy_of_a_run_is_simulated_in_a_diagram(lab, run_folder):
     code = (
         "from pathlib import Path; import numpy as np; from pydrake.systems.analysis import Simulator\n"
         "from guiderail import make_skill; from guiderail.models.policy import Policy\n"
@@ -191,15 +196,15 @@ def test_learned_skill_is_a_plain_diagram(lab, trained):
 
 
 def test_task_in_a_file_works_without_installation(lab):
-    (lab.folder / "mine.py").write_text(
+    (lab.folder / "local_task.py").write_text(
         "from guiderail import register_task\n"
         "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
-        "@register_task('mine/Passage')\nclass Mine(NarrowPassage):\n    num_steps = 40\n"
+        "@register_task('local/Passage')\nclass LocalPassage(NarrowPassage):\n    num_steps = 40\n"
     )
     guiderail(
-        lab, "train", "mine/Passage", "--import", "mine.py", "--episodes", "2", "--guidance", "kgrl",
-        "--algorithm", "peglab_hill_climbing", "--out", "mine", "--no-pictures",
+        lab, "train", "local/Passage", "--import", "local_task.py", "--episodes", "2", "--guidance", "kgrl",
+        "--algorithm", "peglab_hill_climbing", "--out", "local", "--no-pictures",
     )  # fmt: skip
-    # The run remembers what it needs, and imports it if that is trusted.
-    words = ("evaluate", "mine", "--episodes", "2", "--trust-imports", "--baselines", "none", "--json")
-    assert json.loads(guiderail(lab, *words))["episodes"] == 2
+    # The run stores the name of the file, and `--trust-imports` permits its import.
+    command = ("evaluate", "local", "--episodes", "2", "--trust-imports", "--baselines", "none", "--json")
+    assert json.loads(guiderail(lab, *command))["episodes"] == 2

@@ -5,7 +5,7 @@ from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 from guiderail.systems.support.drake_multibody import JointDynamics
 
 
-def test_damping_acts_on_its_joint_if_joints_are_declared_from_the_tool_on():
+def test_damping_acts_on_its_joint_in_any_order_of_declaration():
     plant = MultibodyPlant(0.0)
     upper, lower = (plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(1.0, 0.1)) for name in "ab")
     joints = [

@@ -10,7 +10,7 @@ def system():
     return LeafSystem()
 
 
-def test_signals_of_one_name_share_a_port_in_order(system):
+def test_signals_of_equal_name_share_a_port(system):
     signals = SignalPorts(system, {"pose": 2, "force": 1}, {"force": 1, "action": 3})
     names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
     assert names == ["pose", "force", "action"]
@@ -26,13 +26,13 @@ def test_eval_returns_all_signals_by_name(system):
     assert {name: value.tolist() for name, value in signals.eval(context).items()} == {"pose": [1, 2], "force": [3]}
 
 
-def test_signal_is_refused_when_it_has_two_sizes(system):
+def test_signal_is_refused_when_its_sizes_differ(system):
     with pytest.raises(InputError, match="'pose' can't be of size 2 and 6"):
         SignalPorts(system, {"pose": 2}, {"pose": 6})
 
 
 @pytest.mark.parametrize(("signals", "words"), [({"pose": 0}, "'pose'"), ({"": 1}, "needs a name, not ''")])
-def test_signal_is_refused_when_its_size_is_zero_or_its_name_empty(signals, words, system):
+def test_signal_is_refused_when_size_is_zero_or_name_is_empty(signals, words, system):
     with pytest.raises(InputError, match=words):
         SignalPorts(system, signals)
 

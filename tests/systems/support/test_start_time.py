@@ -1,4 +1,4 @@
-"""Systems that update at the end of a step behave alike for every start time that is a multiple of the period."""
+"""Outputs of systems with updates at control instants are the same for each start time on a multiple of the period."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def command_filter():
     return systems.CommandFilter(BarrierFilter(KeepOut(np.zeros((0, 1)), np.zeros((0, 1)), BOX, 0.0), 0.5), PERIOD)
 
 
-def monitor():
+def episode_monitor():
     return systems.EpisodeMonitor([systems.TerminationTerm("success", {"x": 1}, lambda x: True, steps=3)], PERIOD)
 
 
@@ -37,12 +37,18 @@ CASES = {
     ),
     "chunk limiter": (chunk_limiter, {"chunk": np.full(8, 0.5), "pose": [0.0]}),
     "disturbance": (lambda: systems.CommandDisturbance(1, PERIOD, 0.0, 2), {"command": [1.0], "pose": [0.0]}),
-    "monitor": (monitor, {"x": [1.0]}),
+    "monitor": (episode_monitor, {"x": [1.0]}),
 }
 
 
 def run(make, inputs, start):
-    """Return the first output at initialization and in the middle of the control steps from `start` on."""
+    """Return the first output at the initialization at time `start` and in the middle of six control steps.
+
+    Args:
+        make: Function that returns the system.
+        inputs: Values of the input ports by name.
+        start: Start time [s].
+    """
     system = make()
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
@@ -59,7 +65,7 @@ def run(make, inputs, start):
 
 @pytest.mark.parametrize("steps", [1, 29, 50, 43210])
 @pytest.mark.parametrize("case", CASES)
-def test_start_at_a_multiple_of_the_period_is_a_start_at_zero(case, steps):
+def test_outputs_are_the_same_when_the_start_time_is_not_zero(case, steps):
     expected = run(*CASES[case], 0.0)
     assert len(np.unique(expected, axis=0)) > 1
     np.testing.assert_allclose(run(*CASES[case], steps * PERIOD), expected, rtol=0.0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Package of a lab: task, guidance, kernel, a learner with its own settings, and an environment without guiderail."""
+"""Package of a lab with a task, guidance, a kernel, a learner with settings, and an environment without guiderail."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,12 +19,12 @@ NUM_STEPS, PERIOD = 80, 0.02
 class SlotOptions(gr.Options):
     """Options of the slot."""
 
-    width: float = Field(0.14, ge=0.05, le=0.3, description="of the slot [m]")
+    width: float = Field(0.14, ge=0.05, le=0.3, description="width of the slot [m]")
 
 
 @gr.register_task("peglab/Slot")
 class Slot(gr.Task):
-    """Task of passing a slot to a goal that the demonstrations do not reach."""
+    """Task of moving through a slot to a goal that the reference trajectory does not reach."""
 
     workcell_kind = "plane"
     Options = SlotOptions
@@ -67,7 +67,7 @@ class Slot(gr.Task):
 
 
 class OffsetOptions(gr.Options):
-    """Options of the guidance."""
+    """Options of the guidance `peglab_offset`."""
 
     reach: float = Field(0.05, gt=0, description="distance from the measured pose that an action of 1 commands [m]")
 
@@ -80,7 +80,7 @@ def offset(prior: gr.PriorKnowledge) -> gr.Guidance:
 
 
 class RationalQuadratic:
-    """k(ζ, ζ') = 1 / (1 + ‖ζ − ζ'‖² / (2 a ℓ²))ᵃ."""
+    """Rational quadratic kernel k(ζ, ζ') = (1 + ‖ζ − ζ'‖² / (2 a ℓ²))⁻ᵃ."""
 
     stationary = True
 
@@ -94,20 +94,21 @@ class RationalQuadratic:
 
 
 class Reach(gymnasium.Env):
-    """Environment that uses nothing of guiderail: the action moves a point to the origin."""
+    """Environment without guiderail, in which the action moves a point to the origin."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,))
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, dict[str, Any]]:
         super().reset(seed=seed)
-        self.point, self.left = self.np_random.uniform(-1, 1, 2), 10
+        self.point, self.steps = self.np_random.uniform(-1, 1, 2), 0
         return self.point.astype(np.float32), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        self.point, self.left = self.point + 0.3 * np.clip(action, -1, 1), self.left - 1
+        self.point, self.steps = self.point + 0.3 * np.clip(action, -1, 1), self.steps + 1
         distance = float(np.linalg.norm(self.point))
-        return self.point.astype(np.float32), -distance, distance < 0.1, not self.left, {"success": distance < 0.1}
+        is_success = bool(distance < 0.1)
+        return self.point.astype(np.float32), -distance, is_success, self.steps == 10, {"success": is_success}
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class HillClimbingConfig(gr.LearnerConfig):
 
 @gr.register_learner("peglab_hill_climbing")
 class HillClimbing(gr.Learner):
-    """Hill climbing: keep the best linear policy so far, and try a neighbor of it in each episode."""
+    """Hill climbing: each episode tests a random change of the best linear policy so far."""
 
     Config = HillClimbingConfig
 
@@ -125,21 +126,21 @@ class HillClimbing(gr.Learner):
         self.config, self.space = config, env.action_space
         self.rng = np.random.default_rng(seed)
         self.best = np.zeros((self.space.shape[0], env.observation_space.shape[0] + 1))
-        self.score, self.tried, self.total = -np.inf, self.best, 0.0
+        self.score, self.candidate, self.total = -np.inf, self.best, 0.0
 
     def on_episode_start(self) -> None:
-        self.tried = self.best + self.config.deviation * self.rng.standard_normal(self.best.shape)
+        self.candidate = self.best + self.config.deviation * self.rng.standard_normal(self.best.shape)
         self.total = 0.0
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        return np.tanh(self.tried @ np.append(observation, 1.0)).astype(np.float32)
+        return np.tanh(self.candidate @ np.append(observation, 1.0)).astype(np.float32)
 
     def on_step(self, transition: gr.Transition) -> None:
         self.total += transition.reward
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         if self.total > self.score:
-            self.best, self.score = self.tried, self.total
+            self.best, self.score = self.candidate, self.total
         return {}
 
     def policy(self, description: Mapping[str, Any]) -> gr.Policy:

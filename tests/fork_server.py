@@ -1,8 +1,8 @@
-"""Run programs in forks of one interpreter that has imported the common packages.
+"""Server that runs programs in forks of one interpreter, after the imports of the common packages.
 
-Protocol: one line of JSON in, one out. In: `arguments` of an interpreter (`-c`, code and arguments, or a file and
-arguments), the working `folder`, and changes of the `environment`. Out: `returncode`, `stdout` and `stderr`. A fork has
-its own memory and exit code, and nothing that another program registered.
+Each request is one line of JSON: `arguments` of an interpreter (`-c`, code and arguments, or a file and arguments), the
+working `folder`, and changes of the `environment`. Each response is one line of JSON: `returncode`, `stdout` and
+`stderr`. Programs share no memory, and what a program registers is unknown to the next program.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ import traceback
 from multiprocessing import forkserver, resource_tracker, util
 from typing import TextIO
 
-# Slow imports of other packages; none of guiderail's registries.
+# Packages that take long to import. Modules of guiderail are not preloaded, because imports fill its registries.
 PRELOADED = (
     "pydrake.all", "torch", "stable_baselines3", "sb3_contrib", "gymnasium", "sklearn.mixture", "scipy.stats",
     "scipy.signal", "pandas", "pyarrow.parquet", "pydantic", "typer", "rich.progress", "jinja2", "safetensors.torch",
@@ -26,7 +26,7 @@ PRELOADED = (
 
 
 class Forks:
-    """Server that runs programs in forks of this process."""
+    """Connection to a server process that runs programs in forks of this process."""
 
     def __init__(self) -> None:
         parent_end, child_end = socket.socketpair()
@@ -40,11 +40,11 @@ class Forks:
         parent_end.close()
 
     def run(self, *arguments: object, folder: object = ".", **environment: str) -> subprocess.CompletedProcess:
-        """Run an interpreter with these arguments, as `subprocess.run`."""
-        words = [str(argument) for argument in arguments]
-        print(json.dumps({"arguments": words, "folder": str(folder), "environment": environment}), file=self._requests)
+        """Run an interpreter with these arguments in `folder`; return the result as `subprocess.run` does."""
+        texts = [str(argument) for argument in arguments]
+        print(json.dumps({"arguments": texts, "folder": str(folder), "environment": environment}), file=self._requests)
         self._requests.flush()
-        return subprocess.CompletedProcess(words, **json.loads(self._responses.readline()))
+        return subprocess.CompletedProcess(texts, **json.loads(self._responses.readline()))
 
     def close(self) -> None:
         """Stop the server."""
@@ -52,15 +52,15 @@ class Forks:
         os.waitpid(self._server, 0)
 
 
-def begin_forkserver() -> None:
+def start_forkserver() -> None:
     """Start the fork server of multiprocessing as a fork of this process instead of as a new interpreter."""
 
-    def begin(path: bytes, arguments: list[str], kept: list[int]) -> int:
-        if number := os.fork():
-            return number
-        # The server ends with its parent, which alone may hold the other end of this pipe.
-        pipe = os.fstat(kept[-1])
-        for descriptor in set(range(3, 1024)) - set(kept):
+    def spawn(path: bytes, arguments: list[str], inherited: list[int]) -> int:
+        if pid := os.fork():
+            return pid
+        # The server ends when the writing end of this pipe is closed, so only the parent may have that end open.
+        pipe = os.fstat(inherited[-1])
+        for descriptor in set(range(3, 1024)) - set(inherited):
             with contextlib.suppress(OSError):
                 if os.path.samestat(os.fstat(descriptor), pipe):
                     os.close(descriptor)
@@ -70,16 +70,24 @@ def begin_forkserver() -> None:
             os._exit(0)
 
     resource_tracker.ensure_running()
-    original, util.spawnv_passfds = util.spawnv_passfds, begin
+    original, util.spawnv_passfds = util.spawnv_passfds, spawn
     try:
         forkserver.ensure_running()
     finally:
         util.spawnv_passfds = original
 
 
-def child(arguments: list[str], folder: str, environment: dict[str, str], out: int, err: int) -> None:
-    """Run the program in this process; never returns."""
-    forkserver._forkserver._forkserver_pid = None  # a child of another process
+def run_program(arguments: list[str], folder: str, environment: dict[str, str], out: int, err: int) -> None:
+    """Run the program in this process and end the process.
+
+    Args:
+        arguments: Arguments of an interpreter.
+        folder: Working directory.
+        environment: Changes of the environment variables.
+        out: File descriptor of the standard output.
+        err: File descriptor of the standard error.
+    """
+    forkserver._forkserver._forkserver_pid = None  # that fork server is no child of this process
     os.dup2(out, 1)
     os.dup2(err, 2)
     sys.stdout, sys.stderr = (open(number, "w", closefd=False) for number in (1, 2))  # noqa: SIM115
@@ -104,20 +112,20 @@ def child(arguments: list[str], folder: str, environment: dict[str, str], out: i
 
 
 def serve(requests: TextIO, responses: TextIO) -> None:
-    """Serve requests until the input ends."""
+    """Run one program per request, one after the other, until the requests end."""
     for line in requests:
         program = json.loads(line)
         with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
-            if (number := os.fork()) == 0:
-                child(**program, out=out.fileno(), err=err.fileno())
-            returncode = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+            if (pid := os.fork()) == 0:
+                run_program(**program, out=out.fileno(), err=err.fileno())
+            returncode = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
             out.seek(0), err.seek(0)
             result = {"returncode": returncode, "stdout": out.read(), "stderr": err.read()}
             print(json.dumps(result), file=responses, flush=True)
 
 
 def main() -> None:
-    """Serve the process that started this interpreter."""
+    """Import the common packages, print "ready", and serve requests from the standard input."""
     for name in PRELOADED:
         __import__(name)
     print("ready", flush=True)
