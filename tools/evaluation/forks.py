@@ -178,7 +178,7 @@ def _serve(
             try:
                 answer = pickle.dumps((None, error, text))
                 pickle.loads(answer)
-            except Exception:
+            except Exception:  # not every exception can be pickled; its text is sent instead
                 answer = pickle.dumps((None, RuntimeError(f"{type(error).__name__}: {error}"), text))
         connection.send_bytes(answer)
 
