@@ -3,6 +3,9 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUTSIDE := .venv-outside
+# Distributions of this repository, installed together: the core and its siblings require each other.
+SIBLINGS := hardware parts studies data lerobot mujoco
+EDITABLE := $(SIBLINGS:%=-e packages/%)
 # Meshcat and LCM use this machine's network only.
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
@@ -24,7 +27,7 @@ test: $(VENV)/.ready lint  ## lint and all tests
 lint: $(VENV)/.ready  ## ruff and mypy
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p guiderail
+	$(BIN)/mypy -p guiderail $(SIBLINGS:%=-p guiderail_%)
 
 # Nothing is downloaded. Code in pages is run, the reference is generated, and warnings and broken links are errors.
 docs: $(VENV)/.docs  ## build the documentation into docs/_build/html
@@ -75,15 +78,15 @@ adversary: $(VENV)/.ready  ## obstacles, limits of motion and of joints against 
 
 fci:  ## run a Franka on the simulator of its protocol, minutes
 	$(PYTHON) -m venv .venv-fci
-	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[fci,mujoco]" franky-sim
+	.venv-fci/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn]" -e "packages/hardware[fci]" -e packages/mujoco franky-sim
 	.venv-fci/bin/python tests/harness/fci/simulated_franka.py
 
 lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its own, minutes (downloads 4 GB)
 	python3.12 -m venv .venv-lerobot
-	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e . -e integrations/lerobot_robot_guiderail \
+	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e . -e packages/lerobot \
 	  "lerobot[core-scripts]" pytest
 	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
-	  integrations/lerobot_robot_guiderail/tests
+	  packages/lerobot/tests/plugin
 
 motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, minutes
 	$(BIN)/python tests/harness/motion_limits.py
@@ -118,8 +121,8 @@ $(OUTSIDE)/.ready: pyproject.toml research/outside_envs/requirements.txt
 	touch $@
 
 # Bytecode is compiled separately: pip uses one core and compiles the tests of packages, too.
-$(VENV)/.ready: pyproject.toml setup.py constraints.txt
+$(VENV)/.ready: pyproject.toml setup.py constraints.txt $(SIBLINGS:%=packages/%/pyproject.toml)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]"
+	$(BIN)/python -m pip install -qq --disable-pip-version-check --no-compile -c constraints.txt -e ".[dev]" $(EDITABLE)
 	$(BIN)/python -m compileall -qq -j 0 -x '/tests?/' $(VENV)/lib || true  # some packages contain templates that are not Python
 	touch $@

@@ -28,9 +28,9 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, 
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import PolicyFn, rollout
 from guiderail.tools.learning.train import start_or_resume
-from guiderail.tools.parts.create_task import create_task
 from guiderail.tools.visualization.camera import path_in_picture
 from guiderail.tools.visualization.curves import draw_passage
+from guiderail_parts.create_task import create_task
 
 HERE = Path(__file__).parent
 FOLDER = HERE / "pictures"

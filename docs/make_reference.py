@@ -558,7 +558,7 @@ def workcells() -> str:
 
 def studies() -> str:
     """Return the page of study files."""
-    from guiderail.tools.experiments import declaration
+    from guiderail_studies import declaration
 
     page = (
         "# Study files\n\n`guiderail study FILE --out D` runs methods × seeds × numbers of episodes × evaluation sets. "

@@ -215,9 +215,7 @@ def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) ->
 
 BasePolicy = Callable[[np.ndarray], Any]
 
-BASE_POLICIES: Registry[BasePolicy] = Registry(
-    "base policy", entry_points="guiderail.base_policies", check=check_callable
-)
+BASE_POLICIES: Registry[BasePolicy] = Registry("base policy", plugin="base_policy", check=check_callable)
 register_base_policy = BASE_POLICIES.register
 
 

@@ -21,9 +21,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.models.common.yaml import load_yaml
-from guiderail.tools.certify import certify_skill
 from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.tables import write_table
+from guiderail_studies.certify import certify_skill
 from research.command import Parser, print_result, run_program
 
 SHIPPED = Path(__file__).with_name("certificates.yaml")

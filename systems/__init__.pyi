@@ -4,8 +4,6 @@ from .cartesian_impedance_controller import ImpedanceGains as ImpedanceGains
 from .cartesian_position_controller import CartesianPositionController as CartesianPositionController
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .center_of_pressure import CenterOfPressure as CenterOfPressure
-from .chunk_reference import ChunkReference as ChunkReference
-from .chunk_safety_limiter import ChunkSafetyLimiter as ChunkSafetyLimiter
 from .command_disturbance import CommandDisturbance as CommandDisturbance
 from .command_filter import CommandFilter as CommandFilter
 from .command_watchdog import CommandWatchdog as CommandWatchdog
@@ -18,8 +16,6 @@ from .episode_monitor import TerminationTerm as TerminationTerm
 from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor
 from .external_torque_sensor import JointTorqueErrors as JointTorqueErrors
 from .function_guidance_system import FunctionGuidanceSystem as FunctionGuidanceSystem
-from .gripper_command import GripperCommand as GripperCommand
-from .heartbeat_monitor import HeartbeatMonitor as HeartbeatMonitor
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
 from .image_observation import ImageObservation as ImageObservation
@@ -28,16 +24,9 @@ from .joint_torque_wrench import JointTorqueWrench as JointTorqueWrench
 from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem
 from .mean_force import MeanForce as MeanForce
 from .measured_pose import MeasuredPose as MeasuredPose
-from .meshcat_device import MeshcatDevice as MeshcatDevice
-from .mujoco_gantry import DivergedError as DivergedError
-from .mujoco_gantry import MovedBodies as MovedBodies
-from .mujoco_gantry import MujocoGantry as MujocoGantry
 from .phase_wrench_limit import PhaseWrenchLimit as PhaseWrenchLimit
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
-from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter
-from .pose_publisher import PosePublisher as PosePublisher
-from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
 from .pose_wrench import PoseWrench as PoseWrench
 from .progress_clock import ProgressClock as ProgressClock
 from .recorder import Recorder as Recorder
@@ -51,10 +40,5 @@ from .safety_filter import SafetyFilter as SafetyFilter
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
 from .sensor_disturbance import SensorDisturbance as SensorDisturbance
-from .status_watchdog import StatusWatchdog as StatusWatchdog
-from .torque_publisher import TorquePublisher as TorquePublisher
-from .torque_safety_limiter import ArmState as ArmState
-from .torque_safety_limiter import SafetyLimits as SafetyLimits
-from .torque_safety_limiter import TorqueSafetyLimiter as TorqueSafetyLimiter
 from .wrench_sensor import WrenchSensor as WrenchSensor
 from .wrench_tare import WrenchTare as WrenchTare

@@ -10,28 +10,29 @@ from guiderail.diagrams.envs.options import CommonOptions, PrimitiveOptions, Tem
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
-from guiderail.diagrams.hardware.driver import DRIVERS
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.diagrams.tasks.task import Task
+from guiderail.models.common.plugins import find_plugins
 from guiderail.models.common.registry import Registry
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS, find_end_effector, find_robot
 from guiderail.tools.environments import task_options
-from guiderail.tools.experiments.engines.engine import ENGINES
 from guiderail.tools.learning.learner import LEARNERS
 
 
 def describe_all() -> dict[str, Any]:
-    """Describe all registered tasks, guidance, stations, robots, end effectors, drivers, learners, kernels and engines.
+    """Describe all registered tasks, guidance, stations, robots, end effectors, learners and kernels.
+
+    Installed siblings add their registries, such as drivers and engines.
 
     The descriptions of guidance and stations include ports and options, those of tasks include options. The key
     `options` has the options that all tasks share. Entries of installed packages that cannot be used are left out.
     """
-    registries: dict[str, Registry[Any]] = {"drivers": DRIVERS, "kernels": KERNELS, "engines": ENGINES}
+    registries = {"kernels": KERNELS, **{name: point.load() for name, point in find_plugins("registry")}}
     return {
         "tasks": {name: describe_task(name) for name in TASKS.usable()},
         "guidance": {name: _describe_guidance(name) for name in GUIDANCE.usable()},

@@ -20,6 +20,7 @@ from guiderail.diagrams.envs.options import (
     PrimitiveOptions,
     TemplateOptions,
     check_choice,
+    kernel_from_options,
     validate_options,
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE
@@ -69,12 +70,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
     """
-    folder = getattr(TASKS.get(task), "folder", None) if task in TASKS.names() else None
-    folder_digest = ""
-    if folder is not None:
-        from guiderail.diagrams.tasks.part.file import task_folder_digest  # imports Drake
-
-        folder_digest = task_folder_digest(folder)
+    declared = TASKS.get(task) if task in TASKS.names() else None
+    folder, folder_digest = (None, "") if declared is None else (declared.folder, declared.folder_digest())
     texts = [value for _, value in sorted(environment.items()) if isinstance(value, str)]
     sources = [*imports, *(re.sub(r"\.py:\w+$", ".py", text) for text in texts)]
     paths = [path for path in map(Path, sources) if path.is_absolute() and folder not in (path, *path.parents)]
@@ -181,6 +178,33 @@ def check_reset(task: str, options: Mapping[str, Any]) -> None:
     """Raise an InputError if a reset option of a guiderail task is invalid; other tasks are not checked."""
     if task in TASKS.names():
         validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
+
+
+def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
+    """Return a warning if a task's motion without actions deviates from the demonstrations, otherwise None.
+
+    The motion deviates if less than the fraction `MIN_SHARE` of its steps lies within a standard deviation of the
+    demonstrations. A task without demonstrations has no warning.
+
+    Raises:
+        InputError: For an unknown task or option.
+    """
+    from guiderail.diagrams.envs.config import EnvConfig  # imports Drake, which takes a second
+    from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
+
+    config = EnvConfig.resolve(task, environment)
+    declared = config.make_task()
+    if "demonstrations" not in declared.provides():
+        return None
+    values = config.options
+    chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
+    share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
+    if share >= MIN_SHARE:
+        return None
+    return (
+        f"without actions, {share:.0%} of the steps stay within a standard deviation of the demonstrations: let "
+        "guiderail dataset validate FILE --fit choose length_scale, lambda_ and beta, and give them by --env"
+    )
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:

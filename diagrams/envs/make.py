@@ -36,6 +36,7 @@ from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.plugins import is_sibling_module
 from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
@@ -242,25 +243,15 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
         return None
     try:
         kinds = config.guidance_kind, config.station_kind, _base_policy_key(options.get("base_policy"))
-        files = _folder_digest(task), *map(_digest, options.values())
+        files = task.folder_digest(), *map(_digest, options.values())
         return type(task), *kinds, render_mode, freeze(options), files
     except (TypeError, OSError, InputError):
         return None  # an option is not comparable, or a file of the base policy or the task folder cannot be read
 
 
 def _is_packaged(definition: Any) -> bool:
-    """Return True if a class or a function is defined in this package."""
-    return str(getattr(definition, "__module__", "")).partition(".")[0] == __name__.partition(".")[0]
-
-
-def _folder_digest(task: Task) -> str | None:
-    """Return the digest of a task folder; None if the task has no folder."""
-    folder = getattr(task, "folder", None)
-    if folder is None:
-        return None
-    from guiderail.diagrams.tasks.part.file import task_folder_digest  # other tasks do not need these imports
-
-    return task_folder_digest(folder)
+    """Return True if a class or a function is defined in this package or a sibling distribution."""
+    return is_sibling_module(str(getattr(definition, "__module__", "")))
 
 
 def _digest(option: Any) -> bytes | None:

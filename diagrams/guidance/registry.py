@@ -75,7 +75,7 @@ GUIDANCE: Registry[GuidanceKind] = Registry(
     "guidance",
     package="guiderail.diagrams.guidance",
     decorator="register_guidance",
-    entry_points="guiderail.guidance",
+    plugin="guidance",
     check=_check,
 )
 

@@ -43,9 +43,9 @@ def _check(name: str, kind: object) -> None:
 
 STATIONS: Registry[StationKind] = Registry(
     "station",
-    package=("guiderail.diagrams.stations", "guiderail.diagrams.hardware"),
+    package=("guiderail.diagrams.stations", "guiderail_hardware.drivers"),
     decorator="register_station",
-    entry_points="guiderail.stations",
+    plugin="station",
     check=_check,
 )
 

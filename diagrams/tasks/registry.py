@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.plugins import load_plugin
 from guiderail.models.common.registry import Registry, did_you_mean
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ TASKS: Registry[type[Task]] = Registry(
     "task",
     package="guiderail.diagrams.tasks",
     decorator="register_task",
-    entry_points="guiderail.tasks",
+    plugin="task",
     check=lambda name, task: _check(name, task),
 )
 
@@ -124,22 +125,21 @@ def register_task_folder(folder: str | Path) -> str:
     If a task folder with the same name and content is already registered, it is used instead.
 
     Raises:
-        InputError: If the folder's task is not valid, or another task has its name.
+        InputError: If the folder's task is not valid, another task has its name, or guiderail-parts, which reads
+            task folders, is not installed.
     """
-    from guiderail.diagrams.tasks.part.file import task_folder_digest  # imports Drake
-    from guiderail.diagrams.tasks.part.task import load_task_folder
-
-    task = load_task_folder(Path(folder))
-    registered = TASKS.get(task.file.name) if task.file.name in TASKS.names() else task
-    existing_folder = getattr(registered, "folder", task.folder)
-    if existing_folder != task.folder:
-        if is_task_folder(existing_folder) and task_folder_digest(existing_folder) == task_folder_digest(task.folder):
+    task: type[Task] = load_plugin("task_folder", "part", sibling="parts")(Path(folder))
+    name = task.name
+    registered = TASKS.get(name) if name in TASKS.names() else task
+    existing_folder = registered.folder
+    if existing_folder is not None and existing_folder != task.folder:
+        if is_task_folder(existing_folder) and registered.folder_digest() == task.folder_digest():
             return register_task_folder(existing_folder)
         raise InputError(
-            f"the tasks in {task.folder} and {existing_folder} are both called {task.file.name}: change 'name:' in "
-            "the task.yaml of one of them"
+            f"the tasks in {task.folder} and {existing_folder} are both called {name}: change 'name:' in the "
+            "task.yaml of one of them"
         )
-    register_task(task.file.name)(task)
+    register_task(name)(task)
     return task.name
 
 

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -90,6 +91,7 @@ class Task(ABC):
 
     Attributes:
         name: Name, set by `register_task`.
+        folder: Folder of a task that is read from files; None for any other task.
         workcell_kind: Kind of the workcell; only stations that are registered for it can be used.
         excluded_stations: Names of stations for this kind of workcell that the task cannot use.
         Options: Class of the task's own options, a subclass of `guiderail.Options`.
@@ -122,6 +124,7 @@ class Task(ABC):
     """
 
     name: ClassVar[str] = ""
+    folder: ClassVar[Path | None] = None
     workcell_kind: ClassVar[str] = "insertion"
     excluded_stations: ClassVar[tuple[str, ...]] = ()
     Options: ClassVar[type[option_models.Options]] = option_models.Options
@@ -284,6 +287,11 @@ class Task(ABC):
         Starts given by reset options are not included. Default: the option `start_offset_max`, or 0.
         """
         return float(getattr(self.options, "start_offset_max", 0.0))
+
+    @classmethod
+    def folder_digest(cls) -> str:
+        """Return a digest of the files of `folder`; "" if the task has no folder."""
+        return ""
 
     @classmethod
     def scripted_policies(cls, difficulty: str = option_models.STANDARD) -> Mapping[str, ScriptedPolicy]:

@@ -76,7 +76,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "osqp": {"osqp": "OSQP"},
     "piqp": {"piqp": "PIQP"},
     "mujoco": {"mujoco": "MuJoCo"},
-    "onboard": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
+    "parts": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
     "repair": {"pytetwild": "pytetwild", "pyvista": "PyVista"},
     "bags": {"rosbags": "rosbags"},
     "fci": {"franky": "franky"},
@@ -85,7 +85,10 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "ray": {"ray": "Ray"},
     "onnx": {"onnxruntime": "ONNX Runtime"},
     "wandb": {"wandb": "Weights & Biases"},
+    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot")},
 }
+_SOFTWARE["mujoco"]["guiderail_mujoco"] = "guiderail-mujoco"
+_SOFTWARE["parts"]["guiderail_parts"] = "guiderail-parts"
 EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for module, name in modules.items()}
 """Software and the name of the extra that installs it, by the name of a module."""
 

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, Generic, NamedTuple, TypeVar, overload
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
+from guiderail.models.common.plugins import find_plugins, is_from_sibling
 
 Entry = TypeVar("Entry")
 _LOGGER = logging.getLogger(__name__)
@@ -24,9 +25,10 @@ _NO_VALUE: Any = object()  # default of `register`, because None is refused like
 class Registry(Generic[Entry]):
     """Registry of entries by name.
 
-    Entries have three sources: calls of `register` in the modules of `package`, entry points of the group
-    `entry_points` in installed packages, and calls of `register` in any other imported module. An entry point with the
-    name of an entry of `package` is ignored, with a warning, so that an installed package cannot replace this entry.
+    Entries have three sources: calls of `register` in the modules of `package`, plug-ins of the kind `plugin` in
+    installed packages (see `plugins`), and calls of `register` in any other imported module. Plug-ins of the sibling
+    distributions of guiderail count as entries of `package`. Another plug-in with the name of an entry of `package` is
+    ignored, with a warning, so that an installed package cannot replace this entry.
 
     `get` imports the module of an entry. If `decorator` is given, no module is imported to list the names.
 
@@ -35,7 +37,7 @@ class Registry(Generic[Entry]):
         package: Import name of the package, or of each package, whose modules register entries.
         decorator: Name of the function that registers an entry under its first argument; calls of this function are
             found in the modules' source. Without `decorator`, all modules are imported at the first use.
-        entry_points: Group of the entry points; none by default.
+        plugin: Kind of the plug-ins, such as "task"; none by default.
         check: Function that is called with name and entry before the entry is added, and may raise an `InputError`.
     """
 
@@ -45,12 +47,12 @@ class Registry(Generic[Entry]):
         *,
         package: str | Sequence[str] = (),
         decorator: str | None = None,
-        entry_points: str | None = None,
+        plugin: str | None = None,
         check: Callable[[str, Any], None] = lambda name, value: None,
     ):
         self.noun = noun
         self._packages = (package,) if isinstance(package, str) else tuple(package)
-        self._decorator, self._group, self._check = decorator, entry_points, check
+        self._decorator, self._plugin, self._check = decorator, plugin, check
         self._entries: dict[str, Entry] = {}
         self._origins: dict[str, tuple[str, str]] = {}
         self._loaded: set[str] = set()  # names whose entry points were loaded
@@ -107,15 +109,14 @@ class Registry(Generic[Entry]):
                         self.noun, name, _package_of(point),
                     )  # fmt: skip
                 else:
-                    self._load(point)
+                    self._load(name, point)
             self._loaded.add(name)
         if name not in self._entries:
             raise InputError(f"there is no {self.noun} {brief(name)}: {did_you_mean(name, self.names())}")
         return self._entries[name]
 
-    def _load(self, point: metadata.EntryPoint) -> None:
-        """Load an entry point; raise an InputError if loading fails, or another object is registered under its name."""
-        name = point.name
+    def _load(self, name: str, point: metadata.EntryPoint) -> None:
+        """Load the plug-in of a name; raise an InputError if this fails, or if another object has the name."""
         try:
             with naming_failures(f"importing {point.value}"):
                 value = point.load()
@@ -150,12 +151,12 @@ class Registry(Generic[Entry]):
     def name_of(self, value: object) -> str | None:
         """Return the name under which an object is registered, or that of its entry point; None if there is neither."""
         declared = f"{getattr(value, '__module__', '')}:{getattr(value, '__qualname__', '')}"
-        points = (point for points in self._points.values() for point in points)
+        points = ((name, point) for name, points in self._points.items() for point in points)
         names = (name for name, entry in self._entries.items() if entry is value)
-        return next(names, next((point.name for point in points if point.value == declared), None))
+        return next(names, next((name for name, point in points if point.value == declared), None))
 
     def is_packaged(self, name: str) -> bool:
-        """Return True if a module of the package registers the name."""
+        """Return True if a module of the package, or of a sibling distribution, registers the name."""
         return name in self._declarations
 
     def declared(self, name: str, keyword: str) -> Any:
@@ -188,6 +189,8 @@ class Registry(Generic[Entry]):
             values = {id(value): module for module in files for value in vars(import_module(module)).values()}
             entries = self._entries.items()
             return {name: _Declaration(values[id(entry)], {}) for name, entry in entries if id(entry) in values}
+        modules = {point.module for _, point in self._plugins if is_from_sibling(point)}
+        files |= {module: Path(file) for module in modules if (file := _file(module)) is not None}
         return {
             name: _Declaration(module, values)
             for module, file in files.items()
@@ -196,11 +199,17 @@ class Registry(Generic[Entry]):
 
     @cached_property
     def _points(self) -> dict[str, list[metadata.EntryPoint]]:
-        """Entry points by name, without duplicates of the same value."""
+        """Entry points by name, without those of siblings and without duplicates of the same value."""
         points: dict[str, dict[str, metadata.EntryPoint]] = {}
-        for point in metadata.entry_points(group=self._group) if self._group else ():
-            points.setdefault(point.name, {}).setdefault(point.value, point)
+        for name, point in self._plugins:
+            if self._decorator is None or not is_from_sibling(point):
+                points.setdefault(name, {}).setdefault(point.value, point)
         return {name: list(by_value.values()) for name, by_value in points.items()}
+
+    @cached_property
+    def _plugins(self) -> list[tuple[str, metadata.EntryPoint]]:
+        """Name and entry point of every plug-in of this registry's kind."""
+        return [] if self._plugin is None else list(find_plugins(self._plugin))
 
 
 class _Declaration(NamedTuple):

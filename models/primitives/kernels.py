@@ -25,7 +25,7 @@ class Kernel(Protocol):
 
 
 KERNELS: Registry[Callable[..., Kernel]] = Registry(
-    "kernel", package=__package__, decorator="register_kernel", entry_points="guiderail.kernels", check=check_callable
+    "kernel", package=__package__, decorator="register_kernel", plugin="kernel", check=check_callable
 )
 """Registry of kernels; the names are the values of an environment's option `kernel`.
 

@@ -155,13 +155,11 @@ def _check_end_effector(name: str, end_effector: object) -> None:
         raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")
 
 
-ROBOTS: Registry[Robot] = Registry(
-    "robot", package="guiderail.models.robots", entry_points="guiderail.robots", check=_check_robot
-)
+ROBOTS: Registry[Robot] = Registry("robot", package="guiderail.models.robots", plugin="robot", check=_check_robot)
 END_EFFECTORS: Registry[EndEffector] = Registry(
     "end effector",
     package="guiderail.models.robots",
-    entry_points="guiderail.end_effectors",
+    plugin="end_effector",
     check=_check_end_effector,
 )
 robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names

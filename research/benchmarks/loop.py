@@ -21,13 +21,13 @@ from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.lcm import IiwaDriver
-from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.policy import FORMAT, Policy
+from guiderail_hardware.drivers.clock import set_realtime_priority
+from guiderail_hardware.drivers.lcm import IiwaDriver
+from guiderail_hardware.drivers.lcm_simulated import SimulatedIiwa
+from guiderail_hardware.station import HardwareStation
 from research.benchmarks import with_progress
 
 TASK, ACTION_REPEAT = "BncConnector", 10

@@ -15,10 +15,10 @@ from guiderail.diagrams.tasks.pouring.task import APPROACH, NEAR, NEAR_BONUS, TE
 from guiderail.models.templates.drawing import draw, state_lines
 from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.environments import make_environment
-from guiderail.tools.experiments.job import Job
-from guiderail.tools.experiments.study import ratio, run_study
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import draw_runs, legend, new_figure
+from guiderail_studies.job import Job
+from guiderail_studies.study import ratio, run_study
 from research.figures.runs import (
     episodes_of,
     figure_study,

@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from guiderail.tools.experiments.declaration import LearnerChoice, Method, Study, load_study
-from guiderail.tools.experiments.study import each
 from guiderail.tools.learning.config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import color, draw_runs, label, legend, new_figure, save_figure
+from guiderail_studies.declaration import LearnerChoice, Method, Study, load_study
+from guiderail_studies.study import each
 from research.studies import study_path
 
 

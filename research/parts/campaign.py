@@ -16,9 +16,9 @@ import pandas as pd
 import yaml
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.isolation import IsolatedError, run_isolated
-from guiderail.models.parts.assembly_check import MAX_SHRINK, OverlapError
-from guiderail.tools.parts.create_task import create_task
+from guiderail_parts.create_task import create_task
+from guiderail_parts.geometry.assembly_check import MAX_SHRINK, OverlapError
+from guiderail_parts.isolation import IsolatedError, run_isolated
 from research.parts.pairs import Pair
 
 COMMAND = (sys.executable, "-m", "guiderail")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.parts.mesh_file import ENDINGS
+from guiderail_parts.geometry.mesh_file import ENDINGS
 
 _INDUSTREAL, _FACTORY = "industreal_", "factory_"
 _SIZES = (4, 8, 12, 16)

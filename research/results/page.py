@@ -12,12 +12,12 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.experiments.declaration import LEARNED, Study, load_study
-from guiderail.tools.experiments.job import Job
-from guiderail.tools.experiments.study import BREAKING_SUCCESS, curve, draw_sweeps, each, format_breaking_point
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
 from guiderail.tools.tables import cell, read_table, table_text
+from guiderail_studies.declaration import LEARNED, Study, load_study
+from guiderail_studies.job import Job
+from guiderail_studies.study import BREAKING_SUCCESS, curve, draw_sweeps, each, format_breaking_point
 from research.figures import FIGURES, figure_command
 from research.figures.thesis import THESIS
 from research.results.methods import span, task_table

@@ -118,13 +118,13 @@ def test_reference_has_no_local_path(reference):
 def test_robot_page_has_the_limits_of_the_code():
     import numpy as np
 
-    from guiderail.diagrams.hardware.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
-    from guiderail.diagrams.hardware.station import HardwareStation
     from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
     from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
-    from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES
-    from guiderail.tools.hardware.sim_driver import START
+    from guiderail_hardware.drivers.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE
+    from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES
+    from guiderail_hardware.robot.sim_driver import START
+    from guiderail_hardware.station import HardwareStation
 
     page = (DOCS / "robot.md").read_text(encoding="utf-8").partition("\n## Limits\n")[2].partition("\n## ")[0]
     rows = {row[0]: row[1] for row in re.findall(r"^\| ([^|]+) \| ([^|]+) \|", page, re.MULTILINE)}

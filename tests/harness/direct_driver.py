@@ -3,11 +3,11 @@
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.driver import Driver
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.joint_status import JointStatus
+from guiderail_hardware.drivers.driver import Driver
+from guiderail_hardware.models.joint_status import JointStatus
+from guiderail_hardware.station import HardwareStation
 
 START = np.array([0.0, 0.0, 0.02, np.pi / 2, 0.0, 0.0])
 

@@ -25,9 +25,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-
-sys.path[:0] = [str(Path(__file__).parents[1])]  # point_env and oracles, as pytest's `pythonpath`
-from oracles.parts import square_peg
 from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
 
 import guiderail
@@ -36,6 +33,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import robot_names
+from oracles.parts import square_peg
 
 STEPS = 60  # largest number of environment steps of an episode
 INFO = ("constraint_violation", "measured_violation", "contact_force", "fallback")
@@ -191,7 +189,7 @@ def _train(algorithm: str, settings: dict[str, Any], out: Path) -> guiderail.Run
 def make_part(folder: Path) -> str:
     """Create the task folder of a square peg from two mesh files; return the name of its task."""
     from guiderail.diagrams.tasks.registry import register_task_folder
-    from guiderail.tools.parts.create_task import create_task
+    from guiderail_parts.create_task import create_task
 
     plug, socket = square_peg().write(folder)
     create_task(plug, socket, folder / "square_peg", unit="mm", hard_episodes=0)

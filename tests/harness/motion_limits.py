@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # this file runs as a script
 
-from guiderail.diagrams.hardware.fci import FciDriver
-from guiderail.diagrams.hardware.rtde import UR_MOTION_LIMITS
 from guiderail.models.control.motion_constraints import MotionLimits
-from guiderail.systems.pose_motion_limiter import PoseMotionLimiter
+from guiderail_hardware.drivers.fci import FciDriver
+from guiderail_hardware.drivers.rtde import UR_MOTION_LIMITS
+from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from oracles.franka import FRANKA_LIMITS
 
 START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])

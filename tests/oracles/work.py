@@ -6,7 +6,7 @@ import sys
 import time
 from pathlib import Path
 
-from guiderail.tools.experiments.engines.engine import Outcome
+from guiderail_studies.engines.engine import Outcome
 
 
 def work(job):

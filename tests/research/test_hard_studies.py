@@ -5,8 +5,8 @@ import pytest
 
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR
 from guiderail.diagrams.tasks.pouring.task import POSITION_SCALE, scripted_pour_aimed, scripted_pour_blind
-from guiderail.tools.experiments.declaration import LEARNED, load_study
-from guiderail.tools.experiments.job import Job
+from guiderail_studies.declaration import LEARNED, load_study
+from guiderail_studies.job import Job
 from research.studies import study_path
 
 HARD = (

@@ -23,16 +23,16 @@ from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort,
 import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.control.command_filters import BarrierFilter
-from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
+from guiderail_hardware.models.joint_status import StatusLimits
+from guiderail_lerobot.chunk_guard import ChunkGuard
+from guiderail_mujoco.station import MujocoStation
 from oracles.franka import FRANKA_LIMITS
 
 FOLDER = Path(guiderail.systems.__file__).parent

@@ -8,9 +8,9 @@ from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
 
 from guiderail import systems
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import StatusLimits
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
 from guiderail.models.templates import load_template
+from guiderail_hardware.models.joint_status import StatusLimits
 
 PERIOD = 0.02
 HOLE = {"hole": RigidTransform()}

@@ -7,9 +7,9 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage, reference_trajectory
-from guiderail.models.certificate.adversary import Adversary
 from guiderail.models.common.errors import InputError
-from guiderail.tools.certify import _declared_start, _find_subject, certify_skill, verify_certificate
+from guiderail_studies.certificate.adversary import Adversary
+from guiderail_studies.certify import _declared_start, _find_subject, certify_skill, verify_certificate
 
 COARSE = {"control_period": 0.05}  # 160 steps instead of 400: a certificate takes a third of the time
 
@@ -29,7 +29,7 @@ def test_certify_skill_writes_an_accepted_certificate(tmp_path):
 
 
 def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatch):
-    monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 800)
+    monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 800)
     key = tmp_path / "key"
     key.write_bytes(bytes(range(32)))
     environment, folder = COARSE | {"guidance": "skgrl"}, tmp_path / "certificate"
@@ -37,14 +37,14 @@ def test_verification_compares_a_certificate_with_its_skill(tmp_path, monkeypatc
     assert verify_certificate("NarrowPassage", environment, folder, key=key)["checker"] == "yes"
     key.write_bytes(bytes(32))
     assert "signature is missing" in verify_certificate("NarrowPassage", environment, folder, key=key)["checker"]
-    monkeypatch.setattr("guiderail.tools.certify._run_checker", lambda *_: "yes")  # the checker takes seconds
+    monkeypatch.setattr("guiderail_studies.certify._run_checker", lambda *_: "yes")  # the checker takes seconds
     for name, value in {"action_scale": 2.0, "guidance": "kgrl"}.items():
         verdict = verify_certificate("NarrowPassage", environment | {name: value}, folder)["checker"]
         assert verdict == f"no: the certificate's {name} is not that of NarrowPassage"
     assert "'s start_within" in verify_certificate("NarrowPassage", environment, folder, start_within=0.5)["checker"]
     for excess in (9.0, np.nan):
         needed = SimpleNamespace(excess=np.full((2, 2), excess), residue=np.zeros((2, 2)))
-        monkeypatch.setattr("guiderail.tools.certify._search_budget", lambda loop, needed=needed: needed)
+        monkeypatch.setattr("guiderail_studies.certify._search_budget", lambda loop, needed=needed: needed)
         assert "'s budget of excess" in verify_certificate("NarrowPassage", environment, folder)["checker"]
     with pytest.raises(InputError, match="name the folder of a certificate"):
         verify_certificate("NarrowPassage", environment, tmp_path)
@@ -103,7 +103,7 @@ def test_certify_skill_refuses_invalid_arguments(arguments, message, tmp_path):
 )
 def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty, clipped_seeds):
     """Robot and history of sKGRL begin with an offset from the demonstrations."""
-    monkeypatch.setattr("guiderail.tools.certify.SEARCH_STEPS", 10_000)
+    monkeypatch.setattr("guiderail_studies.certify.SEARCH_STEPS", 10_000)
     environment = COARSE | {"guidance": "skgrl", "difficulty": difficulty}
     result = certify_skill("NarrowPassage", environment, out=tmp_path)
     assert result["checker"] == "yes"

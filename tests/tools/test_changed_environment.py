@@ -5,17 +5,17 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.certify import _find_subject
 from guiderail.tools.environments import changed_environment, check_environment, make_environment
 from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.policies import check_compatible
-from guiderail.tools.evaluation.robustness import robustness
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.experiments.declaration import Study
-from guiderail.tools.experiments.job import Job, run_job
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure
-from guiderail.tools.visualization.report_data import command
+from guiderail_studies.certify import _find_subject
+from guiderail_studies.declaration import Study
+from guiderail_studies.job import Job, run_job
+from guiderail_studies.report_data import command
+from guiderail_studies.robustness import robustness
 
 HARD = {"difficulty": "hard"}
 

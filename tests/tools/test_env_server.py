@@ -11,7 +11,7 @@ import pytest
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
-from guiderail.tools.env_server import MAX_LINE, EnvServer, open_environment, serve
+from guiderail_lerobot.env_server import MAX_LINE, EnvServer, open_environment, serve
 
 OPTIONS = {"guidance": "kgrl", "action_repeat": 20}
 

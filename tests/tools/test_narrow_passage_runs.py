@@ -11,7 +11,6 @@ from safetensors.numpy import load_file
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.datasets.validate import validate_demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.subject import EpisodeSpec
@@ -20,6 +19,7 @@ from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.visualization import camera
 from guiderail.tools.visualization.replay import default_page, tube, write_page
+from guiderail_data.validate import validate_demonstrations
 
 SETTINGS = {"net_arch": "32", "batch_size": 16, "gradient_steps": 1, "learning_starts": 40}
 

@@ -21,11 +21,11 @@ from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 from guiderail.tools.catalog import describe_task_options
-from guiderail.tools.datasets.validate import validate_template
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.train import train
+from guiderail_data.validate import validate_template
 from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10

@@ -6,7 +6,6 @@ from pydantic.dataclasses import dataclass
 import guiderail
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.guidance.registry import GUIDANCE, default_guidance, register_guidance
-from guiderail.diagrams.hardware.driver import DRIVERS, Driver, register_driver
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.registry import STATIONS, register_station
 from guiderail.diagrams.stations.station import Station
@@ -15,8 +14,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import BASE_POLICIES, register_base_policy
 from guiderail.models.primitives.kernels import KERNELS, register_kernel
 from guiderail.models.robots.robot import register_end_effector, register_robot
-from guiderail.tools.experiments.engines.engine import ENGINES, make_engine, register_engine
 from guiderail.tools.learning.learner import LEARNERS, register_learner
+from guiderail_hardware.drivers.driver import DRIVERS, Driver, register_driver
+from guiderail_studies.engines.engine import ENGINES, make_engine, register_engine
 
 
 class IncompleteDriver(Driver):

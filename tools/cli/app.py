@@ -8,15 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 import typer.core
 
 from guiderail.models.common.errors import InputError
-
-if TYPE_CHECKING:
-    from guiderail.tools.hardware.connection import RobotConnection
+from guiderail.models.common.plugins import find_plugins
 
 COLUMN = 19  # width of a value in a table with several columns [characters]
 
@@ -78,11 +76,15 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
 app = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
-def _names(module: str, attribute: str) -> Callable[[], list[str]]:
-    """Return a function that lists names: those of a module's registry or collection, or those its function returns."""
+def _names(place: str) -> Callable[[], list[str]]:
+    """Return a function that lists names: those of a registry or collection, or those that a function returns.
+
+    `place` is "module:attribute".
+    """
 
     def list_names() -> list[str]:
-        value = getattr(import_module(f"guiderail.{module}"), attribute)
+        module, _, attribute = place.partition(":")
+        value = getattr(import_module(module), attribute)
         value = getattr(value, "names", value)
         return list(value() if callable(value) else value)
 
@@ -100,21 +102,19 @@ def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
 
 
 REGISTRIES = {
-    "tasks": ("diagrams.tasks.registry", "TASKS"),
-    "guidance": ("diagrams.guidance.registry", "GUIDANCE"),
-    "stations": ("diagrams.stations.registry", "STATIONS"),
-    "robots": ("models.robots.robot", "ROBOTS"),
-    "drivers": ("diagrams.hardware.driver", "DRIVERS"),
-    "kernels": ("models.primitives.kernels", "KERNELS"),
-    "learners": ("tools.learning.learner", "LEARNERS"),
-    "engines": ("tools.experiments.engines.engine", "ENGINES"),
-}
-"""Module and name of each registry that `guiderail list` prints."""
+    "tasks": "guiderail.diagrams.tasks.registry:TASKS",
+    "guidance": "guiderail.diagrams.guidance.registry:GUIDANCE",
+    "stations": "guiderail.diagrams.stations.registry:STATIONS",
+    "robots": "guiderail.models.robots.robot:ROBOTS",
+    "kernels": "guiderail.models.primitives.kernels:KERNELS",
+    "learners": "guiderail.tools.learning.learner:LEARNERS",
+} | {name: point.value for name, point in find_plugins("registry")}
+"""Module and name of each registry that `guiderail list` prints; siblings add theirs as plug-ins of this kind."""
 
 LISTED: dict[str, Callable[[], list[str]]] = {
-    **{key: _names(*place) for key, place in REGISTRIES.items()},
-    "tasks": _names("diagrams.tasks.registry", "known_tasks"),
-    "presets": _names("tools.learning.config", "PRESETS"),
+    **{key: _names(place) for key, place in REGISTRIES.items()},
+    "tasks": _names("guiderail.diagrams.tasks.registry:known_tasks"),
+    "presets": _names("guiderail.tools.learning.config:PRESETS"),
 }
 """Lists that `guiderail list` prints, by name."""
 
@@ -123,20 +123,19 @@ def find_broken(key: str) -> dict[str, str]:
     """Return the unusable entry points of a list in `LISTED`: error message by name."""
     if key not in REGISTRIES:
         return {}
-    module, attribute = REGISTRIES[key]
-    return dict(getattr(import_module(f"guiderail.{module}"), attribute).broken)
+    module, _, attribute = REGISTRIES[key].partition(":")
+    return dict(getattr(import_module(module), attribute).broken)
 
 
 CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
     "rewards": _declared_by_tasks("rewards"),
     "observations": _declared_by_tasks("observations"),
-    "templates": _names("models.templates.schema", "shipped_templates"),
-    "log_formats": _names("tools.learning.learner", "LOG_FORMATS"),
-    "pictures": _names("tools.files", "PICTURES"),
-    "videos": _names("tools.files", "VIDEOS"),
-    "baselines": _names("tools.evaluation.baselines", "BASELINES"),
-    "pretrained": _names("tools.pretrained", "pretrained_names"),
-    "axes": lambda: [axis.name for axis in import_module("guiderail.tools.evaluation.robustness").AXES],
+    "templates": _names("guiderail.models.templates.schema:shipped_templates"),
+    "log_formats": _names("guiderail.tools.learning.learner:LOG_FORMATS"),
+    "pictures": _names("guiderail.tools.files:PICTURES"),
+    "videos": _names("guiderail.tools.files:VIDEOS"),
+    "baselines": _names("guiderail.tools.evaluation.baselines:BASELINES"),
+    "pretrained": _names("guiderail.tools.pretrained:pretrained_names"),
     "listed": lambda: [*LISTED, *LISTED["tasks"]()],
 }
 """Choices that `{name}` in a help text expands to, and that a shell completes."""
@@ -282,28 +281,6 @@ Processes = Annotated[
 ]
 Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
 
-RobotUrl = Annotated[
-    str | None, option("Hardware: LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")
-]
-Driver = Annotated[str | None, option("Hardware: driver fci (Franka) or rtde (UR).  [default: the robot's LCM driver]")]
-Robot = Annotated[
-    str | None, option("Hardware: robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
-]
-Sim = Annotated[bool, option("Hardware: use a simulated driver in a subprocess instead of a robot.", "--sim")]
-Synchronous = Annotated[
-    bool,
-    option("With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"),
-]
-Rate = Annotated[
-    float | None,
-    option(
-        "With --sim, without --synchronous: speed of the simulated robot's clock relative to real time, from 0.001 to "
-        "1.  [default: 0.2]"
-    ),
-]
-Scenario = Annotated[Path | None, option("Hardware: scenario file with the robot, its bus and its surroundings.")]
-Yes = Annotated[bool, option("Hardware: answer all pre-flight questions with yes.", "--yes")]
-
 
 def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
     """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message.
@@ -409,30 +386,7 @@ def is_hardware(station: Any) -> bool:
     return station in stations.names() and not stations.get(station).is_simulated
 
 
-def connect(
-    environment: Mapping[str, Any], scenario: Path | None, *, sim: bool, synchronous: bool, rate: float | None
-) -> "RobotConnection":
-    """Return the connection to a robot.
-
-    Args:
-        environment: Options of the environment; `robot_url`, `robot` and `driver` are used.
-        scenario: Scenario file, or None.
-        sim: Use a simulated driver.
-        synchronous: The driver and the controller wait for each other.
-        rate: Speed of the simulated robot's clock relative to real time; None for the default.
-
-    Raises:
-        InputError: As `RobotConnection.from_scenario`.
-    """
-    from guiderail.tools.hardware.connection import RobotConnection
-
-    given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
-    given |= {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
-    return RobotConnection.from_scenario(scenario, **given)
-
-
-def refuse_hardware_options(**given: Any) -> None:
-    """Raise an InputError if an option that needs a hardware station is given, that is, neither None nor False."""
-    if any(value is not None and value is not False for value in given.values()):
-        *names, last = (f"--{name}" for name in given)
-        raise InputError(f"{', '.join(names)} and {last} are options of hardware: give --station hardware too")
+def refuse_robot(station: Any, remedy: str) -> None:
+    """Raise an InputError that names the remedy if `station` is a real robot."""
+    if is_hardware(station):
+        raise InputError(f"station={station} is a real robot, which a reset cannot move: use {remedy}")

@@ -12,16 +12,15 @@ from typing import Annotated, Any
 import typer
 
 from guiderail.models.common.errors import InputError, RunsFailedError, brief, explain_missing
+from guiderail.models.common.plugins import SIBLINGS, MissingSiblingError, find_plugins
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app, print_message
 
 COMMANDS = {
     "train": ("train", "demo"),
-    "evaluate": ("evaluate", "robustness", "certify"),
-    "visualize": ("visualize", "report"),
-    "study": ("study",),
-    "hardware": ("deploy", "teleoperate", "sim-driver", "safety-monitor"),
-    "dataset": ("dataset", "template", "create-task"),
+    "evaluate": ("evaluate",),
+    "visualize": ("visualize",),
+    "template": ("template",),
     "list": ("list",),
 }
 """Names of the commands that each module of this package registers."""
@@ -31,9 +30,18 @@ INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def load_commands(name: str = "") -> typer.Typer:
-    """Return the application after importing the module of a command, or all modules if no command has that name."""
-    for module in [module for module, names in COMMANDS.items() if name in names] or COMMANDS:
-        import_module(f"guiderail.tools.cli.{module}")
+    """Return the application after importing the module of a command, or all modules if no command has that name.
+
+    Raises:
+        MissingSiblingError: If the command belongs to a sibling distribution that is not installed.
+    """
+    modules = {command: f"guiderail.tools.cli.{module}" for module, names in COMMANDS.items() for command in names}
+    modules |= {command: point.value for command, point in find_plugins("command")}
+    for sibling, names in SIBLINGS.items():
+        if name in names and name not in modules:
+            raise MissingSiblingError(f"guiderail {name}", sibling)
+    for module in (modules[name],) if name in modules else dict.fromkeys(modules.values()):
+        import_module(module)
     return app
 
 

@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 from guiderail.diagrams.tasks.registry import check_task_name
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.plugins import load_plugin
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 
@@ -76,17 +77,7 @@ def train(
         bool,
         option("A supervisor in the browser corrects the policy, stops and labels episodes.", "--human-in-the-loop"),
     ] = False,
-    robot_url: cli.RobotUrl = None,
-    robot: cli.Robot = None,
-    driver: cli.Driver = None,
-    sim: cli.Sim = False,
-    synchronous: cli.Synchronous = False,
-    rate: cli.Rate = None,
-    scenario: cli.Scenario = None,
-    yes: cli.Yes = False,
-    resume: Annotated[
-        bool, option("Resume the run in --out; a run with a simulated driver needs --sim again.", "--resume")
-    ] = False,
+    resume: Annotated[bool, option("Resume the run in --out.", "--resume")] = False,
     imports: cli.Imports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -115,12 +106,7 @@ def train(
         observation=observation,
         fixture_offset=fixture_offset,
         station=station,
-        robot=robot,
-        robot_url=robot_url,
-        driver=driver,
     )
-    if resume and out is not None:
-        environment = _with_stored_robot(out, environment)
     settings = cli.parse_pairs(setting, "--set", "batch_size=128")
     choices: dict[str, Any] = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed}
     if num_envs is not None:
@@ -139,36 +125,18 @@ def train(
         check_choices(task, settings=settings, **kinds, **choices)
         check_declared_options(task, environment)
     if (folders or "demonstrations" in environment) and task is not None and not resume:
-        from guiderail.tools.datasets.validate import warn_of_deviation
+        from guiderail.tools.environments import warn_of_deviation
 
         if (warning := warn_of_deviation(task, environment)) is not None:
             print_message(warning)
-    if cli.is_hardware(environment.get("station")):
-        if human_in_the_loop:
-            raise InputError("training on hardware has no human in the loop: leave --human-in-the-loop out")
-        if log:
-            raise InputError("training on hardware writes no learning log: leave --log out")
-        if evaluate is not None:
-            raise InputError("after training on hardware, use guiderail evaluate RUN: leave --evaluate out")
-        if settings.get("num_envs", "0") != "0":
-            raise InputError("there is one robot: leave --num-envs out")
-        from guiderail.tools.hardware.train import train_on_robot
+    cli.refuse_robot(environment.get("station"), "guiderail train-on-robot TASK --out RUN")
+    open_supervision = None
+    if human_in_the_loop:
+        wait_for_browser = load_plugin("supervision", "browser", sibling="hardware")
 
-        given = choices | {"step_log": step_log, "imports": modules}
-        result = train_on_robot(
-            task,
-            out,
-            cli.connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate),
-            environment=environment,
-            given={name: value for name, value in given.items() if value is not None},
-            settings=settings,
-            resume=resume,
-            assume_yes=yes,
-            log=print_message,
-        )
-        print_result(result, as_json)
-        return
-    cli.refuse_hardware_options(sim=sim, synchronous=synchronous, rate=rate, scenario=scenario, yes=yes)
+        def open_supervision() -> Any:
+            return wait_for_browser(print_progress)
+
     from guiderail.tools.learning.train import start_or_resume
 
     run = start_or_resume(
@@ -181,7 +149,7 @@ def train(
         step_log=step_log,
         log=log or (),
         pictures=pictures is not False,
-        make_supervisor=_wait_for_supervisor if human_in_the_loop else None,
+        open_supervision=open_supervision,
         **choices,
     )
     held_out: dict[str, Any] = {}
@@ -193,26 +161,6 @@ def train(
         rows = evaluate_trained(RunFolder(run.path), run.config, evaluate)
         held_out = {"held_out_episodes": len(rows), **statistics(rows, "held_out_")}
     print_result(run.summary | held_out, as_json)
-
-
-def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:
-    """Return the given options, completed by the station, the robot and the driver of a run on hardware."""
-    from guiderail.tools.learning.run_folder import RunFolder
-
-    stored = RunFolder(out).config().environment
-    if not cli.is_hardware(stored.get("station")):
-        return environment
-    names = ("station", "robot", "driver")
-    return {name: stored[name] for name in names if stored.get(name) is not None} | environment
-
-
-def _wait_for_supervisor() -> Any:
-    """Block until a browser connects; return the supervisor."""
-    from guiderail.tools.teleop.teleoperator import MeshcatSupervisor
-
-    supervisor = MeshcatSupervisor(print_progress)
-    supervisor.wait()
-    return supervisor
 
 
 @cli.command("demo --out demo")

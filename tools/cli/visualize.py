@@ -7,7 +7,7 @@ import typer
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, option, to_json
+from guiderail.tools.cli.app import option
 
 
 @cli.command("visualize runs/passage --html replay.html")
@@ -72,24 +72,3 @@ def visualize(
         if path is not None:
             write(path, episode)
             typer.echo(path)
-
-
-@cli.command("report studies --out report.html")
-def report(
-    runs: Annotated[list[Path], argument("Folders of runs, or of a study.", "RUN...")],
-    out: Annotated[Path, option("Page to write, .html.")] = Path("report.html"),
-    episodes: Annotated[
-        int, option("Held-out episodes for each run that no study evaluated; evaluated episodes are used again.")
-    ] = 0,
-    trust_imports: cli.TrustImports = False,
-    as_json: cli.Json = False,
-) -> None:
-    """Write the results of runs or of a study as one self-contained page.
-
-    It contains learning curves with bootstrap bands, episodes to convergence, held-out success together with baseline
-    policies, safety statistics of every control step, configuration, versions, and the commands that reproduce it.
-    """
-    from guiderail.tools.visualization.report import write_report
-
-    page = write_report(runs, out, episodes=episodes)
-    typer.echo(to_json({"page": str(page)}) if as_json else page)

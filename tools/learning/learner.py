@@ -178,7 +178,7 @@ def _check_learner(name: str, learner: Any) -> None:
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
 # takes seconds to import: `LEARNERS.declared(name, "Config")` reads the `Config` from the source if possible.
 LEARNERS: Registry[Any] = Registry(
-    "algorithm", package="guiderail.tools.learning", decorator="register_learner", entry_points="guiderail.learners",
+    "algorithm", package="guiderail.tools.learning", decorator="register_learner", plugin="learner",
     check=_check_learner,
 )  # fmt: skip
 register_learner = LEARNERS.register

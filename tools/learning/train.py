@@ -37,7 +37,7 @@ from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
 if TYPE_CHECKING:
-    from guiderail.tools.learning.interventions import Supervisor
+    from guiderail.tools.learning.supervision import Supervise
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
 # Statistics of a run's summary.
@@ -193,7 +193,7 @@ def start_or_resume(
     log: str | Sequence[str] = (),
     pictures: bool = True,
     sb3_callbacks: Any = None,
-    make_supervisor: Callable[[], Supervisor] | None = None,
+    open_supervision: Callable[[], Supervise] | None = None,
 ) -> Run:
     """Train with a progress bar, and draw the learning curve and the replay page.
 
@@ -205,7 +205,8 @@ def start_or_resume(
     - `imports`: modules or files (.py) that register the task, the learner, …
     - `step_log`: True to write every control step to the step log; the default.
     - `sb3_callbacks`: the `callbacks` of `train`.
-    - `make_supervisor`: function that constructs the supervisor; the run then has a human in the loop.
+    - `open_supervision`: function that waits for a supervisor, and returns the start of the supervised episodes; the
+      run then has a human in the loop.
 
     The task's scripted policy acts in the learner's `demonstration_episodes`.
 
@@ -217,7 +218,7 @@ def start_or_resume(
     seed = None if seed is None else check_seed(seed)
     imports, formats = import_modules(imports), check_log_formats(log)
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
-    choices["human_in_the_loop"] = None if make_supervisor is None else True
+    choices["human_in_the_loop"] = None if open_supervision is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
     if resume:
         config = resumed_config(folder, task, environment, given, settings)
@@ -240,10 +241,10 @@ def start_or_resume(
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
     demonstrator = make_baseline(config.task, "scripted") if num_demonstrated else None
-    supervisor = make_supervisor() if config.human_in_the_loop and make_supervisor is not None else None
+    supervise = open_supervision() if config.human_in_the_loop and open_supervision is not None else None
     with EpisodeProgress(config.episodes, name=config.task) as progress:
         run_training(
-            folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervisor=supervisor,
+            folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervise=supervise,
             log=formats, sb3_callbacks=sb3_callbacks,
         )  # fmt: skip
     if not pictures:

@@ -34,7 +34,7 @@ from guiderail.tools.tables import table_text
 
 if TYPE_CHECKING:
     from guiderail.tools.learning.actors import ParallelLearner
-    from guiderail.tools.learning.interventions import SupervisedTraining, Supervisor
+    from guiderail.tools.learning.supervision import Supervise, SupervisedEpisodes
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -53,7 +53,7 @@ def run_training(
     resume: bool = False,
     report: Callable[[dict[str, Any]], None] | None = None,
     demonstrator: Demonstrator | None = None,
-    supervisor: Supervisor | None = None,
+    supervise: Supervise | None = None,
     log: Sequence[str] = (),
     sb3_callbacks: Any = None,
 ) -> list[dict[str, Any]]:
@@ -71,7 +71,7 @@ def run_training(
         demonstrator: Function from an environment to the policy that acts in the learner's `demonstration_episodes`.
             Its actions must not depend on earlier episodes. Off-policy learners also learn from these transitions
             (Vecerik et al., 2017).
-        supervisor: Supervisor of a run that is configured `human_in_the_loop`.
+        supervise: Start of the episodes of a run that is configured `human_in_the_loop`.
         log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
         sb3_callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after
             the episode.
@@ -89,7 +89,7 @@ def run_training(
         raise InputError(
             "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
         )
-    if config.human_in_the_loop and supervisor is None:
+    if config.human_in_the_loop and supervise is None:
         raise InputError("this run has a supervisor: give --human-in-the-loop")
     if config.learner.demonstration_episodes and demonstrator is None:
         raise InputError(
@@ -149,7 +149,7 @@ def run_training(
             folder.create(config)
         try:
             return _train(
-                folder, config, env, learner, resume, report, demonstrator, supervisor, learning_log, callbacks
+                folder, config, env, learner, resume, report, demonstrator, supervise, learning_log, callbacks
             )
         except InputError:
             # The next attempt would refuse a folder that has only a configuration. If the learner diverged, the folder
@@ -167,7 +167,7 @@ def _train(
     resume: bool,
     report: Callable[[dict[str, Any]], None] | None,
     demonstrator: Demonstrator | None,
-    supervisor: Supervisor | None,
+    supervise: Supervise | None,
     learning_log: LearningLog,
     sb3_callbacks: Any = None,
 ) -> list[dict[str, Any]]:
@@ -178,10 +178,8 @@ def _train(
         if num_written < len(rows):
             folder.write_episodes(rows)  # the loop below does not write the table of a complete run
     num_restored, supervised = len(rows), None
-    if config.human_in_the_loop and supervisor is not None:
-        from guiderail.tools.learning.interventions import SupervisedTraining
-
-        supervised = SupervisedTraining(config, supervisor, load_checkpoint(folder.checkpoint)[1] if rows else {})
+    if config.human_in_the_loop and supervise is not None:
+        supervised = supervise(config, load_checkpoint(folder.checkpoint)[1] if rows else {})
         supervised.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
         env, config = supervised.env, supervised.config
     folder.write_config(config)
@@ -293,7 +291,7 @@ def _save(
     rows: list[dict[str, Any]],
     learner: Learner,
     env: Any,
-    supervised: SupervisedTraining | None,
+    supervised: SupervisedEpisodes | None,
 ) -> None:
     """Write the checkpoint, which includes the table, and then the table: a kill in between loses nothing."""
     write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())

@@ -10,12 +10,12 @@ from guiderail import make_env
 from guiderail.diagrams.envs.assemble import Loop, build_prior_knowledge
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
 from guiderail.models.primitives import ReferenceTrajectory
+from guiderail_hardware.station import HardwareStation
 
 PERIOD = 0.02
 

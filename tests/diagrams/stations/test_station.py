@@ -7,9 +7,9 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.mujoco import MujocoStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
+from guiderail_mujoco.station import MujocoStation
 
 STATIONS = [
     ("NarrowPassage", "plane"),

@@ -21,13 +21,13 @@ from fci.simulated_franka import SimulatedRun
 from injections.campaign import DURATION, GROWTH, MAX_STEPS, SLOW, SLOW_AFTER, has_effect
 from injections.kinds import KINDS, PERIOD, Fault, Kind
 
-from guiderail.diagrams.hardware.fci import FciDriver
-from guiderail.diagrams.hardware.lcm import MICROSECOND, IiwaDriver
 from guiderail.models.control import joint_status
-from guiderail.models.control.joint_status import JointStatus
-from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.connection import subprocess_tied_to_parent
-from guiderail.tools.hardware.sim_driver import START
+from guiderail_hardware.drivers.fci import FciDriver
+from guiderail_hardware.drivers.lcm import MICROSECOND, IiwaDriver
+from guiderail_hardware.models.joint_status import JointStatus
+from guiderail_hardware.robot.connection import subprocess_tied_to_parent
+from guiderail_hardware.robot.sim_driver import START
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 CENTER = START + np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])
 AMPLITUDE, FREQUENCY = (
@@ -156,7 +156,7 @@ def main() -> int:
     kinds = [kind for kind in STATUS_KINDS if not arguments.kinds or kind.name in arguments.kinds]
     campaign, num_failed = Campaign(), 0
     code = (
-        "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
+        "from guiderail_hardware.robot.sim_driver import run_sim_driver\n"
         f"run_sim_driver({campaign.run.host!r}, 1e5, 60.0, driver='fci', log=lambda _: None)"
     )
     with subprocess_tied_to_parent(code):

@@ -13,15 +13,15 @@ from unittest.mock import patch
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.fci import FciDriver
-from guiderail.diagrams.hardware.fci_lockstep import FciLockstepClock
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.joint_status import STATUS_FAULTS, Fault
-from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent
-from guiderail.tools.hardware.sim_driver import START
+from guiderail_hardware.drivers.fci import FciDriver
+from guiderail_hardware.drivers.fci_lockstep import FciLockstepClock
+from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault
+from guiderail_hardware.robot.connection import LOCKSTEP_TIMEOUT, subprocess_tied_to_parent
+from guiderail_hardware.robot.sim_driver import START
+from guiderail_hardware.station import HardwareStation
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 FORCE_LIMIT = 18.0  # bound of the impedance force [N]
 STATUSES_PER_STEP = 4  # number of status periods in a control step
@@ -89,7 +89,7 @@ def run_checks() -> list[str]:
 
     run = SimulatedRun()
     code = (
-        "from guiderail.tools.hardware.sim_driver import run_sim_driver\n"
+        "from guiderail_hardware.robot.sim_driver import run_sim_driver\n"
         f"run_sim_driver({run.host!r}, 1e4, 60.0, driver='fci', log=lambda _: None)"
     )
     with subprocess_tied_to_parent(code) as robot:
@@ -115,7 +115,7 @@ def run_checks() -> list[str]:
             "loss", Fault(int(run["fault"][0])) in STATUS_FAULTS and run["arm_state"][0] == ArmState.OFF, run.describe()
         )
     with subprocess_tied_to_parent(code):
-        with patch("guiderail.diagrams.hardware.fci._collision_thresholds", lambda impedance: LOW_THRESHOLDS):
+        with patch("guiderail_hardware.drivers.fci._collision_thresholds", lambda impedance: LOW_THRESHOLDS):
             run.station.driver.recover()
         run.clock.begin()
         run.resume()

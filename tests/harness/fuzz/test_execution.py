@@ -24,23 +24,23 @@ from fuzz.changes import edited, edits, entry_at, paths_in
 from fuzz.tally import attempt
 from fuzz.test_runs import ARRAYS, CONFIGS, DESCRIPTION, LAYERS, TABLE, VALUES
 from fuzz.test_templates import TEXTS as TEMPLATES
-from guiderail.diagrams.tasks.part.file import FILE_FORMAT, read_task_file, task_folder_digest
-from guiderail.diagrams.tasks.part.task import write_workcell
-from guiderail.models.certificate import checker
 from guiderail.models.common.errors import InputError
-from guiderail.models.parts.mesh_file import load_part
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.templates import parse_template
-from guiderail.tools.datasets.convert import import_recording
 from guiderail.tools.environments import as_value, check_environment
 from guiderail.tools.evaluation.step_log import read_step_log, write_step_log
-from guiderail.tools.experiments.declaration import load_study
-from guiderail.tools.experiments.study import run_study
-from guiderail.tools.hardware.scenario import load_scenario
 from guiderail.tools.imports import import_stored
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail_data.convert import import_recording
+from guiderail_hardware.robot.scenario import load_scenario
+from guiderail_parts.geometry.mesh_file import load_part
+from guiderail_parts.task import write_workcell
+from guiderail_parts.task_file import FILE_FORMAT, read_task_file, task_folder_digest
+from guiderail_studies.certificate import checker
+from guiderail_studies.declaration import load_study
+from guiderail_studies.study import run_study
 
 pytest.importorskip("rosbags")
 pytest.importorskip("trimesh")
@@ -283,8 +283,8 @@ def read_recordings(folder):
 
 
 def recording_files(folder):
-    from guiderail.tools.datasets.formats.lerobot import write_lerobot
-    from guiderail.tools.datasets.formats.ros_bag import write_mcap
+    from guiderail_data.formats.lerobot import write_lerobot
+    from guiderail_data.formats.ros_bag import write_mcap
 
     times = 0.1 * np.arange(4)
     demonstrations = Demonstrations([times], [np.column_stack([times] * 6)])

@@ -12,16 +12,16 @@ from drake import lcmt_iiwa_command, lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm import IiwaDriver
-from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.diagrams.hardware.monitor import MonitorState, SafetyMonitor
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.joint_status import Fault
-from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.sim_driver import START
+from guiderail_hardware.drivers.driver import safety_limits
+from guiderail_hardware.drivers.lcm import IiwaDriver
+from guiderail_hardware.drivers.lcm_simulated import SimulatedIiwa
+from guiderail_hardware.models.joint_status import Fault
+from guiderail_hardware.monitor import MonitorState, SafetyMonitor
+from guiderail_hardware.robot.sim_driver import START
+from guiderail_hardware.station import HardwareStation
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 PERIOD = IiwaDriver.period
 STOPPED_WITHIN = 0.05  # time from the detection of a fault to standstill [s]

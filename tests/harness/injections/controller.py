@@ -6,12 +6,12 @@ import sys
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.hardware.clock import WallClock, garbage_collection_disabled, set_realtime_priority
-from guiderail.diagrams.hardware.station import HardwareStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.systems.torque_safety_limiter import ArmState
-from guiderail.tools.hardware.sim_driver import START
+from guiderail_hardware.drivers.clock import WallClock, garbage_collection_disabled, set_realtime_priority
+from guiderail_hardware.robot.sim_driver import START
+from guiderail_hardware.station import HardwareStation
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 
 def main(url: str, rate: float) -> None:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from drake import lcmt_iiwa_status
 
-from guiderail.models.control.joint_status import MAX_MISSED_MESSAGES, Fault
+from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, Fault
 
 from . import bus as buses
 from .bus import PERIOD, Bus, relay_unchanged, with_fields

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status
 
-from guiderail.diagrams.hardware.lcm import IiwaDriver
+from guiderail_hardware.drivers.lcm import IiwaDriver
 
 PERIOD = IiwaDriver.period
 Q, V, T = "joint_position_measured", "joint_velocity_estimated", "joint_torque_external"

@@ -22,12 +22,12 @@ import numpy as np
 from drake import lcmt_iiwa_status
 from pydrake.lcm import DrakeLcm
 
-from guiderail.diagrams.hardware.clock import set_realtime_priority
-from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail.diagrams.stations.arm import ArmControllerPlant
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.joint_status import MAX_SENDERS
+from guiderail_hardware.drivers.clock import set_realtime_priority
+from guiderail_hardware.drivers.driver import safety_limits
+from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver
+from guiderail_hardware.models.joint_status import MAX_SENDERS
 
 STANDSTILL = 0.05  # largest joint speed of a stopped arm [rad/s]
 STOPPED_WITHIN, DETECTED_WITHIN = 0.05, 0.06  # from detection to standstill, from fault to detection [s, robot's clock]

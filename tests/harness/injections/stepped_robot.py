@@ -1,9 +1,9 @@
 """Simulated robot, safety monitor and hardware station, stepped in turn in one process."""
 
-from guiderail.diagrams.hardware.driver import safety_limits
-from guiderail.diagrams.hardware.lcm import IiwaDriver
-from guiderail.diagrams.hardware.lcm_simulated import SimulatedIiwa
-from guiderail.diagrams.hardware.monitor import SafetyMonitor
+from guiderail_hardware.drivers.driver import safety_limits
+from guiderail_hardware.drivers.lcm import IiwaDriver
+from guiderail_hardware.drivers.lcm_simulated import SimulatedIiwa
+from guiderail_hardware.monitor import SafetyMonitor
 
 
 class SteppedRobotClock:

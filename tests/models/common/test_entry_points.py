@@ -10,7 +10,7 @@ from guiderail.models.common.registry import Registry, check_callable
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Return a function that installs a package of one module with entry points of the group "shapes"."""
+    """Return a function that installs a package of one module with plug-ins of the kind "shape"."""
     monkeypatch.syspath_prepend(str(tmp_path))
 
     def install(package, source, **entry_points):
@@ -19,8 +19,8 @@ def install(tmp_path, monkeypatch):
         information = tmp_path / f"{package}-1.0.dist-info"
         information.mkdir()
         (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
-        lines = [f"{name} = {package}:{value}" for name, value in entry_points.items()]
-        (information / "entry_points.txt").write_text("\n".join(["[shapes]", *lines, ""]))
+        lines = [f"shape:{name} = {package}:{value}" for name, value in entry_points.items()]
+        (information / "entry_points.txt").write_text("\n".join(["[guiderail]", *lines, ""]))
 
     yield install
     for name, module in list(sys.modules.items()):  # only modules of the temporary folder
@@ -29,7 +29,7 @@ def install(tmp_path, monkeypatch):
 
 
 def make_registry(**arguments):
-    return Registry("shape", entry_points="shapes", check=check_callable, **arguments)
+    return Registry("shape", plugin="shape", check=check_callable, **arguments)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.isolation import IsolatedError, run_isolated
+from guiderail_parts.isolation import IsolatedError, run_isolated
 
 
 def fail():

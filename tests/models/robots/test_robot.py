@@ -81,9 +81,9 @@ def test_entry_point_of_an_installed_package_adds_a_robot(tmp_path, monkeypatch)
     information = tmp_path / "laboratory-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: laboratory\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[guiderail.robots]\ntwin = laboratory:TWIN\n")
+    (information / "entry_points.txt").write_text("[guiderail]\nrobot:twin = laboratory:TWIN\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    robots = Registry("robot", entry_points="guiderail.robots")
+    robots = Registry("robot", plugin="robot")
     assert robots.names() == ["twin"]
     assert robots.get("twin").num_joints == 6
 

@@ -9,9 +9,9 @@ import pytest
 from guiderail.diagrams.envs.scene import Camera, look_at
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import LinearConstraints
-from guiderail.tools.experiments.declaration import load_study
-from guiderail.tools.experiments.job import EVALUATED, TRAINING, Job
 from guiderail.tools.tables import read_table
+from guiderail_studies.declaration import load_study
+from guiderail_studies.job import EVALUATED, TRAINING, Job
 from research.figures import FIGURES, find_figure, reproduce
 from research.figures.chapter_3 import METHODS
 from research.figures.chapter_4 import MOVED_ELSEWHERE, _violation

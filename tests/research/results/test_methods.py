@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.learning.config import LEARNERS
+from guiderail_studies.declaration import load_study
 from research.results.methods import (
     README_COLUMNS,
     hard_tasks_table,

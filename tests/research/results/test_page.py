@@ -4,8 +4,8 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.declaration import load_study
 from guiderail.tools.tables import read_table, write_table
+from guiderail_studies.declaration import load_study
 from research.command import run_program
 from research.figures import reproduce
 from research.figures.thesis import THESIS

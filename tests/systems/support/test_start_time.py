@@ -5,11 +5,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail import systems
-from guiderail.models.control.chunk_guard import ChunkGuard
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.stepper import StateProgress
+from guiderail_lerobot.chunk_guard import ChunkGuard
 
 PERIOD = 0.02
 BOX = LinearConstraints.box([-1.0], [1.0])

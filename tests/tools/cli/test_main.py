@@ -460,7 +460,7 @@ def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch)
     information = tmp_path / "lab_broken-1.0.dist-info"
     information.mkdir()
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: lab_broken\nVersion: 1.0\n")
-    (information / "entry_points.txt").write_text("[guiderail.kernels]\nlab = lab_broken:Kernel\n")
+    (information / "entry_points.txt").write_text("[guiderail]\nkernel:lab = lab_broken:Kernel\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     for name in ("_points", "broken"):
         monkeypatch.delitem(vars(KERNELS), name, raising=False)
@@ -532,7 +532,7 @@ def test_train_passes_robot_and_imports_to_hardware(options, robot, capsys, tmp_
         passed.update(keywords, connection=connection)
         return {"run": str(out)}
 
-    monkeypatch.setattr("guiderail.tools.hardware.train.train_on_robot", train_on_robot)
+    monkeypatch.setattr("guiderail_hardware.robot.train.train_on_robot", train_on_robot)
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "desk.py"
     file.write_text(STATION)
@@ -549,7 +549,7 @@ def test_evaluate_imports_the_station_before_its_use(capsys, tmp_path, monkeypat
         passed.update(keywords)
         return {"episodes": episodes}
 
-    monkeypatch.setattr("guiderail.tools.hardware.evaluate.evaluate_on_robot", evaluate_on_robot)
+    monkeypatch.setattr("guiderail_hardware.robot.evaluate.evaluate_on_robot", evaluate_on_robot)
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "other_desk.py"
     file.write_text(STATION)

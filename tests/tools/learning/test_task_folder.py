@@ -13,17 +13,17 @@ import guiderail.models.objects.bnc_connector
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.certify import certify_skill
 from guiderail.tools.cli.main import main
-from guiderail.tools.env_server import open_environment
 from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.subject import find_subject
-from guiderail.tools.experiments.declaration import Study
-from guiderail.tools.experiments.job import Job, digest
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import configure, start_or_resume
+from guiderail_lerobot.env_server import open_environment
+from guiderail_studies.certify import certify_skill
+from guiderail_studies.declaration import Study
+from guiderail_studies.job import Job, digest
 
 PART = {"visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01, "pieces": [{"file": "part.obj"}]}
 TASK = {

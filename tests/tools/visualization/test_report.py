@@ -25,9 +25,9 @@ from guiderail.tools.learning.train import configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
 from guiderail.tools.visualization.curves import plot_run
-from guiderail.tools.visualization.report import SAFETY_COLUMNS, _safety, _svg, write_report
-from guiderail.tools.visualization.report_data import command, gather
 from guiderail.tools.visualization.style import new_figure
+from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, write_report
+from guiderail_studies.report_data import command, gather
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 2}
 

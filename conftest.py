@@ -1,0 +1,62 @@
+"""Shared fixtures, and Hypothesis profiles: few examples by default, many with `--hypothesis-profile=long`."""
+
+import gc
+
+import pytest
+from fork_server import Forks, start_forkserver
+from hypothesis import HealthCheck, settings
+
+COMMON = {"deadline": None, "database": None, "suppress_health_check": list(HealthCheck)}
+
+settings.register_profile("quick", max_examples=30, derandomize=True, **COMMON)
+settings.register_profile("long", max_examples=2500, **COMMON)
+settings.load_profile("quick")
+
+
+# Test files in which a simulator calls Python handlers of LCM messages, which ends the process in some Drake versions.
+WITH_HANDLERS = (
+    "hardware/test_station.py", "hardware/test_injections.py", "hardware/test_clock.py",
+    "hardware/test_sim_driver.py", "hardware/test_connection.py", "hardware/test_executor.py",
+    "hardware/test_train.py", "benchmarks/test_loop.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    """Skip the tests with LCM handlers if a handler would end the process."""
+    from guiderail_hardware.drivers.lcm import handlers_are_safe
+
+    if not handlers_are_safe():
+        for item in items:
+            if item.path.as_posix().endswith(WITH_HANDLERS):
+                reason = "this version of Drake calls LCM handlers without the interpreter's lock"
+                item.add_marker(pytest.mark.skip(reason=reason))
+
+
+FORKS = pytest.StashKey[Forks]()
+
+
+def pytest_collection_finish(session):
+    """Start the fork servers after the imports of all tests and before the first fixture."""
+    gc.freeze()  # excludes imported objects from garbage collections, which saves a fifteenth of the run time
+    used = {name for item in session.items for name in getattr(item, "fixturenames", ())}
+    # The server that starts later inherits the pipe of the earlier server and must end first.
+    if "forkserver" in used:
+        start_forkserver()
+    if "forks" in used:
+        session.config.stash[FORKS] = Forks()
+
+
+def pytest_unconfigure(config):
+    if FORKS in config.stash:
+        config.stash[FORKS].close()
+
+
+@pytest.fixture(scope="session")
+def forks(request):
+    """Return the server that runs programs in forks of this process, which saves seconds of imports."""
+    return request.config.stash[FORKS]
+
+
+@pytest.fixture
+def forkserver():
+    """Request that multiprocessing's start method "forkserver" forks this process, which saves seconds of imports."""

@@ -1,1 +1,0 @@
-"""Hardware stations: driver interface, drivers, clocks and safety monitor."""

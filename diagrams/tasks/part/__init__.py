@@ -1,1 +1,0 @@
-"""Insertion tasks made from the meshes of two parts."""

@@ -1,1 +1,0 @@
-"""Insertion tasks from mesh files: reading, checks, convex decomposition, symmetry and a demonstrator."""

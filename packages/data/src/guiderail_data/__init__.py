@@ -1,0 +1,1 @@
+"""Recordings of demonstrations: formats, conversion, validation and bounds."""

@@ -1,0 +1,354 @@
+"""CSV files with time, position, and an orientation in one of several conventions.
+
+Columns are found by their names. The table is read with the strict reader of the standard library:
+`pandas.read_csv` fills short rows and accepts text after a closing quote.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import unicodedata
+from array import array
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from guiderail.models.common.arrays import parse_number
+from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.files import read_bytes, visible_files
+from guiderail.models.common.transforms import POSE_NAMES
+from guiderail.models.primitives import Demonstrations
+from guiderail.models.primitives.io import MAX_FILE_SIZE, SECONDS, find_repeated
+from guiderail_data.formats.recorded import UNITS, Recorded, poses_in_target, rotations_of
+
+TIME = re.compile(r"(t|time|timestamp|stamp|sec|secs|seconds)", re.IGNORECASE)  # names of a time column
+_TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+_ANGLE_UNITS = {"deg": np.pi / 180.0, "rad": 1.0}
+_ORDERS = ("wxyz", "xyzw")
+# Other spellings of units.
+_SPELLINGS = {
+    "m": ("meter", "meters", "metre", "metres"),
+    "deg": ("degree", "degrees", "\u00b0"),
+    "rad": ("radian", "radians"),
+    "s": SECONDS,
+    "ms": ("msec",),
+    "us": ("usec", "\u03bcs"),
+    "ns": ("nsec",),
+}
+_UNIT_OF_SPELLING = {spelling: unit for unit, spellings in _SPELLINGS.items() for spelling in spellings}
+_PERIODS = (1e-4, 1.0)  # range of plausible sampling periods [s]; a time step outside it must have another unit
+# Prefix of the name of a pose column.
+_PREFIX = r"(?:.*[._/ ])?(?:p|pos|position|tool|tcp|ee|actual_tcp_pose|translation)?[._ ]?"
+# Names of columns of other quantities than a pose, such as velocity and force.
+_NO_POSE = re.compile(
+    r"(?:.*[._/ ])?(v|vel|velocity|speed|twist|omega|gyro|acc|accel|acceleration|f|force|torque|wrench)[._/ ].*"
+)
+_QUATERNION = (("qx", "qy", "qz", "qw"), ("quat_x", "quat_y", "quat_z", "quat_w"), ("ox", "oy", "oz", "ow"))
+_EULER = (("roll", "pitch", "yaw"), ("rx_rpy", "ry_rpy", "rz_rpy"))
+# Numbered columns of a quaternion, whose names do not state the order. Five or more such columns are joint positions.
+_UNNAMED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
+_DELIMITERS = ",\t;| "  # accepted delimiters; the first one in the header is used, in this order
+_EMPTY = ("", "na", "n/a", "#n/a", "null", "none")  # texts of an empty field, in lower case
+_MAX_LISTED = 8  # largest number of names in a message
+
+
+@dataclass(frozen=True)
+class _Column:
+    """Column of a table."""
+
+    name: str  # name in the file
+    values: np.ndarray  # values (N,)
+
+    @property
+    def plain(self) -> str:
+        """Name in lower case, without the first bracket and all that follows it."""
+        return re.sub(r"[\[(].*", "", self.name).strip().lower()
+
+
+def read_csv_files(
+    path: Path,
+    *,
+    unit: str | None = None,
+    time_unit: str | None = None,
+    quaternion: str | None = None,
+    angles: str | None = None,
+    target: Sequence[float] | None = None,
+) -> Recorded:
+    """Return one demonstration per file, or all demonstrations of files that guiderail has written.
+
+    Args:
+        path: File, or a folder of files.
+        unit: Unit of positions, m, cm or mm, for columns without a unit in their name.
+        time_unit: Unit of time, s, ms, us or ns, if neither the column's name nor its step size determines it.
+        quaternion: Order of numbered quaternion columns, "xyzw" or "wxyz".
+        angles: Unit of roll, pitch and yaw, "deg" or "rad", for columns without a unit in their name.
+        target: See `poses_in_target`.
+
+    Raises:
+        InputError: If a file is invalid, a unit is neither stated nor given, the stated and the given unit differ, or
+            recordings are mixed with a file that guiderail has written, which may hold the same motions.
+    """
+    for option, given, known in (
+        ("--unit", unit, UNITS),
+        ("--time-unit", time_unit, _TIME_UNITS),
+        ("--quaternion", quaternion, _ORDERS),
+        ("--angles", angles, _ANGLE_UNITS),
+    ):
+        if given is not None and given not in known:
+            raise InputError(f"{option} is one of {', '.join(known)}, not {given!r}")
+    files = [path] if path.is_file() else visible_files(path, (".csv",))
+    if not files:
+        raise InputError(f"there is no .csv file in {path}: name a file, or a folder of them")
+    recorded = Recorded([], [], ())
+    first_of_kind: dict[bool, Path] = {}  # first file that guiderail wrote (True), and first file of another origin
+    for file in files:
+        like = recorded.outputs[0] if recorded.outputs else None
+        columns = _table(file)
+        is_written = [column.name for column in columns[:2]] == ["demonstration", "time"]
+        first_of_kind.setdefault(is_written, file)
+        if len(first_of_kind) > 1:
+            raise InputError(
+                f"{first_of_kind[True]} holds demonstrations, next to recordings such as {first_of_kind[False].name}, "
+                "and may hold the same motions: name one file, or move it to another folder"
+            )
+        if is_written:
+            options = {"unit": unit, "time-unit": time_unit, "quaternion": quaternion, "angles": angles}
+            part = _read_written(file, [name for name, value in options.items() if value is not None], target, like)
+        else:
+            part = _read(file, columns, unit, time_unit, quaternion, angles, target, like)
+        if recorded.names and part.names != recorded.names:
+            raise InputError(f"{file} has other columns than {files[0].name}: record the same ones in all of them")
+        recorded.times += part.times
+        recorded.outputs += part.outputs
+        recorded.names = part.names
+        recorded.assumptions += [text for text in part.assumptions if text not in recorded.assumptions]
+    return recorded
+
+
+def _read_written(
+    file: Path, given: Sequence[str], target: Sequence[float] | None, like: np.ndarray | None
+) -> Recorded:
+    """Read a file that `Demonstrations.save` wrote; `given` has the names of the user's options, which are refused."""
+    if given:
+        raise InputError(f"{file} holds demonstrations, whose conventions are known: leave --{given[0]} out")
+    demonstrations = Demonstrations.load(file)
+    outputs, names = list(demonstrations.outputs), demonstrations.names
+    if target is not None:
+        if names != POSE_NAMES:
+            raise InputError(f"{file} has the outputs {_listed(names)}, and --target needs {_listed(POSE_NAMES)}")
+        for m, y in enumerate(outputs):
+            outputs[m] = poses_in_target(y[:, :3], Rotation.from_euler("ZYX", y[:, 3:]), target, like)
+            like = outputs[0] if like is None else like
+    return Recorded(list(demonstrations.times), outputs, names)
+
+
+def _read(
+    file: Path,
+    columns: Sequence[_Column],
+    unit: str | None,
+    time_unit: str | None,
+    quaternion: str | None,
+    angles: str | None,
+    target: Sequence[float] | None,
+    like: np.ndarray | None,
+) -> Recorded:
+    if len(columns[0].values) < 2:
+        raise InputError(f"{file} has fewer than two lines of numbers: a motion needs at least two")
+    assumptions: list[str] = []
+    clock, times = _time(file, columns, time_unit, assumptions)
+    position = _columns(file, columns, "xyz")
+    if not position:
+        raise InputError(
+            f"{file} has no columns x, y and z: name them so; a table of outputs other than a pose needs "
+            "no import: guiderail reads it as it is, if its time is in seconds"
+        )
+    positions = np.column_stack([column.values for column in position])
+    units = _units(file, position, UNITS, unit, "--unit")
+    if None in units:
+        missing = [o for o, known in enumerate(units) if known is None]
+        size = float(np.ptp(positions[:, missing], axis=0).max())
+        which = _listed(["xyz"[o] for o in missing])
+        raise InputError(f"{file} does not state the unit of {which}, moving by {size:.4g}: give --unit m or mm")
+    positions = positions * [UNITS[str(known)] for known in units]
+    orientation, rotations = _rotations(file, columns, quaternion, angles, assumptions)
+    if rotations is None:
+        if target is not None:
+            raise InputError(f"{file} has no quaternion nor roll, pitch and yaw, and --target needs an orientation")
+        assumptions.append("there is no orientation")
+    elif target is None:
+        assumptions.append(
+            "poses stay in the frame of the recording: "
+            "to convert them, give the pose of the task's target in it as --target"
+        )
+    used = (clock, *position, *orientation)
+    if left := [column.name for column in columns if column.name and not any(column is other for other in used)]:
+        assumptions.append(f"{_listed(left)} {'is' if len(left) == 1 else 'are'} left out")
+    if rotations is None:
+        return Recorded([times], [positions], POSE_NAMES[:3], assumptions)
+    return Recorded([times], [poses_in_target(positions, rotations, target, like)], POSE_NAMES, assumptions)
+
+
+def _table(file: Path) -> list[_Column]:
+    """Return the columns of a table of numbers, empty fields as NaN; every line has as many fields as the header."""
+    try:
+        data = read_bytes(file, "table", MAX_FILE_SIZE)
+        text = data.decode("utf-8-sig")  # Excel writes a byte-order mark, which is not part of a name
+        first = next((line for line in io.StringIO(text) if line.strip()), "")
+        delimiter = next((character for character in _DELIMITERS if character in first), ",")
+        lines = csv.reader(io.StringIO(text), delimiter=delimiter, skipinitialspace=True, strict=True)
+        rows = ((lines.line_num, row) for row in lines if len(row) > 1 or "".join(row).strip())
+        _, names = next(rows, (0, []))
+        values = array("d")
+        for number, row in rows:
+            if len(row) != len(names):
+                raise InputError(f"{file}: line {number} has {len(row)} fields, the header has {len(names)}")
+            values.extend([np.nan if field.strip().lower() in _EMPTY else parse_number(field) for field in row])
+    except InputError:
+        raise
+    except (ValueError, OSError, csv.Error) as error:
+        raise InputError(f"{file} is not a table of numbers below a line of names: {brief(str(error))}") from error
+    if not names:
+        raise InputError(f"{file} is not a table of numbers below a line of names: it is empty")
+    if repeated := find_repeated(name.strip() for name in names):
+        raise InputError(f"{file} has {repeated[:200]} and {repeated[:200]}: keep only one of the two columns")
+    table = np.frombuffer(values, dtype=float).reshape(-1, len(names))
+    return [_Column(name.strip(), column) for name, column in zip(names, table.T, strict=True)]
+
+
+def _units(
+    file: Path, columns: Sequence[_Column], known: Collection[str], given: str | None, option: str
+) -> list[str | None]:
+    """Return the unit of each column: the unit in the column's name, otherwise `given`; the two must not differ."""
+    units = []
+    for column in columns:
+        unit = _unit_of_name(file, column.name, known) or given
+        if given not in (None, unit):
+            raise InputError(
+                f"{file} has {column.name}, which contradicts {option} {given}: leave {option} out, and name each "
+                "column's unit"
+            )
+        units.append(unit)
+    return units
+
+
+def _unit_of_name(file: Path, name: str, known: Collection[str]) -> str | None:
+    """Return the unit in a column's name, in brackets or as its ending; None if the name has no unit."""
+    plain = unicodedata.normalize("NFKC", name).lower()  # maps the micro sign to the Greek letter
+    if inside := [text.strip() for text in re.findall(r"[\[(]([^\[\]()]*)", plain)]:
+        units = [unit for text in inside if (unit := _UNIT_OF_SPELLING.get(text, text)) in known]
+        if not units:
+            raise InputError(f"{file} has {name}, whose unit is not one of {', '.join(known)}: convert or rename it")
+        return units[-1]
+    at_end = re.search(rf"_({'|'.join(known)})$", plain)
+    return at_end and at_end.group(1)
+
+
+def _listed(names: Sequence[str]) -> str:
+    if len(names) > _MAX_LISTED:
+        names = [*names[:_MAX_LISTED], f"{len(names) - _MAX_LISTED} more"]
+    *most, last = names
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+def _column(file: Path, columns: Sequence[_Column], wanted: str) -> _Column | None:
+    """Return the column `wanted`, or the only pose column whose name ends in `wanted`; None if both are missing."""
+    named = rf"{wanted}(_mm|_cm|_m|_rad|_deg)?"
+    exact = [column for column in columns if re.fullmatch(named, column.plain)]
+    ends = [column for column in columns if re.fullmatch(_PREFIX + named, column.plain)]
+    return _only(file, exact or [column for column in ends if not _NO_POSE.fullmatch(column.plain)], wanted)
+
+
+def _columns(file: Path, columns: Sequence[_Column], wanted: Sequence[str]) -> list[_Column]:
+    """Return the columns `wanted`, or an empty list if one of them is missing."""
+    found = [column for name in wanted if (column := _column(file, columns, name)) is not None]
+    return found if len(found) == len(wanted) else []
+
+
+def _only(file: Path, found: Sequence[_Column], wanted: str) -> _Column | None:
+    """Return the only column in `found`, or None if it is empty; raise an InputError if there are several."""
+    if len(found) > 1:
+        names = _listed([column.name for column in found])
+        raise InputError(f"{file} has {names}, and does not state which of them is {wanted}: keep only that one")
+    return found[0] if found else None
+
+
+def _time(
+    file: Path, columns: Sequence[_Column], given: str | None, assumptions: list[str]
+) -> tuple[_Column, np.ndarray]:
+    """Return the time column, and the time since its first sample (N,) [s]."""
+    matches = [column for column in columns if TIME.fullmatch(re.sub(r"_(s|ms|us|ns)$", "", column.plain))]
+    clock = _only(file, matches, "time")
+    if clock is None:
+        raise InputError(f"{file} has no column t, time or timestamp: add one")
+    (unit,) = _units(file, [clock], _TIME_UNITS, given, "--time-unit")
+    ticks = clock.values
+    steps = np.diff(ticks)
+    if (steps < 0.0).any():
+        at = int(np.argmax(steps < 0.0)) + 1
+        raise InputError(f"{file}: the time column {clock.name} decreases at sample {at}: sort or drop samples")
+    if not (steps > 0.0).any():
+        raise InputError(f"{file}: the time column {clock.name} does not increase: a motion needs increasing time")
+    if unit is None:
+        step = float(np.median(steps[steps > 0.0]))  # a recorder faster than the robot repeats time stamps
+        fitting = [name for name, scale in _TIME_UNITS.items() if _PERIODS[0] <= step * scale < _PERIODS[1]]
+        if fitting[:1] != ["s"]:
+            candidates = " or ".join(fitting) or "s, ms, us or ns"
+            raise InputError(
+                f"{file} does not state the unit of {clock.name}, whose step is {step:g}: give --time-unit {candidates}"
+            )
+        unit = "s"
+        assumptions.append(f"{clock.name} is in seconds, {1.0 / step:.4g} samples in each")
+    return clock, (ticks - ticks[0]) * _TIME_UNITS[unit]
+
+
+def _rotations(
+    file: Path,
+    columns: Sequence[_Column],
+    quaternion: str | None,
+    angles: str | None,
+    assumptions: list[str],
+) -> tuple[list[_Column], Rotation | None]:
+    """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
+    for names in _QUATERNION:
+        if matches := _columns(file, columns, names):
+            places = {id(column): place for place, column in enumerate(columns)}
+            in_file = sorted(zip(matches, "xyzw", strict=True), key=lambda pair: places[id(pair[0])])
+            order = "".join(letter for _, letter in in_file)
+            if quaternion not in (None, order):
+                listed = ", ".join(column.name for column, _ in in_file)
+                raise InputError(f"{file} has {listed}, which contradicts --quaternion {quaternion}: leave it out")
+            return matches, rotations_of(np.column_stack([column.values for column in matches]), str(file))
+    numbers = {column.plain for column in columns if re.fullmatch("q[0-9]+", column.plain)}
+    for names in _UNNAMED if len(numbers) == 4 else ():
+        same = [_only(file, [column for column in columns if column.plain == name], name) for name in names]
+        matches = [column for column in same if column is not None]
+        if len(matches) == len(names):
+            if quaternion is None:
+                raise InputError(
+                    f"{file} has the quaternion {', '.join(names)} and does not state which is its scalar: give "
+                    "--quaternion wxyz or xyzw"
+                )
+            values = np.column_stack([column.values for column in matches])
+            return matches, rotations_of(values if quaternion == "xyzw" else values[:, [1, 2, 3, 0]], str(file))
+    fixed = [[column for column in columns if re.fullmatch(rf"R{axis} ?\[(deg|rad)\]", column.name)] for axis in "xyz"]
+    if all(len(named) == 1 for named in fixed):  # names that guiderail writes; a rotation vector has rx, ry and rz
+        matches = [column for (column,) in fixed]
+        scales = [_ANGLE_UNITS[str(unit)] for unit in _units(file, matches, _ANGLE_UNITS, angles, "--angles")]
+        assumptions.append("Rz, Ry and Rx are ZYX Euler angles, Rz Ry Rx")
+        return matches, Rotation.from_euler("xyz", np.column_stack([column.values for column in matches]) * scales)
+    for euler in _EULER:
+        if matches := _columns(file, columns, euler):
+            units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")
+            if None in units:
+                name = matches[units.index(None)].name
+                raise InputError(f"{file} does not state whether {name} is in degrees: give --angles deg or rad")
+            assumptions.append("roll, pitch and yaw are about fixed axes, Rz(yaw) Ry(pitch) Rx(roll)")
+            scales = [_ANGLE_UNITS[str(unit)] for unit in units]
+            rotation_angles = np.column_stack([column.values for column in matches]) * scales
+            return matches, Rotation.from_euler("xyz", rotation_angles)
+    return [], None

@@ -1,0 +1,153 @@
+"""ROS 2 bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
+
+import numpy as np
+import pytest
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations
+from guiderail_data.formats.ros_bag import read_bags, write_mcap
+
+pytest.importorskip("rosbags")
+JOINTS = "sensor_msgs/msg/JointState"
+POSE = "geometry_msgs/msg/Pose"
+ARRAY = "std_msgs/msg/Float64MultiArray"
+
+
+def write(path, kind, make, values):
+    """Write a bag with a message for each of `values`; return its path.
+
+    `make` returns a message from the message types by short name and a value.
+    """
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = {name.split("/")[-1]: message_type for name, message_type in store.types.items()}
+    with Writer(path, version=8) as writer:
+        connection = writer.add_connection("/topic", kind, typestore=store)
+        for n, value in enumerate(values):
+            writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, value), kind))
+    return path
+
+
+def joints(types, values):
+    names, positions = values
+    header = types["Header"](stamp=types["Time"](sec=0, nanosec=0), frame_id="")
+    empty = np.array([])
+    return types["JointState"](
+        header=header, name=list(names), position=np.array(positions, dtype=float), velocity=empty, effort=empty
+    )
+
+
+def pose(types, w):
+    return types["Pose"](
+        position=types["Point"](x=0.0, y=0.0, z=0.0), orientation=types["Quaternion"](x=0.0, y=0.0, z=0.0, w=w)
+    )
+
+
+def array(types, values):
+    layout = types["MultiArrayLayout"](dim=[], data_offset=0)
+    return types["Float64MultiArray"](layout=layout, data=np.array(values, dtype=float))
+
+
+def test_joint_order_may_differ_between_messages(tmp_path):
+    orders = [("abc", (1, 2, 3)), ("cab", (3, 1, 2)), ("bca", (2, 3, 1)), ("abc", (1, 2, 3))]
+    result = read_bags(write(tmp_path / "bag", JOINTS, joints, orders), None, None)
+    assert result.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(result.outputs[0], [[1, 2, 3]] * 4)
+
+
+def test_hidden_file_next_to_bags_is_not_read(tmp_path):
+    write(tmp_path / "0", JOINTS, joints, [("abc", (1, 2, 3))] * 2)
+    (tmp_path / "._1.mcap").write_bytes(b"\x00\x05\x16\x07")
+    assert len(read_bags(tmp_path, None, None).times) == 1
+
+
+def test_joint_order_may_differ_between_bags(tmp_path):
+    for name, order in (("0", ("abc", (1, 2, 3))), ("1", ("cab", (3, 1, 2)))):
+        write(tmp_path / name, JOINTS, joints, [order] * 2)
+    result = read_bags(tmp_path, None, None)
+    assert result.names == ("a [rad]", "b [rad]", "c [rad]")
+    np.testing.assert_array_equal(result.outputs, [[[1, 2, 3]] * 2] * 2)
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        (("g", (5,)), "message 1 on /topic of .* has the joints g, and message 0 a, b: record each device"),
+        (("ag", (1, 5)), "has the joints a, g, and message 0 a, b"),
+        (("ab", ()), "has 0 positions for 2 joints"),
+    ],
+)
+def test_bag_is_refused_when_the_joints_change(second, message, tmp_path):
+    bag = write(tmp_path / "bag", JOINTS, joints, [("ab", (1, 2)), second, ("ab", (1, 2))])
+    with pytest.raises(InputError, match=message):
+        read_bags(bag, None, None)
+
+
+def test_bag_is_refused_when_two_joints_have_one_name(tmp_path):
+    bag = write(tmp_path / "bag", JOINTS, joints, [("aba", (1, 2, 3))] * 2)
+    with pytest.raises(InputError, match=r"message 0 on /topic of .* has a joint twice \(a, b, a\)"):
+        read_bags(bag, None, None)
+
+
+@pytest.mark.parametrize("length", [0.0, 0.5, np.nan])
+def test_bag_is_refused_when_a_quaternion_has_no_unit_length(length, tmp_path):
+    bag = write(tmp_path / "bag", POSE, pose, [1.0, length, 1.0])
+    with pytest.raises(InputError, match=r"at sample 1, .*cut such samples out \(1 of 3\)"):
+        read_bags(bag, None, None)
+
+
+def test_bag_is_refused_when_the_array_size_changes(tmp_path):
+    bag = write(tmp_path / "bag", ARRAY, array, [range(6), range(5)])
+    with pytest.raises(InputError, match=r"message 1 on /topic .* has 5 numbers instead of 6"):
+        read_bags(bag, None, None)
+
+
+def test_array_outputs_are_named_after_its_dimension(tmp_path):
+    def labeled_array(types, label):
+        dimension = types["MultiArrayDimension"](label=label, size=3, stride=3)
+        layout = types["MultiArrayLayout"](dim=[dimension], data_offset=0)
+        return types["Float64MultiArray"](layout=layout, data=np.arange(3.0))
+
+    result = read_bags(write(tmp_path / "bag", ARRAY, labeled_array, ["force", "force"]), None, None)
+    assert result.names == ("force 0", "force 1", "force 2")
+    np.testing.assert_array_equal(result.outputs[0], [[0, 1, 2]] * 2)
+    unnamed = read_bags(write(tmp_path / "unnamed", ARRAY, labeled_array, ["", ""]), None, None)
+    assert unnamed.names == ("output 0", "output 1", "output 2")
+
+
+@pytest.mark.parametrize(("kind", "make", "value"), [(ARRAY, array, range(6)), (JOINTS, joints, ("ab", (1, 2)))])
+def test_target_is_refused_without_poses(kind, make, value, tmp_path):
+    with pytest.raises(InputError, match=r"/topic of .* does not state which numbers are a pose: leave --target out"):
+        read_bags(write(tmp_path / "bag", kind, make, [value] * 2), None, (0.0,) * 6)
+
+
+def test_recorder_time_is_used_when_messages_have_no_stamps(tmp_path):
+    result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 3), None, None)
+    np.testing.assert_allclose(result.times[0], [0.0, 0.01, 0.02])
+    assert any("the messages have no stamps that increase" in text for text in result.assumptions)
+
+
+def test_assumption_names_no_frame_without_a_header(tmp_path):
+    result = read_bags(write(tmp_path / "bag", POSE, pose, [1.0] * 2), None, None)
+    assert any(text.startswith("poses stay in the frame of the recording: ") for text in result.assumptions)
+
+
+def test_bag_export_shifts_negative_time(tmp_path):
+    t = 0.1 * np.arange(5)
+    notes = write_mcap(tmp_path / "bags", Demonstrations([t - 0.2, t + 0.3], [t[:, None]] * 2))
+    assert "first samples were at -0.2 to 0.3 s" in notes[-1]
+    loaded = read_bags(tmp_path / "bags", None, None)
+    np.testing.assert_allclose(loaded.times, [t, t], atol=1e-9)
+    np.testing.assert_array_equal(loaded.outputs, [t[:, None]] * 2)
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [([0.0, 1e10], "ends at 1e\\+10 s"), ([0.0, 1e-12], "less than a nanosecond apart")],
+)
+def test_bag_export_refuses_time_out_of_range(times, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        write_mcap(tmp_path / "bags", Demonstrations([np.array(times)], [np.ones((2, 1))]))
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,1 @@
+"""guiderail on robots: drivers, safety, training on a robot and teleoperation."""

@@ -1,0 +1,294 @@
+"""Commands of robots: deploy, train-on-robot, teleoperate, sim-driver and safety-monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
+
+if TYPE_CHECKING:
+    from guiderail_hardware.robot.connection import RobotConnection
+
+RobotUrl = Annotated[str | None, option("LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")]
+Driver = Annotated[str | None, option("Driver fci (Franka) or rtde (UR).  [default: the robot's LCM driver]")]
+Robot = Annotated[
+    str | None, option("Robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
+]
+Sim = Annotated[bool, option("Use a simulated driver in a subprocess instead of a robot.", "--sim")]
+Synchronous = Annotated[
+    bool,
+    option("With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"),
+]
+Rate = Annotated[
+    float | None,
+    option(
+        "With --sim, without --synchronous: speed of the simulated robot's clock relative to real time, from 0.001 to "
+        "1.  [default: 0.2]"
+    ),
+]
+Scenario = Annotated[Path | None, option("Scenario file with the robot, its bus and its surroundings.")]
+Yes = Annotated[bool, option("Answer all pre-flight questions with yes.", "--yes")]
+
+
+def connect(
+    environment: Mapping[str, Any], scenario: Path | None, *, sim: bool, synchronous: bool, rate: float | None
+) -> RobotConnection:
+    """Return the connection to a robot.
+
+    Args:
+        environment: Options of the environment; `robot_url`, `robot` and `driver` are used.
+        scenario: Scenario file, or None.
+        sim: Use a simulated driver.
+        synchronous: The driver and the controller wait for each other.
+        rate: Speed of the simulated robot's clock relative to real time; None for the default.
+
+    Raises:
+        InputError: As `RobotConnection.from_scenario`.
+    """
+    from guiderail_hardware.robot.connection import RobotConnection
+
+    given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
+    given |= {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
+    return RobotConnection.from_scenario(scenario, **given)
+
+
+@cli.command("deploy runs/connector --sim --yes")
+def deploy(
+    run: Annotated[Path, argument("Folder of a run, or pretrained:NAME ({pretrained}).", "RUN")],
+    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
+    robot_url: RobotUrl = None,
+    robot: Robot = None,
+    driver: Driver = None,
+    sim: Sim = False,
+    synchronous: Synchronous = False,
+    rate: Rate = None,
+    scenario: Scenario = None,
+    force_limit: Annotated[
+        float | None, option("Force limit of a first motion [N].  [default and maximum: that of the training]")
+    ] = None,
+    episodes: Annotated[
+        int | None,
+        option("Number of episodes of an evaluation, one row each.  [default: one execution]"),
+    ] = None,
+    policy: Annotated[
+        str | None, option("With --episodes: policy to evaluate instead of the run's: scripted, {baselines}.")
+    ] = None,
+    yes: Yes = False,
+    out: Annotated[
+        Path | None, option("Folder of the recording.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]")
+    ] = None,
+    imports: cli.HardwareImports = None,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Execute a policy on a robot, once or, with --episodes, as an evaluation.
+
+    The assumptions about the robot are printed and have to be confirmed. Then the controller holds the arm at its
+    present pose, moves it slowly to the start and executes the skill; every control step is recorded. The exit code is
+    0 if the skill was executed to its end, and 1 if a limit, a fault or a key stopped it. An evaluation pauses between
+    its episodes; a stopped episode counts as a failure.
+    """
+    cli.import_files(imports)
+    environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
+    connection = connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
+    if episodes is not None:
+        if force_limit is not None:
+            raise InputError("an evaluation has the force limit of the training: leave --force-limit out")
+        from guiderail_hardware.robot.evaluate import evaluate_on_robot
+
+        result = evaluate_on_robot(
+            run, connection, episodes, station=station, policy=policy, assume_yes=yes, out=out, log=print_message
+        )
+        print_result(result, as_json)
+        return
+    if policy is not None or as_json:
+        raise InputError("--policy and --json belong to an evaluation: give --episodes too")
+    from guiderail_hardware.robot.executor import deploy as deploy_policy
+
+    code = deploy_policy(
+        run, connection, station=station, force_limit=force_limit, assume_yes=yes, out=out, log=print_progress
+    )
+    raise typer.Exit(code)
+
+
+@cli.command("train-on-robot BncConnector --sim --yes --episodes 20 --out runs/robot", "train-on-robot")
+def train_on_robot(
+    task: Annotated[str | None, argument("Task to learn: {tasks}.", "TASK", "tasks")] = None,
+    out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
+    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
+    guidance: cli.Guidance = None,
+    algorithm: Annotated[
+        str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")
+    ] = None,
+    episodes: Annotated[int | None, option("Total number of episodes.  [default: 60]")] = None,
+    seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
+    preset: Annotated[
+        str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
+    ] = None,
+    env: cli.Env = None,
+    robot_url: RobotUrl = None,
+    robot: Robot = None,
+    driver: Driver = None,
+    sim: Sim = False,
+    synchronous: Synchronous = False,
+    rate: Rate = None,
+    scenario: Scenario = None,
+    yes: Yes = False,
+    step_log: Annotated[
+        bool | None,
+        option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
+    ] = None,
+    resume: Annotated[
+        bool, option("Resume the run in --out; a run with a simulated driver needs --sim again.", "--resume")
+    ] = False,
+    imports: cli.Imports = None,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Train a policy on a robot and write a run folder.
+
+    Every episode ends with a checkpoint, and an interrupted run is resumed with --resume.
+    """
+    from guiderail.tools.imports import import_modules
+
+    name, folders = (None, ()) if task is None else cli.find_task(task, imports)
+    modules = import_modules((*folders, *(imports or ())))
+    if out is None:
+        raise InputError("the run needs a folder: name one with --out RUN")
+    environment = cli.parse_environment(
+        env, guidance=guidance, station=station, robot=robot, robot_url=robot_url, driver=driver
+    )
+    if resume:
+        environment = _with_stored_robot(out, environment)
+    settings: dict[str, Any] = cli.parse_pairs(setting, "--set", "batch_size=128")
+    if settings.get("num_envs", "0") != "0":
+        raise InputError("there is one robot: leave num_envs out")
+    given = {
+        "algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log,
+        "imports": modules,
+    }  # fmt: skip
+    from guiderail_hardware.robot.train import train_on_robot as train
+
+    result = train(
+        name,
+        out,
+        connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate),
+        environment=environment,
+        given={key: value for key, value in given.items() if value is not None},
+        settings=settings,
+        resume=resume,
+        assume_yes=yes,
+        log=print_message,
+    )
+    print_result(result, as_json)
+
+
+def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:
+    """Return the given options, completed by the station, the robot and the driver of a run on hardware."""
+    from guiderail.tools.learning.run_folder import RunFolder
+
+    stored = RunFolder(out).config().environment
+    names = ("station", "robot", "driver")
+    return {name: stored[name] for name in names if stored.get(name) is not None} | environment
+
+
+@cli.command("teleoperate ./peg --record demonstrations.npz")
+def teleoperate(
+    task: Annotated[str, argument("Folder of a task, or one of {tasks}.", "TASK", "tasks")],
+    record: Annotated[
+        Path | None, option("Demonstrate in the browser and write the demonstrations to this new file, .npz or .csv.")
+    ] = None,
+    guidance: cli.Guidance = None,
+    env: cli.Env = None,
+    imports: cli.TaskImports = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Act in place of the policy, or demonstrate a task.
+
+    Without --record, a gamepad, sliders or keys give the action of the task's guidance. With --record, they move the
+    desired pose, the robot follows under impedance control, and the page in the browser shows the force. Each
+    demonstration is kept or discarded; a kept demonstration is written at once.
+    """
+    name = cli.find_task(task, imports)[0]
+    environment = cli.parse_environment(env, guidance=guidance)
+    if record is None:
+        if as_json:
+            raise InputError("--json prints a summary of the demonstrations: give --record too")
+    elif guidance is not None:
+        raise InputError("a demonstration is recorded without guidance: leave --guidance out")
+    from guiderail_hardware.teleop import recorder
+
+    if record is None:
+        recorder.teleoperate(name, environment, print_progress)
+    else:
+        print_result(recorder.record_demonstrations(name, environment, record, print_progress), as_json)
+
+
+@cli.command("sim-driver --seconds 60", "sim-driver")
+def sim_driver(
+    url: Annotated[
+        str, option("LCM URL of the driver's bus; with --driver fci an address.  [default: LCM's default; 127.0.0.1]")
+    ] = "",
+    driver: Driver = None,
+    seconds: Annotated[float, option("Duration in simulated time [s].")] = 3600.0,
+    command_timeout: Annotated[float, option("Without --rate: longest wait for a command [s].")] = 5.0,
+    task: Annotated[
+        str, option("Task with the fixture in front of the robot: {tasks}.", choices="tasks")
+    ] = "BncConnector",
+    rate: Annotated[
+        float | None, option("Follow the wall clock at this rate, at most 1, without waiting for commands.")
+    ] = None,
+    offset: Annotated[str | None, option("x,y offset of the fixture [m], such as 0.001,-0.0005.")] = None,
+    scenario: Annotated[Path | None, option("Scenario file with the robot's surroundings.")] = None,
+    imports: cli.Imports = None,
+) -> None:
+    """Simulate a robot and its driver: an iiwa on LCM with a safety monitor, or with --driver fci a Franka.
+
+    The robot stands in front of a task's fixture. Without --rate, the exit code is 1 if commands stopped arriving.
+    """
+    from guiderail_hardware.robot.sim_driver import run_sim_driver
+
+    name = cli.find_task(task, imports)[0]
+    xy = None if offset is None else tuple(cli.parse_floats(offset, 2, "--offset"))
+    completed = run_sim_driver(
+        url,
+        seconds,
+        command_timeout,
+        name,
+        rate=rate,
+        offset=xy,
+        scenario=scenario,
+        driver=driver or "",
+        log=print_progress,
+    )
+    raise typer.Exit(0 if completed else 1)
+
+
+@cli.command("safety-monitor --task BncConnector", "safety-monitor")
+def safety_monitor(
+    url: Annotated[str, option("LCM URL of the driver's bus.  [default: LCM's default]")] = "",
+    robot: Annotated[str, option("Robot arm.", choices="robots")] = "iiwa14",
+    task: Annotated[
+        str, option("Task with the workpiece that the arm carries: {tasks}.", choices="tasks")
+    ] = "BncConnector",
+    rate: Annotated[float, option("Rate of a simulated robot's clock relative to this machine's.")] = 1.0,
+    imports: cli.Imports = None,
+) -> None:
+    """Bring a robot to rest when torque commands stop arriving, or its status is wrong.
+
+    Some drivers repeat the last torque after the program that sent it has ended. For such a driver, guiderail deploy
+    moves the robot only if this monitor runs. The monitor runs on the driver's machine until it is terminated.
+    """
+    from guiderail_hardware.robot.sim_driver import run_safety_monitor
+
+    run_safety_monitor(url, robot, cli.find_task(task, imports)[0], rate=rate, log=print_progress)

@@ -1,0 +1,1 @@
+"""Drivers of robots: interface, protocols, simulated counterparts and clocks."""

@@ -1,0 +1,1 @@
+"""Numerics of robots without Drake: status checks, message sequence and state estimation."""

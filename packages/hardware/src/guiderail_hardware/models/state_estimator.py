@@ -1,0 +1,431 @@
+"""Estimator of a robot's joint state that compares status messages with each other, with the clock and with a model.
+
+The hardware station (`StatusWatchdog`) and the safety monitor use it. docs/robot.md derives the thresholds.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.errors import InputError
+from guiderail_hardware.models.joint_status import (
+    Fault,
+    JointStatus,
+    LastStatus,
+    StatusLimits,
+    check_status,
+    parse_status,
+)
+from guiderail_hardware.models.message_sequence import RESOLUTION
+
+# Faults with which a status is accepted.
+ACCEPTABLE_FAULTS = (Fault.NONE, Fault.DEADLINE_MISSED, Fault.SECOND_COMMANDER)
+# Faults after which the message is dropped, and the next message is compared with the last readable status. After any
+# other fault, statuses are in doubt until all have been valid for the settling time. A status in doubt is only accepted
+# if it agrees with the prediction.
+DROPPED_FAULTS = (Fault.NO_STATUS, Fault.MALFORMED, Fault.WRONG_SIZE, Fault.NOT_FINITE)
+FRESH_FRACTION = 0.5  # fraction of the maximum age up to which damping with a measured velocity does not oscillate
+AGREEMENT = 0.1  # largest difference from the predicted velocity at which a status in doubt is accepted [rad/s]
+# Fraction by which the clock offset follows a status that arrives earlier than expected. With 1, all messages after a
+# single stray message would be late.
+EARLY_FRACTION = 0.2
+EARLY_WINDOW = 0.5  # decay time of the sum of offset corrections for early statuses [s]
+MAX_EARLY = 1.0 / 3.0  # sum of these corrections above which the robot's clock is too fast, relative to `max_lead`
+POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
+REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
+MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
+MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # motion [rad] and speed [rad/s] above which a joint's values must change
+MAX_EQUAL_POSITIONS, MAX_EQUAL_VELOCITIES = 2, 4  # number of repetitions of a moving joint's value that is a fault
+MAX_EQUAL_STATUSES = 4  # number of repetitions of all values of a joint that is a fault while another joint is moving
+MODEL_ERROR, SENSOR_ERROR = 0.3, 0.1  # largest relative error of inertia times acceleration, and of external torque
+EXTERNAL_STEP = 2.0  # largest change of the predicted external torque between statuses, in torque tolerances
+LAG = 1.0  # largest delay of a velocity's filter [periods]
+DELAY = 2.0  # largest time from a command or a contact to its effect on torques [periods]
+REACTION = 1.5  # accepted change of velocity that no torque explains, relative to the measured change
+MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
+BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time constants of the learned bias with and without commanded torque [s]
+MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity is unknown [s]
+
+
+@dataclass(frozen=True)
+class EstimatorState:
+    """State of the estimator between two checks."""
+
+    check_time: float  # local time of the next check [s]
+    receipt_time: float  # local time of the last readable status [s]
+    fault: float  # last fault, a code of `Fault`; `NONE` after the settling time
+    fault_time: float  # local time of that fault [s]
+    doubt_time: float  # local time of the last fault that put statuses in doubt [s]; NaN if none
+    early: float  # sum of the recent corrections of the clock offset for early statuses [s]
+    conflicts: float  # `JointStatus.conflicts` of the last status
+    foreign_commands: float  # `JointStatus.foreign_commands` of the last status
+    last_time: float  # time stamp of the last readable status [s]; NaN before the first
+    last_offset: float  # offset from the robot's clock to the local clock after the last readable status [s]
+    accepted_time: float  # time stamp of the accepted status [s]; NaN before the first
+    accepted_offset: float  # clock offset after the accepted status [s]
+    last_values: np.ndarray  # `JointStatus.values` of the last readable status, valid or not, (3n,)
+    # `JointStatus.values` of the accepted status, (3n,), with the velocity limited as described in `StateEstimator`;
+    # zero before the first accepted status.
+    accepted_values: np.ndarray
+    velocity: np.ndarray  # velocity estimate from several sources, (n,) [rad/s]; zero where it is unknown
+    residual: np.ndarray  # recent difference between positions and integrated velocities, (n,) [rad]
+    equal_positions: np.ndarray  # number of consecutive equal positions of each moving joint, (n,)
+    equal_velocities: np.ndarray  # number of consecutive equal velocities of each moving joint, (n,)
+    # Number of consecutive statuses with equal values of a joint while another joint moves, (n,).
+    equal_values: np.ndarray
+    # External torque of the prediction, which follows the accepted external torque at a limited rate, (n,) [Nm].
+    external: np.ndarray
+    torque: np.ndarray  # torques in effect until the next check, (n,) [Nm]
+    variation: np.ndarray  # last change of torques and external torques, (n,) [Nm]
+    predicted: np.ndarray  # recent impulse of all torques, (n,) [Nms]
+    commanded: np.ndarray  # recent impulse of the torques without the external ones, (n,) [Nms]
+    measured: np.ndarray  # recent change of momentum, (n,) [Nms]
+    reaction: np.ndarray  # recent changes of velocity, (n,) [rad/s], not negative
+    # Largest difference of `predicted` and `measured` that errors of the torques explain, (n,) [Nms].
+    tolerance: np.ndarray
+    bias: np.ndarray  # learned constant error of the torques, (n,) [Nm]
+
+    @classmethod
+    def initial(cls, num_joints: int) -> "EstimatorState":
+        """Return the state before the first check."""
+        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
+        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((14, num_joints)))
+
+    @classmethod
+    def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
+        """Return the state from the result of `vector`."""
+        values, vectors = np.split(vector[12:], [6 * num_joints])
+        return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(14, -1))
+
+    def vector(self) -> np.ndarray:
+        """Return the state as one vector, (12 + 20 n,)."""
+        return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
+
+    @property
+    def last(self) -> LastStatus:
+        """Last readable status, valid or not."""
+        return LastStatus(self.last_time, self.last_offset, self.last_values)
+
+    @property
+    def accepted(self) -> LastStatus:
+        """Last accepted status."""
+        return LastStatus(self.accepted_time, self.accepted_offset, self.accepted_values)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Result of a check."""
+
+    fault: Fault  # present or recent fault, or `Fault.NONE`
+    age: float  # age of the accepted status by the synchronized clocks [s]; infinite before the first
+    is_new: bool  # True if a status is accepted at this check
+    state: EstimatorState  # state for the next check; has the accepted values and the velocity estimate
+
+
+class StateEstimator:
+    """Estimator of a robot's joint state that checks each status.
+
+    `check_status` compares a status with its predecessor and the clock. A status without such a fault is also compared
+    with a model, for each joint:
+
+    - *Equal values*: if the velocity or positions of a joint show motion, consecutive statuses do not have bit-equal
+      positions or velocities of the joint. While one joint moves, no other joint repeats all of position, velocity and
+      external torque.
+    - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses with the velocities v₋ and v and
+      the time h between them. The sum of deviations, with a decay, is within the position tolerance.
+    - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay, and the time h
+      between two checks,
+      |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
+      The last term, with a faster decay, accepts collisions, which change the velocity before the external torque. It
+      is zero for a joint that does not react. Δv_noise and Δv_max are `velocity_noise` and `velocity_jump`.
+
+    A fault is reported until all statuses have been valid for the settling time. The velocity estimate is the median of
+    three sources: the reported velocity, the change of position, and the last estimate plus the effect of the torques.
+    A single wrong source therefore cannot move the estimate out of the interval of the other two sources. While no
+    status is accepted, only the third source is used, so that damping ends when the momentum is removed. A status in
+    doubt can only reduce the size of the estimate. The arm is controlled with the accepted velocity: the reported
+    velocity, limited to the interval of the other two sources, widened by the velocity noise.
+
+    The clocks are synchronized with the first status. Afterwards the clock offset follows early statuses quickly and
+    late statuses slowly. After a fault or a timeout the clocks are synchronized again. Delays of this program are not
+    attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`.
+
+    Args:
+        limits: Plausibility limits of a status.
+        torque_tolerance: Largest error of each joint's torque, (n,) [Nm], positive: friction, gravity compensation,
+            sensor.
+        period: Period of the check [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range.
+    """
+
+    def __init__(self, limits: StatusLimits, torque_tolerance: Sequence[float], *, period: float):
+        self._limits, self._period, n = limits, period, len(limits.velocity)
+        self._torque_tolerance = as_numbers(torque_tolerance, "torque_tolerance")
+        if self._torque_tolerance.shape != (n,):
+            raise InputError(f"a robot with {n} joints needs a torque tolerance for each of them")
+        if not ((self._torque_tolerance > 0.0) & (self._torque_tolerance < np.inf)).all():
+            raise InputError("the torque tolerances of a robot must be positive and finite")
+        if not 0.0 < period < np.inf:
+            raise InputError(f"the period of an estimator must be positive, not {period} s")
+        self._zeros = np.zeros(n)
+        self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
+
+    def evaluate(
+        self, before: EstimatorState, status: JointStatus | None, now: float, M: np.ndarray, drag: np.ndarray
+    ) -> Estimate:
+        """Check the newest status.
+
+        Args:
+            before: State after the last check.
+            status: Newest status, None before the first; a status that `parse_status` refuses is malformed.
+            now: Local time [s].
+            M: Mass matrix at the accepted positions, (n, n).
+            drag: Torques that oppose the estimated velocity in the model (Coriolis, damping), (n,) [Nm].
+
+        Returns:
+            The fault, the age of the accepted status and the estimate; `advance` completes the state.
+        """
+        status = parse_status(status)
+        state = self._predict(before, now, M, drag)
+        is_doubted = np.isfinite(before.doubt_time)
+        is_trusted = not is_doubted or (status is not None and self._agrees(status, state, now))
+        last = before.accepted if is_doubted and is_trusted else before.last
+        fault = self._find_fault(before, last, status, now)
+        if status is None or fault in DROPPED_FAULTS:
+            return self._finish(state, before, fault, now)
+        values = status.values()
+        state = replace(state, conflicts=float(status.conflicts), foreign_commands=float(status.foreign_commands))
+        is_reordered = status.time <= last.time and fault in ACCEPTABLE_FAULTS
+        if is_reordered or (status.time == last.time and np.array_equal(values, last.values)):
+            return self._finish(state, before, fault, now)
+
+        if fault == Fault.CONFLICT and not is_doubted:
+            # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
+            reported = before.last_values[self._velocities]
+            state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
+        elapsed, change = status.time - last.time, values - last.values
+        is_comparable = 0.0 < elapsed <= self._limits.max_age and fault in ACCEPTABLE_FAULTS
+        if (is_doubted and is_trusted) or not is_comparable:
+            state = self._restart(state)
+        if is_comparable:
+            state = self._update_positions(state, values, change, elapsed)
+        if is_comparable and not is_doubted and state.torque.any():
+            state = self._update_momentum(state, M, change[self._velocities], elapsed)
+        else:
+            # The momentum sums start again at this status.
+            is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
+            state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
+        fault = fault or self._find_contradiction(state, M)
+        state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
+        state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
+        velocity = values[self._velocities]
+        if is_comparable:
+            others, margin = (change[self._positions] / elapsed, state.velocity), self._limits.velocity_noise
+            values = values.copy()
+            values[self._velocities] = np.clip(velocity, np.min(others, 0) - margin, np.max(others, 0) + margin)
+            reported, velocity = velocity, np.median((velocity, *others), axis=0)
+            if fault == Fault.INCONSISTENT:
+                # Two of the three sources are from this status, whose velocity may be outdated.
+                is_old = np.abs(np.array((reported, others[0])) - state.velocity).min(axis=0) > AGREEMENT
+                velocity = np.where(is_old, state.velocity, velocity)
+            if is_doubted:
+                # Damping with an outdated velocity would drive the arm. The predicted velocity therefore limits it.
+                size = np.minimum(np.abs(velocity), np.abs(state.velocity))
+                velocity = np.where(velocity * state.velocity > 0.0, np.sign(velocity) * size, 0.0)
+        if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING) and not is_doubted:
+            is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
+            missing, is_missing = self._missing_velocity(state, M)
+            state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
+        if fault not in ACCEPTABLE_FAULTS or not is_trusted:
+            return self._finish(state, before, fault, now)
+        age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
+        reach = EXTERNAL_STEP * self._torque_tolerance
+        external = np.clip(values[self._torques], before.external - reach, before.external + reach)
+        variation = np.abs(external - before.external)
+        state = replace(state, velocity=velocity, variation=variation, accepted_values=values, external=external)
+        state = replace(state, accepted_time=status.time, accepted_offset=state.last_offset)
+        return self._finish(state, before, fault, now, age)
+
+    def advance(self, estimate: Estimate, torque: np.ndarray) -> EstimatorState:
+        """Return the state for the next check, until which the torques (n,) [Nm] are in effect.
+
+        A torque that is NaN or infinite counts as zero.
+        """
+        state = estimate.state
+        torque = np.where(np.isfinite(torque), torque, 0.0)
+        return replace(state, torque=torque, variation=state.variation + np.abs(torque - state.torque))
+
+    def forget_torque(self, state: EstimatorState) -> EstimatorState:
+        """Return the state after a command that was not sent, so that the torques in effect are unknown.
+
+        Until the next status, the prediction assumes zero torque. The velocity is not compared with torques, and no
+        bias is learned.
+        """
+        return replace(state, torque=self._zeros, tolerance=self._period * self._torque_tolerance)
+
+    def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
+        """Return the state with the effect of the torques since the last check."""
+        step = max(now - before.check_time + self._period, 0.0)
+        # The external torque is unknown without a recent status, and may be wrong while statuses are in doubt.
+        age = now - step - (before.accepted_time + before.accepted_offset)
+        is_known = np.isfinite(age) and not np.isfinite(before.doubt_time)
+        freshness = np.clip(2.0 - age / self._period, 0.0, 1.0) if is_known else 0.0
+        external = freshness * before.external
+        net = before.torque + external - drag + before.bias
+        error = self._torque_tolerance + MODEL_ERROR * np.abs(net) + SENSOR_ERROR * np.abs(external)
+        return replace(
+            before,
+            velocity=before.velocity + step * np.linalg.solve(M, net),
+            predicted=before.predicted + step * net,
+            commanded=before.commanded + step * (net - external),
+            tolerance=before.tolerance + step * (error + DELAY * before.variation),
+            variation=self._zeros,
+        )
+
+    def _find_fault(self, before: EstimatorState, last: LastStatus, status: JointStatus | None, now: float) -> Fault:
+        fault = check_status(status, last, now, self._limits)
+        if not fault and status is not None and np.isfinite(last.time):
+            if status.conflicts > before.conflicts:
+                return Fault.CONFLICT
+            if status.foreign_commands > before.foreign_commands:
+                return Fault.SECOND_COMMANDER
+        if not fault and now - before.check_time > self._limits.max_check_interval:
+            return Fault.DEADLINE_MISSED
+        return fault
+
+    def _agrees(self, status: JointStatus, state: EstimatorState, now: float) -> bool:
+        """Return True if a status is valid and fresh relative to the accepted one, and its velocity is as predicted."""
+        accepted, elapsed = state.accepted, status.time - state.accepted_time
+        is_fresh = elapsed > 0.0 and now - (status.time + accepted.offset) <= FRESH_FRACTION * self._limits.max_age
+        if not is_fresh or check_status(status, accepted, now, self._limits) != Fault.NONE:
+            return False
+        values = status.values()
+        deviation = self._deviation(values, values - accepted.values, elapsed)
+        is_moving_as_predicted = np.abs(values[self._velocities] - state.velocity) <= AGREEMENT
+        return bool((is_moving_as_predicted & (np.abs(deviation) <= self._limits.position_tolerance)).all())
+
+    def _deviation(self, values: np.ndarray, change: np.ndarray, elapsed: float) -> np.ndarray:
+        """Return the part of each position's change that the velocities do not explain, (n,) [rad]."""
+        acceleration = change[self._velocities]
+        error = change[self._positions] - elapsed * (values[self._velocities] - 0.5 * acceleration)
+        return np.sign(error) * np.maximum(np.abs(error) - LAG * elapsed * np.abs(acceleration), 0.0)
+
+    def _update_positions(
+        self, state: EstimatorState, values: np.ndarray, change: np.ndarray, elapsed: float
+    ) -> EstimatorState:
+        speed, is_equal = np.abs(values[self._velocities]), change == 0.0
+        equal_positions = is_equal[self._positions] & (speed * elapsed > MIN_MOTION)
+        # If a velocity is frozen close to zero, the positions show that the joint moves.
+        moved = (np.abs(change[self._positions]) - 2.0 * RESOLUTION) / elapsed
+        equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
+        equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
+        decay = np.exp(-elapsed / POSITION_WINDOW)
+        return replace(
+            state,
+            residual=decay * state.residual + self._deviation(values, change, elapsed),
+            equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
+            equal_velocities=np.where(equal_velocities, state.equal_velocities + 1.0, 0.0),
+            equal_values=np.where(equal_values, state.equal_values + 1.0, 0.0),
+        )
+
+    def _restart(self, state: EstimatorState) -> EstimatorState:
+        """Return the state with the comparisons of consecutive statuses reset."""
+        zero = self._zeros
+        return replace(state, residual=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
+
+    def _update_momentum(
+        self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
+    ) -> EstimatorState:
+        decay, share = np.exp(-elapsed / MOMENTUM_WINDOW), elapsed / (MOMENTUM_WINDOW * BIAS_TIME)
+        predicted, measured = decay * state.predicted, decay * (state.measured + M @ change)
+        return replace(
+            state,
+            predicted=predicted,
+            commanded=decay * state.commanded,
+            measured=measured,
+            reaction=np.exp(-elapsed / REACTION_WINDOW) * (state.reaction + np.abs(change)),
+            tolerance=decay * state.tolerance,
+            bias=self._limited_bias(state.bias - share * (predicted - measured)),
+        )
+
+    def _update_rest(self, state: EstimatorState, change: np.ndarray) -> EstimatorState:
+        """Return the state with zero momentum sums; the bias is learned from `predicted` minus `change` (n,) [Nms]."""
+        bias = self._limited_bias(state.bias - (state.predicted - change) / REST_BIAS_TIME)
+        zero = self._zeros
+        state = replace(state, bias=bias, predicted=zero, commanded=zero, measured=zero)
+        return replace(state, reaction=zero, tolerance=zero)
+
+    def _limited_bias(self, bias: np.ndarray) -> np.ndarray:
+        limit = MAX_BIAS * self._torque_tolerance
+        return np.clip(bias, -limit, limit)
+
+    def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the velocity change by recent torques that the reported velocity lacks (n,) [rad/s], and a mask (n,).
+
+        The change is computed with and without the external torques, and the smaller result is used. The mask is true
+        if both results have the same sign. Otherwise, not the velocity but the external torque is wrong.
+        """
+        missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
+        is_missing = np.prod(np.sign(missing), axis=1) > 0.0
+        return np.where(is_missing, np.sign(missing[:, 0]) * np.abs(missing).min(axis=1), 0.0), is_missing
+
+    def _find_contradiction(self, state: EstimatorState, M: np.ndarray) -> Fault:
+        counts = (
+            (state.equal_positions, MAX_EQUAL_POSITIONS),
+            (state.equal_velocities, MAX_EQUAL_VELOCITIES),
+            (state.equal_values, MAX_EQUAL_STATUSES),
+        )
+        if any((count >= limit).any() for count, limit in counts):
+            return Fault.FROZEN
+        if (np.abs(state.residual) > self._limits.position_tolerance).any():
+            return Fault.INCONSISTENT
+        inverse, limits = np.linalg.inv(M), self._limits
+        deviation = np.abs(inverse @ (state.predicted - state.measured))
+        reaction = np.minimum(REACTION * state.reaction, limits.velocity_jump)
+        allowed = limits.velocity_noise + np.abs(inverse) @ state.tolerance + reaction
+        return Fault.NOT_REACTING if (deviation > allowed).any() else Fault.NONE
+
+    def _synchronize(
+        self, state: EstimatorState, offset: float, measured: float, now: float, fault: Fault
+    ) -> tuple[EstimatorState, Fault]:
+        """Return the state with the clock offset after a status with the offset `measured` [s], and the fault."""
+        receipt_age = now - state.receipt_time
+        is_synchronized = fault in ACCEPTABLE_FAULTS and np.isfinite(state.last_time)
+        is_late = fault == Fault.STALE and receipt_age <= self._limits.max_age
+        if not (is_synchronized or is_late):
+            return replace(state, last_offset=measured, early=0.0), fault
+        delay = measured - offset
+        change = min(delay, self._limits.clock_drift * self._period) if delay > 0.0 else EARLY_FRACTION * delay
+        early = state.early * np.exp(-receipt_age / EARLY_WINDOW) - min(change, 0.0)
+        if early > MAX_EARLY * self._limits.max_lead:
+            return replace(state, last_offset=measured, early=0.0), fault or Fault.CLOCK_RATE
+        return replace(state, last_offset=offset + change, early=early), fault
+
+    def _finish(
+        self, state: EstimatorState, before: EstimatorState, fault: Fault, now: float, age: float | None = None
+    ) -> Estimate:
+        """Return the result of a check; `age` [s] is that of the status accepted at this check, None without one."""
+        is_new = age is not None
+        if age is None:
+            accepted_at = before.accepted_time + before.accepted_offset
+            age = max(now - accepted_at, 0.0) if np.isfinite(accepted_at) else np.inf
+        # If the robot's clock is set back after a timeout, its controller has restarted.
+        has_restarted = fault == Fault.OUT_OF_ORDER and before.fault == Fault.STALE
+        if age > MAX_PREDICTION_TIME or has_restarted or not np.isfinite(state.velocity).all():
+            state = replace(state, velocity=self._zeros)
+        # Computed and not read from a context, so that the state can be copied to a diagram with another time.
+        check_time = now + self._period
+        state = replace(state, check_time=check_time)
+        if fault:
+            state = replace(state, fault=float(fault), fault_time=now)
+        elif check_time - state.fault_time > self._limits.settling_time:
+            state = replace(state, fault=float(Fault.NONE))
+        if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
+            state = replace(state, doubt_time=now)
+        elif check_time - state.doubt_time > self._limits.settling_time:
+            state = replace(state, doubt_time=np.nan)
+        return Estimate(fault or Fault(int(before.fault)), age, is_new, state)

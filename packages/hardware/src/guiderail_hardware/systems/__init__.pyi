@@ -1,0 +1,11 @@
+from .gripper_command import GripperCommand as GripperCommand
+from .heartbeat_monitor import HeartbeatMonitor as HeartbeatMonitor
+from .meshcat_device import MeshcatDevice as MeshcatDevice
+from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter
+from .pose_publisher import PosePublisher as PosePublisher
+from .pose_rate_limiter import PoseRateLimiter as PoseRateLimiter
+from .status_watchdog import StatusWatchdog as StatusWatchdog
+from .torque_publisher import TorquePublisher as TorquePublisher
+from .torque_safety_limiter import ArmState as ArmState
+from .torque_safety_limiter import SafetyLimits as SafetyLimits
+from .torque_safety_limiter import TorqueSafetyLimiter as TorqueSafetyLimiter

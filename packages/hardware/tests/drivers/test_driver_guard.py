@@ -1,0 +1,336 @@
+"""A driver that raises exceptions or returns wrong objects: a moving arm is damped to rest nevertheless."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from direct_driver import START, DirectDriver, start_station
+from hardware_doubles import unplugged
+from pydrake.systems.analysis import Simulator
+
+from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.models.common.errors import InputError
+from guiderail_hardware.drivers.clock import WallClock
+from guiderail_hardware.drivers.driver import PoseDriver, describe_stop
+from guiderail_hardware.models.joint_status import MALFORMED_STATUS, Fault, Heartbeat, JointStatus
+from guiderail_hardware.station import HardwareStation
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
+
+DAMPING_STEPS = 60  # steps in which the arm is damped to rest
+PERIOD = DirectDriver.period
+
+
+class NoisyDriver(DirectDriver):
+    """Robot with noise in its velocities, because constant velocities would count as frozen."""
+
+    is_repeating = False  # while `write` fails, the robot repeats the last torque
+
+    def read(self):
+        status = super().read()
+        return replace(status, velocities=status.velocities + 1e-9 * (-1) ** round(self.time / self.period))
+
+    def elapse(self):
+        if self.is_repeating:
+            DirectDriver.write(self, self.torques.pop(), self.time)
+        super().elapse()
+
+
+class MovingArm:
+    """Arm that a station moves at about 0.3 rad/s."""
+
+    def __init__(self, driver=None):
+        self.driver = driver or NoisyDriver()
+        self.station = HardwareStation(BncWorkcell(), self.driver)
+        self.simulator = Simulator(self.station)
+        self.context = self.simulator.get_mutable_context()
+        self.step = 0
+        desired_pose = self.station.get_desired_pose_input_port()
+        desired_pose.FixValue(self.context, START)
+        self.station.start(self.simulator)
+        self.advance(200)
+        desired_pose.FixValue(self.context, START + [0.03, 0.0, 0.03, 0.0, 0.0, 0.0])
+        self.advance(50)
+        assert self.speed > 0.2
+        self.num_torques = len(self.driver.torques)
+
+    def advance(self, steps=1):
+        for _ in range(steps):
+            self.step += 1
+            self.driver.elapse()
+            self.simulator.AdvancePendingEvents()
+            self.station.receive(self.context)
+            self.simulator.AdvanceTo(self.step * PERIOD)
+
+    @property
+    def speed(self):
+        return np.abs(self.driver.velocities).max()
+
+    @property
+    def fault(self):
+        return Fault(int(self.station.get_fault_output_port().Eval(self.context)[0]))
+
+    @property
+    def arm_state(self):
+        return ArmState(int(self.station.get_arm_state_output_port().Eval(self.context)[0]))
+
+    @property
+    def torques(self):
+        return self.driver.torques[self.num_torques :]
+
+
+def exit_program(*arguments):
+    raise SystemExit(3)
+
+
+def change_statuses(driver, change):
+    """Apply a function to every status that a driver returns."""
+    read = driver.read
+    driver.read = lambda: change(read())
+
+
+# Changes of a status, and the expected faults.
+STATUSES = {
+    "text": (lambda status: replace(status, positions=["a"] * 7), Fault.MALFORMED),
+    "scalar": (lambda status: JointStatus(status.time, 0.0, 0.0, 0.0), Fault.WRONG_SIZE),
+    "none": (lambda status: replace(status, positions=None), Fault.MALFORMED),
+    "column": (lambda status: replace(status, positions=status.positions[:, None]), Fault.WRONG_SIZE),
+    "complex": (lambda status: replace(status, positions=status.positions + 0j), Fault.MALFORMED),
+    "text as time": (lambda status: replace(status, time="now"), Fault.MALFORMED),
+    "no time": (lambda status: replace(status, time=None), Fault.MALFORMED),
+    "array as time": (lambda status: replace(status, time=np.zeros(2)), Fault.MALFORMED),
+    "dictionary": (lambda status: {"time": status.time}, Fault.MALFORMED),
+    "no status": (lambda status: None, Fault.NO_STATUS),
+}
+METHODS = ("read", "receive", "read_heartbeats")
+
+
+@pytest.mark.parametrize("name", STATUSES)
+def test_arm_is_damped_when_a_status_is_malformed(name):
+    change, fault = STATUSES[name]
+    arm = MovingArm()
+    change_statuses(arm.driver, change)
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (fault, ArmState.OFF)
+    assert arm.speed < 0.05
+    assert len(arm.torques) >= 40
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("fail", [unplugged, exit_program])
+def test_arm_is_damped_when_a_read_raises(method, fail):
+    arm = MovingArm()
+    setattr(arm.driver, method, fail)
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+    assert len(arm.torques) >= 40
+    reason = "OSError: cable unplugged" if fail is unplugged else "SystemExit: 3"
+    assert describe_stop(arm.fault, arm.driver) == f"{Fault.MALFORMED.description} ({method} raised {reason})"
+
+
+@pytest.mark.parametrize("heartbeats", [None, 3, ["heartbeat"]])
+def test_arm_is_damped_when_heartbeats_have_a_wrong_type(heartbeats):
+    arm = MovingArm()
+    arm.driver.read_heartbeats = lambda: heartbeats
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_arm_is_stopped_by_a_single_exception(method):
+    arm = MovingArm()
+    setattr(arm.driver, method, unplugged)
+    arm.advance()
+    delattr(arm.driver, method)
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+
+
+def test_guard_returns_the_heartbeats_of_the_driver():
+    driver, heartbeat = DirectDriver(), Heartbeat(1, False)
+    driver.read_heartbeats = lambda: [heartbeat]
+    assert driver.guard.read_heartbeats() == (heartbeat,)
+
+
+@pytest.mark.parametrize("fail", [unplugged, exit_program])
+@pytest.mark.parametrize("is_repeating", [False, True])
+@pytest.mark.parametrize("failures", [1, 5, 20, 38, 60])
+def test_arm_is_damped_when_commands_fail(fail, is_repeating, failures):
+    """When commands can be sent again, the arm is damped for the full 40 steps."""
+    arm = MovingArm()
+    arm.driver.write, arm.driver.is_repeating = fail, is_repeating
+    arm.advance(failures)
+    del arm.driver.write
+    arm.driver.is_repeating, speed = False, arm.speed
+    assert len(arm.torques) == 0
+    for _ in range(DAMPING_STEPS):
+        arm.advance()
+        assert arm.speed <= speed + 0.01
+    assert (arm.fault, arm.arm_state) == (Fault.COMMAND_FAILED, ArmState.OFF)
+    assert arm.speed < 0.03
+    assert arm.driver.guard.num_failed_commands == failures
+    assert describe_stop(arm.fault, arm.driver).startswith("a command could not be sent to the robot (write raised ")
+
+
+@pytest.mark.parametrize(("failures", "max_speed"), [(1, 0.05), (5, 0.1), (15, 0.2)])
+def test_arm_is_damped_when_reads_and_commands_fail(failures, max_speed):
+    """For 20 steps, the velocity is predicted from the torques that were sent."""
+    arm = MovingArm()
+    arm.driver.write = arm.driver.read = unplugged
+    arm.advance(failures)
+    del arm.driver.write
+    for _ in range(DAMPING_STEPS):
+        speed = arm.speed
+        arm.advance()
+        assert arm.speed <= speed + 1e-3
+    assert arm.arm_state == ArmState.OFF
+    assert arm.speed < max_speed
+
+
+def test_commands_are_retried_at_every_step_when_all_fail():
+    arm = MovingArm()
+    arm.driver.write = unplugged
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.COMMAND_FAILED, ArmState.OFF)
+    assert arm.driver.guard.num_failed_commands > 40
+
+
+def test_first_fault_remains_when_a_later_command_fails():
+    arm = MovingArm()
+    arm.station.stop(arm.context)
+    arm.driver.write = unplugged
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.USER_STOP, ArmState.OFF)
+
+
+class HoldingDriver(NoisyDriver):
+    """Driver of a robot that can hold its position by itself."""
+
+    can_hold = True
+
+    def hold(self):
+        unplugged()
+
+
+def test_arm_is_damped_when_hold_raises():
+    arm = MovingArm(HoldingDriver())
+    change_statuses(arm.driver, lambda status: MALFORMED_STATUS)
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+
+
+def test_arm_is_not_damped_when_hold_succeeds():
+    arm, holds = MovingArm(HoldingDriver()), []
+    arm.driver.hold = partial(holds.append, True)
+    change_statuses(arm.driver, lambda status: MALFORMED_STATUS)
+    arm.advance(5)
+    assert (len(holds), arm.torques) == (5, [])
+
+
+@pytest.mark.parametrize("method", ["read", "receive"])
+def test_take_over_does_not_wait_when_a_read_fails(method):
+    """`start` would wait for the robot, or raise an error, while the arm moves."""
+    arm = MovingArm()
+    if method == "read":
+        arm.driver.read = lambda: None
+    else:
+        arm.driver.receive = unplugged
+    station = arm.station.clone(BncWorkcell())
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), np.full(6, np.nan))
+    station.take_over(simulator, arm.station, arm.context)
+    arm.station, arm.simulator, arm.context, arm.step = station, simulator, simulator.get_mutable_context(), 0
+    arm.advance(DAMPING_STEPS)
+    assert arm.fault == (Fault.NO_STATUS if method == "read" else Fault.MALFORMED)
+    assert arm.speed < 0.05
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_start_raises_when_a_read_raises(method):
+    driver = DirectDriver()
+    station = HardwareStation(BncWorkcell(), driver)
+    setattr(driver, method, unplugged)
+    simulator = Simulator(station)
+    station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+    message = f"no status can be read from the driver direct: {method} raised OSError: cable unplugged"
+    with pytest.raises(InputError, match=message):
+        station.start(simulator)
+    delattr(driver, method)
+    station.start(simulator)  # succeeds, because the errors have been cleared
+
+
+def test_wall_clock_steps_when_receiving_raises():
+    driver = DirectDriver()
+    (station, simulator), clock = start_station(driver), WallClock(driver)
+    calls = []
+
+    def receive(timeout=0.0):
+        calls.append(timeout)
+        unplugged()
+
+    driver.receive = receive
+    clock.begin()
+    clock.advance(simulator, station, 3)
+    assert simulator.get_context().get_time() == 3 * driver.period
+    assert len(calls) < 20  # `receive` is not called in a busy loop
+
+
+def test_describe_stop_names_an_exception_of_error():
+    class DriverWithoutError(DirectDriver):
+        error = property(unplugged)
+
+    assert describe_stop(Fault.STALE, DriverWithoutError()).endswith("(error raised OSError: cable unplugged)")
+    assert describe_stop(Fault.STALE, DirectDriver()) == Fault.STALE.description
+
+
+def test_describe_stop_omits_the_exception_of_an_older_status():
+    driver = DirectDriver()
+    driver.read = unplugged
+    assert driver.guard.read() is MALFORMED_STATUS
+    driver.read = lambda: "status"
+    assert driver.guard.read() is MALFORMED_STATUS
+    assert describe_stop(Fault.MALFORMED, driver) == Fault.MALFORMED.description
+
+
+def test_recover_raises_one_error_for_any_exception():
+    driver = DirectDriver()
+    driver.recover = unplugged
+    with pytest.raises(InputError, match="the driver direct failed: recover raised OSError: cable unplugged"):
+        driver.guard.recover()
+
+    def refuse():
+        raise InputError("the error persists")
+
+    driver.recover = refuse
+    with pytest.raises(InputError, match="the error persists"):
+        driver.guard.recover()
+
+
+@pytest.mark.parametrize("method", ["configure", "write_pose", "stop"])
+def test_pose_command_that_raises_is_reported_once(method):
+    class FailingPoseDriver(PoseDriver):
+        name = "poses"
+        configure = write_pose = stop = read = unplugged
+
+    guard = FailingPoseDriver().guard
+    getattr(guard, method)(*[None] * {"configure": 1, "write_pose": 2, "stop": 0}[method])
+    assert guard.command_error == f"{method} raised OSError: cable unplugged"
+    assert [guard.take_failure(), guard.take_failure()] == [True, False]
+
+
+def test_forget_errors_clears_failure_and_recovery():
+    driver = NoisyDriver()
+    guard = driver.guard
+    for _ in range(2):
+        assert (guard.take_failure(), guard.take_recovery()) == (False, False)
+        driver.write = lambda torque, time: 1 / 0
+        guard.write(np.zeros(7), 0.0)
+        guard.forget_errors()
+        del driver.write
+        guard.write(np.zeros(7), 0.0)
+        guard.receive()
+        assert guard.read() is not MALFORMED_STATUS
+    assert (guard.take_failure(), guard.take_recovery()) == (False, False)

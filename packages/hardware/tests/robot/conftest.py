@@ -1,0 +1,39 @@
+"""Executor of a skill with a simulated robot, both in one process."""
+
+import numpy as np
+import pytest
+from injections.stepped_robot import SteppedRobotClock
+from pydrake.lcm import DrakeLcm
+
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.make import make_skill
+from guiderail_hardware.robot.executor import SkillExecutor
+from guiderail_hardware.robot.sim_driver import START
+
+OPTIONS = {"station": "hardware", "guidance": "kmp", "fixture_offset": "none"}
+
+
+@pytest.fixture
+def make_executor(monkeypatch):
+    """Return a function that builds an executor, with the clock that steps its simulated robot."""
+
+    def make_executor(
+        start=START,
+        policy=lambda observation: np.zeros(2),
+        num_steps=20,
+        is_stop_requested=lambda: False,
+        has_monitor=True,
+        **options,
+    ):
+        lcm = DrakeLcm("memq://")
+        with monkeypatch.context() as patch:
+            # The skill's station would open another bus in memory by its URL.
+            patch.setattr("guiderail_hardware.drivers.lcm.open_bus", lambda url: lcm)
+            skill = make_skill("BncConnector", policy, **OPTIONS, **options)
+        task = EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
+        monkeypatch.setattr(task, "num_steps", num_steps)
+        clock = SteppedRobotClock(task.workcell(), lcm, start, has_monitor)
+        skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
+        return SkillExecutor(task, skill, clock, is_stop_requested), clock
+
+    return make_executor

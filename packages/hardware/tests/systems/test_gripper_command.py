@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from guiderail.models.common.errors import InputError
+from guiderail_hardware.systems.gripper_command import GripperCommand
+
+LOWER, UPPER, OPENING = np.array([0.0, -1.0]), np.array([0.04, 1.0]), np.array([0.03, 0.5])
+
+
+class Rig:
+    """Gripper command with a position input that may be unconnected."""
+
+    def __init__(self):
+        self.system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
+        self.simulator = Simulator(self.system)
+        self.context = self.simulator.get_mutable_context()
+
+    def command(self, position):
+        self.system.get_position_input_port().FixValue(self.context, position)
+
+    def advance(self, seconds):
+        self.simulator.AdvanceTo(self.context.get_time() + seconds)
+
+    @property
+    def desired(self):
+        return self.system.get_desired_state_output_port().Eval(self.context)
+
+
+def test_initial_opening_is_output_when_input_is_unconnected():
+    rig = Rig()
+    rig.advance(0.1)
+    np.testing.assert_array_equal(rig.desired, [0.03, 0.5, 0.0, 0.0])
+
+
+def test_command_is_clipped_to_its_limits_and_output_at_once():
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    np.testing.assert_array_equal(rig.desired, [0.01, 0.2, 0.0, 0.0])
+    rig.command([-5.0, 5.0])
+    np.testing.assert_array_equal(rig.desired, [0.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
+def test_last_position_is_output_when_a_command_is_not_finite(number):
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    rig.advance(0.05)
+    rig.command([number, 0.4])
+    for _ in range(3):
+        np.testing.assert_array_equal(rig.desired, [0.01, 0.4, 0.0, 0.0])
+        rig.advance(0.05)
+
+
+@pytest.mark.parametrize("is_initialized", [False, True])
+def test_reset_restores_the_initial_opening(is_initialized):
+    rig = Rig()
+    rig.command([0.01, 0.2])
+    rig.advance(0.05)
+    rig.command([np.nan, np.nan])
+    if is_initialized:
+        rig.context.SetTime(0.0)
+        rig.simulator.Initialize()
+    else:
+        rig.system.SetDefaultContext(rig.context)
+    np.testing.assert_array_equal(rig.desired, [0.03, 0.5, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        {"lower": np.zeros(1)},
+        {"opening": np.array([0.05, 0.0])},
+        {"opening": np.array([np.nan, 0.0])},
+        {"upper": np.array([[0.04, 1.0]]), "lower": LOWER[None], "opening": OPENING[None]},
+        {"period": 0.0},
+    ],
+)
+def test_constructor_refuses_arguments_out_of_range(arguments):
+    valid = {"lower": LOWER, "upper": UPPER, "opening": OPENING, "period": 0.01} | arguments
+    with pytest.raises(InputError):
+        GripperCommand(valid.pop("lower"), valid.pop("upper"), valid.pop("opening"), **valid)
+
+
+@pytest.mark.parametrize(("limit", "outside"), [(LOWER, -np.inf), (UPPER, np.inf)])
+@pytest.mark.parametrize("joint", [0, 1])
+def test_opening_may_be_at_a_limit_but_not_beyond(limit, outside, joint):
+    opening = OPENING.copy()
+    opening[joint] = limit[joint]
+    GripperCommand(LOWER, UPPER, opening, period=0.01)
+    opening[joint] = np.nextafter(limit[joint], outside)
+    with pytest.raises(InputError, match="opening must be within"):
+        GripperCommand(LOWER, UPPER, opening, period=0.01)
+
+
+def test_arguments_are_copied_and_may_be_lists():
+    GripperCommand(LOWER.tolist(), UPPER.tolist(), OPENING.tolist(), period=0.01)
+    lower, upper = LOWER.copy(), UPPER.copy()
+    system = GripperCommand(lower, upper, OPENING, period=0.01)
+    lower[:], upper[:] = 0.0, 0.0
+    context = system.CreateDefaultContext()
+    system.get_position_input_port().FixValue(context, [-5.0, 5.0])
+    np.testing.assert_array_equal(system.get_desired_state_output_port().Eval(context), [0.0, 1.0, 0.0, 0.0])
+
+
+def test_gripper_command_has_its_ports():
+    system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
+    assert system.get_position_input_port().get_name() == "position"
+    assert system.get_desired_state_output_port().get_name() == "desired_state"
+    assert system.get_desired_state_output_port().size() == 4

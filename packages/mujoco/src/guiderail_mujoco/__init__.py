@@ -1,0 +1,1 @@
+"""MuJoCo as a second physics engine: `station="mujoco"`."""

@@ -1,0 +1,1 @@
+"""Insertion tasks from the mesh files of two parts."""

@@ -1,0 +1,1 @@
+"""Geometry of parts: mesh files, checks, convex decomposition, symmetry and a demonstrator."""

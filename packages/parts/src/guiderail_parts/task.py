@@ -1,0 +1,465 @@
+"""Insertion task of two meshes, with all parameters declared in `task.yaml`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, Literal, cast
+
+import numpy as np
+from pydantic import Field
+from pydrake.math import RigidTransform
+from pydrake.multibody.plant import MultibodyPlant
+
+from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.options import STANDARD, Number
+from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
+from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.stations.workcell import MovableWorkcell
+from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.insertion import (
+    HOLD_DISTANCE,
+    MAX_HOLD_MOTION,
+    DemonstratedInsertion,
+    HoldTest,
+    sides_of_the_rim,
+)
+from guiderail.diagrams.tasks.options import (
+    CENTER_OF_PRESSURE_SCALE,
+    HISTORY_VARIANCE,
+    OBSERVATIONS,
+    REWARDS,
+    FixtureOffsetOptions,
+    ForceOptions,
+)
+from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.files import write_atomically
+from guiderail.models.common.parsing import add_models
+from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
+from guiderail.models.objects.sdf import TriangleMesh
+from guiderail.models.objects.surfaces import Hull, Surface
+from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
+from guiderail.systems.episode_monitor import TerminationTerm
+from guiderail_parts.geometry.assembly_check import SYMMETRIES
+from guiderail_parts.geometry.mesh_file import part_sdf
+from guiderail_parts.task_file import (
+    AUTOMATE,
+    FILE_NAME,
+    Bounds,
+    PartTaskFile,
+    read_task_file,
+    task_folder_digest,
+)
+
+if TYPE_CHECKING:
+    from guiderail.diagrams.envs.config import EnvConfig
+
+
+PLUG, SOCKET = "plug", "socket"
+"""Names of the bodies, and of their SDF files without the suffix."""
+
+
+@dataclass(frozen=True)
+class PartWorkcell(MovableWorkcell):
+    """Socket in the world and plug in the tool; the coordinates of both meshes are those of the assembly, in T."""
+
+    fixture: ClassVar[str] = SOCKET
+    workpiece: ClassVar[str] = PLUG
+    folder: Path  # folder with the SDF files of plug and socket
+    place: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the target in the world, (3,) [m]
+    stiction_tolerance: float = 1e-5  # largest creep of a sticking contact [m/s]
+    scenario: Sequence[str] = ()  # paths of Drake model directives (.dmd.yaml) of further objects
+    # Names of the files of the convex pieces of plug and socket, for MuJoCo.
+    convex: tuple[tuple[str, ...], tuple[str, ...]] = ((), ())
+    friction: float = 0.2  # friction coefficient of the convex pieces
+
+    @property
+    def X_WF(self) -> RigidTransform:
+        """Pose of the nominal socket, equal to that of the target."""
+        return RigidTransform(np.array(self.place))
+
+    @property
+    def X_FT(self) -> RigidTransform:
+        """Pose of the target on the socket, the identity."""
+        return RigidTransform()
+
+    def sdf(self, body: str) -> Path:
+        """Return the path of the SDF file of plug or socket."""
+        return self.folder / f"{body}.sdf"
+
+    def add_fixture(self, plant: MultibodyPlant) -> None:
+        """Add the socket and the objects of the scenario."""
+        plant.set_stiction_tolerance(self.stiction_tolerance)
+        super().add_fixture(plant)
+        for file in self.scenario:
+            add_models(plant, file)
+
+    def fixture_surfaces(self) -> list[Surface]:
+        """Return the convex pieces of the socket.
+
+        Raises:
+            InputError: If the socket has no convex pieces, so that the plug would touch nothing.
+        """
+        return self._surfaces(SOCKET, self.convex[1])
+
+    def workpiece_surfaces(self) -> list[Surface]:
+        """Return the convex pieces of the plug.
+
+        Raises:
+            InputError: If the plug has no convex pieces.
+        """
+        return self._surfaces(PLUG, self.convex[0])
+
+    def _surfaces(self, body: str, files: Sequence[str]) -> list[Surface]:
+        if not files:
+            raise InputError(
+                f"the {body} in {self.folder} has no convex pieces, which MuJoCo needs: choose station='gantry'"
+            )
+        return [
+            Surface(
+                f"{body}_{number}", "parts", Hull(TriangleMesh.from_obj(self.folder / file).vertices), self.friction
+            )
+            for number, file in enumerate(files)
+        ]
+
+
+COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
+
+# Indices into the observation [time, pose, wrench, center of pressure, command].
+TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
+IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
+BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
+MIN_PUSH = 1.5 * MM  # smallest displacement of the command by a push on a seated plug, in addition to the play [m]
+FOLLOWING = 3.0  # rate of change of the action per 2 mm of distance between the command and a plug in the socket [1/s]
+# Largest distance from the demonstrations' start to the bounds, inside which an episode starts [m], [rad].
+MAX_START_SHIFT = np.array([*[1.0 * MM] * 3, *[2.0 * DEGREE] * 3])
+WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
+
+
+class PartOptions(FixtureOffsetOptions, ForceOptions):
+    """Options of a task of two meshes."""
+
+    offset_shape: Literal["ring", "square"] = Field(
+        "ring",
+        description="region of the fixture's offset: the ring with the radii offset_range, or the square in which |x| "
+        "and |y| are at most the larger radius; square needs fixture_offset=per_episode",
+    )
+    fixture_turn: Number = Field(
+        0.0, ge=0, le=10, description="largest sampled turn of the fixture about its axis [degrees]"
+    )
+    bound: Number | None = Field(
+        None,
+        ge=0.5 * MM,
+        le=6.0 * MM,
+        description="bound of a command's |x| and |y| [m]; it replaces the bounds of task.yaml, which must be constant",
+    )
+    start_offset_max: Number = Field(
+        0.0, ge=0, le=2 * MM, description="largest sampled offset of the start along x and y [m]"
+    )
+
+
+class PartUncertainty(BncUncertainty):
+    """Sampler of the socket's offset: as for BncConnector, or in each episode uniformly in a square."""
+
+    def __init__(self, options: PartOptions):
+        super().__init__(options.fixture_offset, offset_range=options.offset_range, jack_turn=options.fixture_turn)
+        self.is_square = options.offset_shape == "square"
+
+    def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if not self.is_square:
+            return super()._draw_episode(rng, run)
+        side = self.offset_range[1]
+        return self._append_turn(rng.uniform(-side, side, 2), rng), np.zeros(2)
+
+
+class ScriptedSearch:
+    """Search by the center of pressure: while the plug is blocked, the action moves steadily towards the socket's axis.
+
+    A plug on the rim is blocked. While a plug below the rim is not blocked, the command follows the plug's lateral
+    position, so that the plug is not pushed against a wall. If the task has a `search_turn`, a third entry of the
+    action turns a blocked plug back and forth.
+
+    If the observed time does not increase, a new episode has begun, and the search starts from an action of zero. The
+    search integrates the action and not the displacement, because the displacement per action depends on the guidance
+    and changes during the motion.
+    """
+
+    def __init__(self, file: PartTaskFile, duration: Callable[[], float]):
+        """Construct the policy.
+
+        Args:
+            file: Content of `task.yaml`.
+            duration: Function that returns the duration of the reference trajectory [s]; called at each observation.
+        """
+        self._file, self._duration = file, duration
+        self._times, poses = file.motion.plan_search()
+        # If the task has an `advance`, the thread keeps the plug above the command by `push`.
+        self._heights = poses[:, 2] + (file.motion.push if file.motion.advance else 0.0)
+        self._time, self._size, self._direction = np.inf, 3 if file.motion.search_turn else 2, 1.0
+        self._action = np.zeros(self._size)
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return an action, (2,) or (3,) with a `search_turn`, for an observation with the center of pressure.
+
+        Raises:
+            InputError: If the observation has no center of pressure.
+        """
+        if len(observation) < COMMAND.stop:
+            raise InputError('this policy needs the center of pressure: choose observation="center_of_pressure"')
+        time = 0.5 * (float(observation[TIME]) + 1.0) * self._duration()
+        passed = time - self._time
+        if passed <= 0.0:
+            self._action, self._direction, passed = np.zeros(self._size), 1.0, 0.0
+        self._time = time
+        lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
+        height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
+        on_rim, search = height > self._file.motion.rim - IN_SOCKET, self._file.search
+        change = np.zeros(self._size)
+        if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
+            change[:2] = search.lever_sign * search.speed * lever / max(length, MM)
+            if abs(self._action[-1]) >= 1.0:
+                self._direction = -np.sign(self._action[-1])
+            change[2:] = self._direction * search.turn_speed
+        elif not on_rim:
+            change[:2] = FOLLOWING * (observation[POSITION] - observation[COMMAND])
+        self._action = np.clip(self._action + passed * change, -1.0, 1.0)
+        return self._action.copy()
+
+
+class PartInsertion(DemonstratedInsertion):
+    """Insert a plug into a socket.
+
+    Rewards: see `DemonstratedInsertion`.
+    """
+
+    Options = PartOptions
+    options: PartOptions
+    workpiece, fixture = PLUG, SOCKET
+    simulated_rewards = ("aligned",)
+    rewards = REWARDS
+    observations = OBSERVATIONS
+    folder: ClassVar[Path]
+    file: ClassVar[PartTaskFile]  # content of `task.yaml`
+
+    def __init__(self, config: EnvConfig):
+        super().__init__(config)
+        if self.options.offset_shape == "square" and self.options.fixture_offset != "per_episode":
+            raise InputError(
+                "offset_shape=square samples the fixture's offset in every episode: choose fixture_offset=per_episode, "
+                "or offset_shape=ring"
+            )
+        self.offsets = PartUncertainty(self.options)
+        self.collision = Threshold("contact_force", self.options.largest_force_limit)
+        self.num_steps = self.reference().num_steps
+        self.insertion_length = self.file.motion.travel
+        self._check_length_and_start()
+
+    def _check_length_and_start(self) -> None:
+        """Raise an InputError if `task.yaml` excludes every success, or the start of the demonstrations."""
+        steps, start = self.file.tolerance.steps, self.reference().means[0]
+        if self.steps_of(steps) > self.num_steps:
+            raise InputError(
+                f"tolerance.steps in {self.folder / FILE_NAME} is {steps}, longer than an episode of "
+                f"{self.num_steps * self.control_period:.3g} s: give fewer steps"
+            )
+        shift = np.abs(self.file.bounds.nearest(start, 0) - start)
+        if (shift > MAX_START_SHIFT).any():
+            output = int((shift / MAX_START_SHIFT).argmax())
+            raise InputError(
+                f"bounds in {self.folder / FILE_NAME} exclude the demonstrations' start, {POSE_NAMES[output]} = "
+                f"{start[output]:.4g}: let them include it at the beginning of the motion"
+            )
+
+    def workcell(self) -> PartWorkcell:
+        """Return the socket in the world and the plug in the tool."""
+        return self._workcell
+
+    @cached_property
+    def _workcell(self) -> PartWorkcell:
+        return write_workcell(self.folder, self.file)
+
+    @classmethod
+    def folder_digest(cls) -> str:
+        """Return the digest of the task folder; see `task_folder_digest`."""
+        return task_folder_digest(cls.folder)
+
+    def reference(self) -> ReferenceTrajectory:
+        """Return the reference trajectory of the folder's demonstrations."""
+        return self.on_clock(self.file.demonstrations.reference(self.folder))
+
+    def constraints(self) -> LinearConstraints:
+        """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y.
+
+        Raises:
+            InputError: If `bound` is given, and the bounds of `task.yaml` change between phases.
+        """
+        return self._bounds().constraints(self.reference().num_steps)
+
+    def _bounds(self) -> Bounds:
+        bounds, limit = self.file.bounds, self.options.bound
+        if limit is None:
+            return bounds
+        if bounds.phases is not None:
+            difficulty = self.config.difficulty
+            is_set = self.difficulties[difficulty].get("bound") == limit
+            remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
+            raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
+        return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]), phases=None)
+
+    def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
+        D = np.zeros((POSE_SIZE, POSE_SIZE))
+        D[2, 2] = D[5, 3] = 1.0
+        return D, np.zeros(POSE_SIZE)
+
+    def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:
+        """Return pushes along ±x and ±y, as far as the bounds allow; the walls of the socket stop a seated plug.
+
+        A direction is omitted if the bounds allow less than `MIN_PUSH` plus the play, which is twice the clearance. A
+        plug that was turned at the bottom is locked, and is pulled upwards instead.
+        """
+        if self.file.turn:
+            return super().hold_tests(pose)
+        play, constraints = min(2.0 * self.file.clearance, HOLD_DISTANCE), self.constraints()
+        tests = []
+        for direction in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+            target = pose + (play + HOLD_DISTANCE) * np.array([*direction, 0.0, 0.0, 0.0, 0.0])
+            x, y = (constraints.nearest(target, self.num_steps) - pose)[:2].tolist()
+            if direction[0] * x + direction[1] * y >= play + MIN_PUSH:
+                tests.append(HoldTest((x, y, 0.0), play + MAX_HOLD_MOTION))
+        return tests
+
+    @classmethod
+    def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
+        """Return the scripted search by the center of pressure."""
+        reference = partial(cls.file.demonstrations.reference, cls.folder)
+        return {"scripted_search": ScriptedSearch(cls.file, lambda: reference().num_steps * CONTROL_PERIOD)}
+
+    @classmethod
+    def provides(cls) -> tuple[str, ...]:
+        """Return the kinds of prior knowledge, without walls ("keep_out") if the bounds change between phases."""
+        has_phases = cls.file.bounds.phases is not None
+        return tuple(kind for kind in super().provides() if not (kind == "keep_out" and has_phases))
+
+    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+        """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
+        height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
+        center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
+        scale_of_turn = max(abs(turn), 3 * DEGREE, self.file.motion.search_turn * DEGREE)
+        scale = np.array([2 * MM, 2 * MM, height, scale_of_turn, 1.5 * DEGREE, 1.5 * DEGREE])
+        return self.scaled_terms(center, scale, WRENCH_SCALE)
+
+    def termination_terms(self) -> list[TerminationTerm]:
+        """Return success at the target, and collision above the force limit."""
+        tolerance = self.file.tolerance
+        seated = TerminationTerm("success", {PLUG: POSE_SIZE}, tolerance.accepts, steps=self.steps_of(tolerance.steps))
+        return [seated, self.force_limit()]
+
+    def symmetry(self) -> Symmetry | None:
+        """Return the symmetries of both parts; None if none applies."""
+        return self._select_symmetries(self.file.sides)
+
+    def near_symmetry(self) -> Symmetry | None:
+        """Return the symmetries of both parts and those that nearly hold on the rim; None if none applies."""
+        return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
+
+    def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
+        symmetries = sides_of_the_rim(self.config.observation, self.action_dims())
+        selected = [index for index, name in enumerate(SYMMETRIES) if name in names]
+        if symmetries is None or not selected or self.has_image:
+            return None
+        return Symmetry(*(matrices[selected] for matrices in symmetries)).pad(len(self.force_limit_terms()))
+
+    def camera(self) -> Camera:
+        """Return a camera that looks slightly down at the socket."""
+        size = self.file.motion.travel
+        target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
+        return front_camera(target, distance=6 * size, height=3 * size)
+
+    def scene(self) -> Scene:
+        """Return the demonstrations and the box of the bounds of each phase in `task.yaml`, or of `bound`."""
+        to_world, size = in_frame(self.workcell().X_WT), self.file.motion.travel
+        near = viewpoint(*to_world(np.array([[1.8 * size, -2.6 * size, 2.6 * size], [0.0, 0.0, 0.5 * size]])))
+        lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self._bounds().arrays())
+        lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
+        boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
+        return Scene(
+            to_world=to_world,
+            demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
+            constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
+            viewpoint=near,
+            arm_views={"the parts": near, "the arm": ARM_VIEW},
+            line_radius=0.0001,
+        )
+
+
+def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:
+    """Write the SDF files of a task folder next to its meshes, and return its workcell.
+
+    Raises:
+        InputError: If the SDF files cannot be written.
+    """
+    for name, part in ((PLUG, file.plug), (SOCKET, file.socket)):
+        text = part_sdf(
+            name,
+            part.visual,
+            part.pieces,
+            mass=part.mass,
+            center=part.center,
+            gyration=part.gyration,
+            color=COLORS[name],
+        )
+        path, content = folder / f"{name}.sdf", text.encode()
+        if not path.is_file() or path.read_bytes() != content:
+            write_atomically(path, content)  # another process may read the file at the same time
+    return PartWorkcell(
+        folder,
+        cast(tuple[float, float, float], file.place),
+        file.stiction_tolerance,
+        tuple(str(folder / name) for name in file.scenario),
+        (file.plug.convex, file.socket.convex),
+        file.plug.pieces[0].friction,
+    )
+
+
+def load_task_folder(folder: Path) -> type[PartInsertion]:
+    """Return the task class of a folder.
+
+    Raises:
+        InputError: As `read_task_file`.
+    """
+    folder = folder.resolve()
+    return _task_class(folder, task_folder_digest(folder))
+
+
+@cache
+def _task_class(folder: Path, content: str) -> type[PartInsertion]:
+    """Return the task class of a folder with a digest `content`; cached, so that environments can share diagrams."""
+    file = read_task_file(folder)
+    defaults = {
+        "guidance": "skgrl",
+        "station": "gantry",
+        "action_repeat": 10,
+        "action_dims": file.action_dims,
+        "history_variance": HISTORY_VARIANCE,
+        "force_limit": file.force_limit,
+        "time_step": file.time_step,
+        **file.recommended.environment,
+    }
+    members = {
+        "name": file.name,
+        "difficulties": {STANDARD: {}, "hard": file.hard, "automate": AUTOMATE},
+        "folder": folder,
+        "file": file,
+        "defaults": defaults,
+        "learner": file.recommended.learner,
+        "excluded_stations": () if file.is_convex else ("mujoco",),
+        "__module__": __name__,
+    }
+    task = type(f"PartInsertion({folder})", (PartInsertion,), members)
+    task.__doc__ = f"Insert {file.plug.source or 'a plug'} into {file.socket.source or 'a socket'}."
+    return cast(type[PartInsertion], task)

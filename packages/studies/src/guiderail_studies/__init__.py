@@ -1,0 +1,1 @@
+"""Studies, robustness, reports and certificates of trained policies."""

@@ -1,0 +1,182 @@
+"""`guiderail study`, `guiderail robustness`, `guiderail certify` and `guiderail report`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from guiderail.models.common.errors import InputError, RunsFailedError
+from guiderail.tools.cli import app as cli
+from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
+from guiderail.tools.cli.evaluate import SEED, split_names
+
+
+@cli.command("study study.yaml --out studies --methods skgrl,kgrl --seeds 30,31")
+def study(
+    file: Annotated[Path, argument("YAML file of the study.", "FILE")],
+    out: Annotated[Path, option("Folder of the study; finished runs in it are used again.")],
+    methods: Annotated[str | None, option("Methods to run, comma-separated.  [default: all]")] = None,
+    seeds: Annotated[
+        str | None, option("Seeds instead of the study's, comma-separated; a method's own seeds take precedence.")
+    ] = None,
+    engine: Annotated[str | None, option("Engine: {engines}.  [default: process]", choices="engines")] = None,
+    address: Annotated[
+        str | None, option("Address of a Ray cluster.  [default: RAY_ADDRESS, or a local cluster]")
+    ] = None,
+    processes: Annotated[
+        int | None, option("Number of runs in parallel.  [default: 2, or the cores of a cluster]")
+    ] = None,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Train and evaluate methods over seeds, as declared in a YAML file.
+
+    The result is a table with one row per method, seed, checkpoint and evaluation set; a table of selected methods or
+    other seeds is named after them. The same command resumes an interrupted study. A failed run does not stop the
+    others: it is listed at the end, and the exit code is 1.
+    """
+    from guiderail.tools.imports import import_stored
+    from guiderail_studies import declaration
+    from guiderail_studies.engines.engine import make_engine
+    from guiderail_studies.study import study_command
+
+    declared = declaration.load_study(file)
+    import_stored(declared.imports, file)
+    names = None if methods is None else [name.strip() for name in methods.split(",")]
+    chosen = declared.subset(names, cli.parse_integers(seeds, "--seeds"))
+    running = make_engine(engine or "process", processes, address)
+    result = study_command(chosen, out, running, declared.subset_name(chosen), file=file)
+    print_result(result, as_json)
+    if "failed" in result:
+        raise RunsFailedError(result["failed"], None)
+
+
+@cli.command("robustness runs/connector --env station=mujoco --episodes 50")
+def robustness(
+    policies: Annotated[
+        list[str],
+        argument("Runs of one task, which are compared; or policies of any origin, with --task.", "RUN|POLICY..."),
+    ],
+    task: cli.PolicyTask = None,
+    episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
+    seed: cli.Seed = SEED,
+    axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
+    env: cli.Env = None,
+    baselines: cli.Baselines = None,
+    processes: cli.Processes = None,
+    trust_policy: cli.TrustPolicy = False,
+    imports: cli.TaskImports = None,
+    out: Annotated[
+        Path | None,
+        option(
+            "Folder to write, required for several runs and for a policy without a run.  "
+            "[default: robustness/STATION in the run]"
+        ),
+    ] = None,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Evaluate policies under friction, stiffness, sensor, command and timing errors.
+
+    One quantity is changed at a time. One table and one picture compare all runs. Evaluated episodes are stored, so the
+    same command resumes an interrupted evaluation, and an additional run needs only its own episodes.
+    """
+    from guiderail_studies.robustness import robustness as evaluate_robustness
+    from guiderail_studies.robustness import values_below
+
+    result = evaluate_robustness(
+        policies,
+        task=None if task is None else cli.find_task(task, imports)[0],
+        episodes=episodes,
+        seed=seed,
+        environment=cli.parse_environment(env),
+        axes=axes,
+        baselines=split_names(baselines),
+        out=out,
+        log=print_message,
+        processes=processes,
+        trust_policy=trust_policy,
+    )
+    if as_json:
+        typer.echo(to_json({"table": str(result["table"]), "picture": str(result["picture"]), "rows": result["rows"]}))
+        return
+    for line in result["table"].with_suffix(".md").read_text(encoding="utf-8").splitlines():
+        typer.echo(line)
+    for policy in result["policies"]:
+        for name, values in values_below(result["rows"], policy).items():
+            below = ", ".join(f"{value:.3g}" for value in values) or "no value"
+            typer.echo(f"{policy}, {name}: success rate below 90 % at {below}")
+    typer.echo(result["table"])
+    typer.echo(result["picture"])
+
+
+@cli.command("certify runs/passage --attack 1000000")
+def certify(
+    subject: Annotated[
+        str,
+        argument("Folder of a run. With --out also pretrained:NAME ({pretrained}) or a task: {tasks}.", "RUN or TASK"),
+    ],
+    env: cli.Env = None,
+    out: Annotated[Path | None, option("Folder to write.  [default: certificate in the run]")] = None,
+    start_within: Annotated[
+        float | None,
+        option(
+            "Largest start offset of the robot, in the outputs' units.  [default: that of a reset, plus the error of "
+            "the pose measurement]"
+        ),
+    ] = None,
+    attack: Annotated[int, option("Number of steps in which an adversary tries to leave the bounds.")] = 0,
+    verify: Annotated[Path | None, option("Folder of a certificate: check it and compare it with the skill.")] = None,
+    key: Annotated[Path | None, option("Key that signs the certificate or, with --verify, has signed it.")] = None,
+    imports: cli.TaskImports = None,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Compute bounds on all commands of a skill, for any action, and check them with an independent program.
+
+    The certificate lists its assumptions. It can be checked on any machine: python checker.py FOLDER needs NumPy alone.
+    With --attack, a table compares the bounds with the worst commands that an adversary finds.
+    """
+    from guiderail_studies.certify import certify_skill, verify_certificate
+
+    task, environment = cli.find_task(subject, imports)[0], cli.parse_environment(env)
+    if verify is not None and (out is not None or attack):
+        raise InputError("--verify only checks a certificate: give it without --out and --attack")
+    if verify is not None:
+        result = verify_certificate(task, environment, verify, start_within=start_within, key=key)
+    else:
+        result = certify_skill(task, environment, out=out, start_within=start_within, attack=attack, key=key)
+    rows = result.get("attack", [])
+    if as_json:
+        typer.echo(to_json(result))
+    else:
+        for name, value in result.items():
+            if name == "attack":
+                continue
+            text = ", ".join("–" if x is None else f"{x:.4g}" for x in value) if isinstance(value, list) else value
+            typer.echo(f"{'accepted by the checker' if name == 'checker' else name.replace('_', ' ')}: {text}")
+        if rows:
+            typer.echo(Path(result["certificate"]).with_name("attack.md").read_text(encoding="utf-8"))
+    if result["checker"] != "yes" or any(row["violations"] for row in rows):
+        raise typer.Exit(1)
+
+
+@cli.command("report studies --out report.html")
+def report(
+    runs: Annotated[list[Path], argument("Folders of runs, or of a study.", "RUN...")],
+    out: Annotated[Path, option("Page to write, .html.")] = Path("report.html"),
+    episodes: Annotated[
+        int, option("Held-out episodes for each run that no study evaluated; evaluated episodes are used again.")
+    ] = 0,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Write the results of runs or of a study as one self-contained page.
+
+    It contains learning curves with bootstrap bands, episodes to convergence, held-out success together with baseline
+    policies, safety statistics of every control step, configuration, versions, and the commands that reproduce it.
+    """
+    from guiderail_studies.report import write_report
+
+    page = write_report(runs, out, episodes=episodes)
+    typer.echo(to_json({"page": str(page)}) if as_json else page)

@@ -1,1 +1,0 @@
-"""Demonstration files: formats, conversion, validation and bounds."""

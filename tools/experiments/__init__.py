@@ -1,1 +1,0 @@
-"""Studies: methods × seeds, run in parallel and evaluated on held-out episodes."""

@@ -1,1 +1,0 @@
-"""Tasks made from the meshes of two parts."""
