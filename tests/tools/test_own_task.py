@@ -25,7 +25,7 @@ from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.train import train
-from guiderail_data.validate import validate_template
+from guiderail.tools.validate_template import validate_template
 from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10

@@ -60,14 +60,14 @@ def test_interrupted_training_names_resume(tmp_path):
 @pytest.mark.parametrize(
     ("function", "arguments", "hint"),
     [
-        ("experiments.study.study_command", ["study", study_path("connector")], "; the same command resumes it"),
-        ("evaluation.evaluate.evaluate", ["evaluate", "NarrowPassage", "--policy", "zero"], ""),
-        ("parts.create_task.create_task", ["create-task", "a.stl", "b.stl", "--unit", "mm"], ""),
+        ("guiderail_studies.study.study_command", ["study", study_path("connector")], "; the same command resumes it"),
+        ("guiderail.tools.evaluation.evaluate.evaluate", ["evaluate", "NarrowPassage", "--policy", "zero"], ""),
+        ("guiderail_parts.create_task.create_task", ["create-task", "a.stl", "b.stl", "--unit", "mm"], ""),
     ],
     ids=lambda value: value[0] if isinstance(value, list) else "",
 )
 def test_interrupted_command_ends_with_a_line(function, arguments, hint, forks, tmp_path):
-    module, _, name = f"guiderail.tools.{function}".rpartition(".")
+    module, _, name = function.rpartition(".")
     out = [] if arguments[0] == "evaluate" else ["--out", tmp_path / "out"]
     result = forks.run("-c", INTERRUPTED_PROGRAM, module, name, *arguments, *out, folder=tmp_path)
     assert (result.returncode, result.stderr) == (130, f"guiderail: stopped{hint}\n")

@@ -13,7 +13,9 @@ import guiderail
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.plugins import SIBLINGS
 from guiderail.models.primitives.kernels import KERNELS
+from guiderail.tools.cli import main as main_module
 from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
 from guiderail.tools.environments import as_value
@@ -292,16 +294,21 @@ def test_help_has_a_valid_example_and_writes_nothing(command, capsys, tmp_path, 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_number_of_commands_is_sixteen():
-    assert len(typer.main.get_command(load_commands()).commands) == 16
-
-
 def test_every_command_is_listed_with_its_module():
-    listed = {name: module for module, names in COMMANDS.items() for name in names}
+    listed = {name: f"guiderail.tools.cli.{module}" for module, names in COMMANDS.items() for name in names}
+    listed |= {name: f"guiderail_{sibling}.cli" for sibling, names in SIBLINGS.items() for name in names}
     for name, command in typer.main.get_command(load_commands()).commands.items():
         callbacks = [part.callback for part in getattr(command, "commands", {"": command}).values()]
-        assert {callback.__module__ for callback in callbacks} == {f"guiderail.tools.cli.{listed.pop(name)}"}
+        assert {callback.__module__ for callback in callbacks} == {listed.pop(name)}
     assert not listed
+
+
+@pytest.mark.parametrize(("name", "sibling"), [(name, key) for key, names in SIBLINGS.items() for name in names])
+def test_command_of_missing_sibling_names_the_line_that_installs_it(name, sibling, capsys, monkeypatch):
+    monkeypatch.setattr(main_module, "find_plugins", lambda kind: iter(()))
+    code, _, err = call(capsys, name)
+    line = f'guiderail {name} needs guiderail-{sibling}, which is not installed: pip install "guiderail[{sibling}]"'
+    assert (code, err) == (2, f"guiderail: {line}\n")
 
 
 def test_help_lists_the_choices(capsys):
@@ -462,7 +469,7 @@ def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch)
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: lab_broken\nVersion: 1.0\n")
     (information / "entry_points.txt").write_text("[guiderail]\nkernel:lab = lab_broken:Kernel\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("_points", "broken"):
+    for name in ("_plugins", "_points", "broken"):
         monkeypatch.delitem(vars(KERNELS), name, raising=False)
     sentence = "the kernel 'lab' of the installed package lab_broken cannot be used: importing lab_broken:Kernel failed"
     try:
@@ -479,7 +486,7 @@ def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch)
         assert code == 2
         assert sentence in err
     finally:
-        for name in ("_points", "broken"):
+        for name in ("_plugins", "_points", "broken"):
             vars(KERNELS).pop(name, None)
 
 

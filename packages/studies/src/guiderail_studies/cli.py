@@ -1,5 +1,6 @@
 """`guiderail study`, `guiderail robustness`, `guiderail certify` and `guiderail report`."""
 
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated
 
@@ -9,6 +10,8 @@ from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
 from guiderail.tools.cli.evaluate import SEED, split_names
+
+cli.CHOICES["axes"] = lambda: [axis.name for axis in import_module("guiderail_studies.robustness").AXES]
 
 
 @cli.command("study study.yaml --out studies --methods skgrl,kgrl --seeds 30,31")
