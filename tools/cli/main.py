@@ -24,7 +24,15 @@ COMMANDS = {
     "list": ("list",),
 }
 """Names of the commands that each module of this package registers."""
-ENVIRONMENT_OPTIONS = ("--guidance", "--station", "--reward", "--observation", "--action-repeat", "--fixture-offset")
+ENVIRONMENT_OPTIONS = (
+    "--guidance",
+    "--station",
+    "--reward",
+    "--observation",
+    "--action-repeat",
+    "--fixture-offset",
+    "--robot",
+)
 """Options of `train` that other commands take as `--env NAME=VALUE`."""
 INTERRUPTED = 130  # exit code after Ctrl-C
 

@@ -75,7 +75,7 @@ def call(capsys, *arguments):
         (["train", "Bead", "--out", "new", "--set", "tau=1", "--set", "tau=0.5"], "tau is given as 1 and as 0.5"),
         (["train", "Bead", "--out", "new", "--env", "action_repeat=two"], "give a value such as 1"),
         (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
-        (["train", "BncConnector", "--out", "new", "--robot", "panda"], "it is an option of station='arm'"),
+        (["train", "BncConnector", "--out", "new", "--robot", "panda"], "give --env robot=panda"),
         (["train", "BncConnector", "--out", "new", "--robot-url", "memq://"], "it is an option of station='hardware'"),
         (["train", "BncConnector", "--out", "new", "--rate", "0.5"], "give --station hardware too"),
         (["train", "BncConnector", "--out", "new", "--scenario", "lab.yaml"], "give --station hardware too"),
@@ -424,7 +424,7 @@ def test_train_draws_no_pictures_when_none_are_wanted(capsys, tmp_path):
 
 
 def test_completion_offers_commands_and_choices(monkeypatch, capsys):
-    for line, expected in (("guiderail tra", "train"), ("guiderail train Nar", "NarrowPassage")):
+    for line, expected in (("guiderail eva", "evaluate"), ("guiderail train Nar", "NarrowPassage")):
         monkeypatch.setenv("_GUIDERAIL_COMPLETE", "complete_bash")
         monkeypatch.setenv("COMP_WORDS", line)
         monkeypatch.setenv("COMP_CWORD", str(len(line.split()) - 1))
