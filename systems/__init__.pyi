@@ -15,11 +15,11 @@ from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .episode_monitor import TerminationTerm as TerminationTerm
 from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor
 from .external_torque_sensor import JointTorqueErrors as JointTorqueErrors
+from .force_monitor import ForceMonitor as ForceMonitor
 from .function_guidance_system import FunctionGuidanceSystem as FunctionGuidanceSystem
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
 from .image_observation import ImageObservation as ImageObservation
-from .impedance_monitor import ImpedanceMonitor as ImpedanceMonitor
 from .joint_torque_wrench import JointTorqueWrench as JointTorqueWrench
 from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem
 from .mean_force import MeanForce as MeanForce

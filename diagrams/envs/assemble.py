@@ -324,6 +324,7 @@ def build_task_diagram(
         "reward": reward.get_reward_output_port(),
         "termination": monitor.get_termination_output_port(),
         "contact_force": station.get_contact_force_output_port(),
+        **station.impedance_force(),
         "desired_pose": guidance.GetOutputPort("desired_pose"),
         "pose": station.get_pose_output_port(),
         "wrench": station.get_wrench_output_port(),
@@ -371,7 +372,8 @@ class SkillDiagram:
     """Learned skill as a diagram for a `Simulator`: observation → policy → guidance → station."""
 
     # Diagram with the subsystems "policy", "guidance" and "station"; exports pose, desired_pose, wrench, contact_force,
-    # held_action, constraint_violation and fallback, and rgb_image if it was built with a camera.
+    # held_action, constraint_violation and fallback, impedance_force if the station has an impedance, and rgb_image if
+    # it was built with a camera.
     diagram: Diagram
     control_period: float  # control period [s]
     num_steps: int  # number of control steps of an episode
@@ -415,6 +417,8 @@ def build_skill_diagram(
     builder.Connect(policy.GetOutputPort("action"), action)
     for name in ("pose", "wrench", "contact_force"):
         builder.ExportOutput(station.GetOutputPort(name), name)
+    for name, port in station.impedance_force().items():
+        builder.ExportOutput(port, name)
     for name in OUTPUTS:
         builder.ExportOutput(guidance.GetOutputPort(name), name)
     meshcat = add_meshcat(builder, scene_of(station)) if render_mode == "human" else None

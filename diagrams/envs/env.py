@@ -25,6 +25,7 @@ from guiderail.systems.episode_monitor import TERMINATIONS
 RECORDED_SIGNALS = (
     "commanded_violation",
     "measured_violation",
+    "contact_force",
     "wrench",
     "saturation",
     "collision",
@@ -39,6 +40,7 @@ INFO_KEYS = (
     "termination",
     "constraint_violation",
     "measured_violation",
+    "impedance_force",
     "contact_force",
     "fallback",
     "control_steps",
@@ -69,10 +71,11 @@ class DiagramEnv(DrakeGymEnv):
     that instant; the observation is read at the end of the last control step only.
 
     `info` has, at every step and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
-    `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `contact_force` (maximum of
-    the step [N]), `fallback` (True if guidance fell back to a safe command), every reward term by name (summed over the
-    step), and `control_steps` since the reset. Here a step is a call of `step`, with all its control steps. The `info`
-    of a reset also has the values that the task sampled.
+    `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `impedance_force` and
+    `contact_force` (maxima of the step [N]; without an impedance the first is NaN), `fallback` (True if guidance fell
+    back to a safe command), every reward term by name (summed over the step), and `control_steps` since the
+    reset. Here a step is a call of `step`, with all its control steps. The `info` of a reset also has the values that
+    the task sampled.
 
     An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
 
@@ -148,7 +151,8 @@ class DiagramEnv(DrakeGymEnv):
         self._termination_port = diagram.GetOutputPort("termination")
         recorded = filter(diagram.HasOutputPort, RECORDED_SIGNALS)
         self._recorded = [(name, diagram.GetOutputPort(name)) for name in recorded]
-        self._force_port = diagram.GetOutputPort("contact_force")
+        self._has_impedance = diagram.HasOutputPort("impedance_force")
+        self._force_port = diagram.GetOutputPort("impedance_force" if self._has_impedance else "contact_force")
         self._desired_pose_port = diagram.GetOutputPort("desired_pose")
         self._plants = list(_plants(diagram))
         self._pose_port = diagram.GetOutputPort("pose")
@@ -231,7 +235,9 @@ class DiagramEnv(DrakeGymEnv):
                 now = {name: port.Eval(context) for name, port in self._recorded}
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
-        info = self._info(0, *self._violations, 0.0, False, dict.fromkeys(self.task.reward_terms, 0.0))
+        info = self._info(
+            0, *self._violations, self._forces(0.0, 0.0), False, dict.fromkeys(self.task.reward_terms, 0.0)
+        )
         return self._observation, info | self.sampled
 
     @contextmanager
@@ -282,7 +288,7 @@ class DiagramEnv(DrakeGymEnv):
         context = self.simulator.get_context()
         self._action_value.GetMutableData().set_value(action)
 
-        total = peak_force = 0.0
+        total = peak_force = peak_contact_force = 0.0
         commanded_violation = measured_violation = -np.inf
         terms = dict.fromkeys(self.task.reward_terms, 0.0)
         termination, fallback = 0, False
@@ -306,6 +312,7 @@ class DiagramEnv(DrakeGymEnv):
             total += reward
             # The built-in max would ignore NaN, and an unknown violation would be reported as slack.
             peak_force = float(np.maximum(peak_force, force))
+            peak_contact_force = float(np.maximum(peak_contact_force, now["contact_force"][0]))
             commanded_violation = float(np.maximum(commanded_violation, now["commanded_violation"][0]))
             measured_violation = float(np.maximum(measured_violation, now["measured_violation"][0]))
             fallback = fallback or bool(now["fallback"][0])
@@ -324,7 +331,8 @@ class DiagramEnv(DrakeGymEnv):
             # The simulation failed before the first control step ended.
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
-        info = self._info(termination, commanded_violation, measured_violation, peak_force, fallback, terms)
+        forces = self._forces(peak_force, peak_contact_force)
+        info = self._info(termination, commanded_violation, measured_violation, forces, fallback, terms)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -387,12 +395,16 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 
+    def _forces(self, force: float, contact_force: float) -> tuple[float, float]:
+        """Return the forces of the impedance, NaN if there is none, and of the contact [N]."""
+        return (force if self._has_impedance else math.nan), contact_force
+
     def _info(
         self,
         termination: int,
         commanded_violation: float,
         measured_violation: float,
-        force: float,
+        forces: tuple[float, float],
         fallback: bool,
         terms: Mapping[str, float],
     ) -> dict[str, Any]:
@@ -402,7 +414,8 @@ class DiagramEnv(DrakeGymEnv):
             "termination": TERMINATIONS[termination],
             "constraint_violation": commanded_violation,
             "measured_violation": measured_violation,
-            "contact_force": force,
+            "impedance_force": forces[0],
+            "contact_force": forces[1],
             "fallback": fallback,
             "control_steps": self._control_steps,
             **terms,

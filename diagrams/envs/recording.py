@@ -16,7 +16,7 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.recorder import Recorder, Recording
 
-SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}
+SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "impedance_force": 1, "saturation": 1}
 
 
 class DrivenStation:

@@ -90,6 +90,7 @@ class TaskDiagram:
     ``pose``                (O,) measured pose
     ``fallback``            (1,) 1 if guidance commanded a safe pose instead of the requested one
     ``wrench``              (W,) contact wrench on the tool; this port and all following ports are optional
+    ``impedance_force``     (1,) magnitude of the force of the impedance [N]
     ``saturation``          nonzero while an actuator is at its limit; its size depends on the station
     ``collision``           (1,) positive during a collision
     ``privileged``          (m,) observation for a privileged critic; the policy does not receive it

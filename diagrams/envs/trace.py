@@ -1,5 +1,6 @@
 """Trace of an episode: commands, measurements and rewards of every control step, and their statistics."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -58,7 +59,7 @@ class EpisodeTrace:
 
     @property
     def force(self) -> np.ndarray:
-        """Contact force, (n,) [N]."""
+        """Force of the impedance or, without an impedance, of the contact, (n,) [N]."""
         return self._force[: self._length]
 
     @property
@@ -83,7 +84,7 @@ class EpisodeTrace:
         reward: float,
         signals: Mapping[str, np.ndarray],
     ) -> None:
-        """Record one control step: poses (O,), contact force [N], reward and signals.
+        """Record one control step: poses (O,), force [N] as in `force`, reward and signals.
 
         Raises:
             InputError: If a signal of the trace is missing.
@@ -114,6 +115,9 @@ class EpisodeTrace:
             "max_commanded_violation": self._largest("commanded_violation"),
             "max_measured_violation": self._largest("measured_violation"),
             "peak_force": float(self.force.max(initial=0.0)),
+            "peak_contact_force": float(self.signals["contact_force"].max(initial=0.0))
+            if "contact_force" in self._signals
+            else math.nan,
             # Forces are added in the order of the steps, because the order of NumPy's mean rounds differently.
             "mean_force": float(np.cumsum(self.force)[-1] / len(self)) if len(self) else 0.0,
             "collisions": float((collision & ~np.append(False, collision[:-1])).sum()),

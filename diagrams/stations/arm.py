@@ -220,7 +220,7 @@ class ArmStation(Station):
         )
         builder.AddNamedSystem("wrench_sensor", sensor)
         sensor.connect(builder, plant)
-        wrench = sensor.get_wrench_output_port()
+        wrench = contact_wrench = sensor.get_wrench_output_port()
         if joint_torque is not None:
             builder.ExportOutput(wrench, "exact_wrench")
             wrench = self._add_wrench_estimate(builder, joint_torque)
@@ -231,6 +231,7 @@ class ArmStation(Station):
             control_period,
             state=plant.get_state_output_port(arm.model),
             wrench=wrench,
+            contact_wrench=contact_wrench,
         )
         builder.Connect(torque, plant.get_actuation_input_port(arm.model))
         if arm.gripper:

@@ -72,6 +72,7 @@ class DisturbedStation(Station):
         wrench = self._add_wrench(builder, station.get_wrench_output_port(), measured)
         exact = station.GetOutputPort(EXACT_WRENCH if station.HasOutputPort(EXACT_WRENCH) else "wrench")
         outputs = {name: station.GetOutputPort(name) for name in OUTPUTS}
+        outputs |= station.impedance_force()
         outputs |= {"pose": pose.get_disturbed_measurement_output_port(), "wrench": wrench}
         export_station_ports(
             builder,

@@ -20,7 +20,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.energy_tank import EnergyTank
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.force_monitor import ForceMonitor
 from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
 
@@ -42,9 +42,10 @@ def add_controller(
     impedance: Impedance,
     period: float,
     *,
+    contact_wrench: OutputPort,
     compensate_gravity: bool,
-) -> tuple[CartesianImpedanceController, ImpedanceMonitor, EnergyTank | None]:
-    """Add a robot's controller, the monitor of its impedance wrench, and its energy tank.
+) -> tuple[CartesianImpedanceController, ForceMonitor, EnergyTank | None]:
+    """Add a robot's controller, the monitor of its forces, and its energy tank.
 
     The controller checks its commands every `period` [s], which is also the period of the tank. There is a tank only if
     the impedance is bounded; the desired pose is then an input of the tank instead of the controller.
@@ -67,8 +68,9 @@ def add_controller(
         timeout=command_timeout(period),
     )
     builder.AddNamedSystem("controller", controller)
-    monitor = ImpedanceMonitor(limits)
-    add_system(builder, "monitor", monitor, impedance_wrench=controller.get_impedance_wrench_output_port())
+    monitor = ForceMonitor(limits)
+    impedance_wrench = controller.get_impedance_wrench_output_port()
+    add_system(builder, "monitor", monitor, impedance_wrench=impedance_wrench, contact_wrench=contact_wrench)
     tank = add_energy_tank(builder, impedance, period, controller.get_pose_output_port())
     if tank is not None:
         builder.Connect(tank.get_reference_pose_output_port(), controller.get_desired_pose_input_port())
@@ -126,15 +128,22 @@ def add_impedance_control(
     *,
     state: OutputPort,
     wrench: OutputPort,
+    contact_wrench: OutputPort | None = None,
     compensate_gravity: bool = True,
 ) -> OutputPort:
     """Add the controller of a robot, which checks its commands every `period` [s], and export a station's ports.
 
     `state` is the port of the joint positions and velocities, (2n,), and `wrench` the port of the measured wrench,
-    (6,). The result is the port of the joint torques, (n,).
+    (6,). `contact_wrench` is the port of the contact's wrench, (6,); by default it is the measured one. The result is
+    the port of the joint torques, (n,).
     """
     controller, monitor, tank = add_controller(
-        builder, controller_plant, impedance, period, compensate_gravity=compensate_gravity
+        builder,
+        controller_plant,
+        impedance,
+        period,
+        contact_wrench=wrench if contact_wrench is None else contact_wrench,
+        compensate_gravity=compensate_gravity,
     )
     builder.Connect(state, controller.get_estimated_state_input_port())
     export_station_ports(
@@ -144,6 +153,7 @@ def add_impedance_control(
         pose=controller.get_pose_output_port(),
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
+        impedance_force=monitor.get_impedance_force_output_port(),
         saturation=controller.get_saturation_output_port(),
         command_timed_out=controller.get_command_timed_out_output_port(),
         max_wrench=None if tank is None else tank.get_max_wrench_input_port(),
@@ -184,9 +194,9 @@ def add_joint_impedance(
         Port of the desired positions, (6,).
     """
     watchdog = CommandWatchdog(control_period, command_timeout(control_period))
-    monitor = ImpedanceMonitor(np.array(impedance.limits))
+    monitor = ForceMonitor(np.array(impedance.limits))
     add_system(builder, "watchdog", watchdog, pose=pose)
-    add_system(builder, "monitor", monitor, impedance_wrench=impedance_wrench)
+    add_system(builder, "monitor", monitor, impedance_wrench=impedance_wrench, contact_wrench=wrench)
     tank = add_energy_tank(builder, impedance, time_step, pose)
     export_station_ports(
         builder,
@@ -195,6 +205,7 @@ def add_joint_impedance(
         pose=pose,
         wrench=wrench,
         contact_force=monitor.get_contact_force_output_port(),
+        impedance_force=monitor.get_impedance_force_output_port(),
         saturation=monitor.get_saturation_output_port(),
         command_timed_out=watchdog.get_command_timed_out_output_port(),
         max_wrench=None if tank is None else tank.get_max_wrench_input_port(),

@@ -19,7 +19,10 @@ output               size   meaning
 `pose`               O      measured pose X_TP, in the same coordinates
 `wrench`             W      wrench of the surroundings on the tool at P in the axes of T, [fx fy fz tx ty tz],
                             N and Nm, without the tool's weight and inertia, low-pass filtered
-`contact_force`      1      magnitude of the impedance's force [N], by which collisions are detected
+`contact_force`      1      magnitude of the contact force [N]: the simulator's, low-pass filtered like `wrench`
+                            but without errors of a sensor; on a robot that of `wrench`
+`impedance_force`    1      only with an impedance: magnitude of its force [N], which `force_limit` bounds and by
+                            which collisions are detected
 `saturation`         1      nonzero while the controller is at a limit of force or torque; size 2 on the plane station
 `command_timed_out`  1      1 while commands are missing or not finite, and the last safe pose is held
 ===================  =====  ========================================================================================
@@ -191,11 +194,17 @@ class Station(Diagram):
     get_command_time_input_port = input_getter("command_time", "time of the desired pose, (1,) [s]; optional")
     get_pose_output_port = output_getter("pose", "measured pose, (O,)")
     get_wrench_output_port = output_getter("wrench", "wrench of the surroundings on the tool, (W,)")
-    get_contact_force_output_port = output_getter("contact_force", "magnitude of the impedance's force, (1,) [N]")
+    get_contact_force_output_port = output_getter("contact_force", "magnitude of the contact force, (1,) [N]")
+    get_impedance_force_output_port = output_getter("impedance_force", "magnitude of the impedance's force, (1,) [N]")
     get_saturation_output_port = output_getter("saturation", "flag, 1 while the controller is at a limit, (1,)")
     get_command_timed_out_output_port = output_getter(
         "command_timed_out", "flag, 1 while the last safe pose is held, (1,)"
     )
+
+    def impedance_force(self) -> dict[str, OutputPort]:
+        """Return the port `impedance_force` by name; empty for a station without an impedance."""
+        name = "impedance_force"
+        return {name: self.GetOutputPort(name)} if self.HasOutputPort(name) else {}
 
     @abstractmethod
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
@@ -326,15 +335,18 @@ def export_station_ports(
     command_time: InputPort,
     *,
     max_wrench: InputPort | None = None,
+    impedance_force: OutputPort | None = None,
     **outputs: OutputPort,
 ) -> None:
-    """Export the `INPUTS` and `OUTPUTS` of a station, and `max_wrench` if its impedance is bounded."""
+    """Export the `INPUTS` and `OUTPUTS` of a station, and the ports of an impedance if there is one."""
     if max_wrench is not None:
         builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")
     builder.ExportInput(command_time, "command_time")
     for name in OUTPUTS:
         builder.ExportOutput(outputs[name], name)
+    if impedance_force is not None:
+        builder.ExportOutput(impedance_force, "impedance_force")
 
 
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:

@@ -175,7 +175,7 @@ class InsertionTask(Task):
         if not self.collision.above > 0.0:
             raise InputError(
                 f"the force limit of {self.name} must be positive, not {brief(self.collision.above)}: let its "
-                'constructor set collision to Threshold("contact_force", limit)'
+                'constructor set collision to Threshold("impedance_force", limit)'
             )
         return Impedance().with_max_force(self.collision.above)
 
@@ -191,11 +191,11 @@ class InsertionTask(Task):
         if self._force_limit_range is not None:
             return TerminationTerm(
                 "collision",
-                {"contact_force": 1, "force_limit": 1},
-                lambda contact_force, force_limit: contact_force[0] > force_limit[0],
+                {"impedance_force": 1, "force_limit": 1},
+                lambda impedance_force, force_limit: impedance_force[0] > force_limit[0],
             )
         limit = self.collision.above
-        return TerminationTerm("collision", {"contact_force": 1}, lambda contact_force: contact_force[0] > limit)
+        return TerminationTerm("collision", {"impedance_force": 1}, lambda impedance_force: impedance_force[0] > limit)
 
     def reset(
         self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any

@@ -102,7 +102,7 @@ def _profile(task: str, station: str) -> dict[str, Any]:
         "height_mm": (recording["pose"][:, 2] / MM).tolist(),
         "push_n": recording["wrench"][:, 2].tolist(),
         "torque_nm": recording["wrench"][:, 5].tolist(),
-        "peak_force_n": float(recording["contact_force"].max()),
+        "peak_force_n": float(recording["impedance_force"].max()),
     }
 
 

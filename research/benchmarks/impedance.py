@@ -77,7 +77,7 @@ def insertion(control: str, time_step: float) -> tuple[dict[str, Any], np.ndarra
         "time_step": time_step,
         "seconds": time.process_time() - begin,
         "locks": workcell.is_locked(workcell.workpiece_in_target(station.plant, driven.plant_context)),
-        "peak_force": float(recording["contact_force"].max()),
+        "peak_force": float(recording["impedance_force"].max()),
     }
     return row, recording["pose"]
 

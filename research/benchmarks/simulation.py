@@ -28,7 +28,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import insert_and_loc
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController
 from guiderail.systems.cartesian_position_controller import CartesianPositionController
 from guiderail.systems.contact_detector import ContactDetector
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.force_monitor import ForceMonitor
 from guiderail.systems.measured_pose import MeasuredPose
 from guiderail.systems.pose_wrench import PoseWrench
 from guiderail.systems.recorder import Recorder
@@ -46,8 +46,8 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (ContactDetector, "_update"),
     (LastValidPose, "_update"),
     (LastValidPose, "eval"),
-    (ImpedanceMonitor, "_contact_force"),
-    (ImpedanceMonitor, "_saturation"),
+    (ForceMonitor, "_impedance_force"),
+    (ForceMonitor, "_saturation"),
     (Recorder, "_record"),
 )
 CONTACT = (3.8, 7.6)  # interval from first contact of the plug to its release in the locked state [s]

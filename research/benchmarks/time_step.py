@@ -67,7 +67,7 @@ def _errors(signals: dict[str, np.ndarray], finest: dict[str, np.ndarray]) -> di
         "angle_rms": _rms(difference["pose"][:, 3:]),
         "force_rms": _rms(difference["wrench"][:, :3]),
         "torque_rms": _rms(difference["wrench"][:, 3:]),
-        "peak_contact_force": float(signals["contact_force"].max()),
+        "peak_impedance_force": float(signals["impedance_force"].max()),
         "end_distance": float(np.linalg.norm(difference["pose"][-1, :3])),
     }
 
@@ -87,7 +87,7 @@ def show(results: dict[str, Any]) -> None:
         print(
             f"{1e3 * row['time_step']:6.2f} ms  {row['seconds']:4.2f} s {1e3 * row['position_rms']:6.3f} mm "
             f"{np.rad2deg(row['angle_rms']):5.2f}°  {row['force_rms']:5.2f} N {1e3 * row['torque_rms']:5.1f} mNm "
-            f"{row['peak_contact_force']:5.1f} N {1e3 * row['end_distance']:5.3f} mm"
+            f"{row['peak_impedance_force']:5.1f} N {1e3 * row['end_distance']:5.3f} mm"
         )
     print(f"errors are RMS against the finest; the default is {1e3 * results['default']:.0f} ms")
 
@@ -95,7 +95,7 @@ def show(results: dict[str, Any]) -> None:
 def draw(results: dict[str, Any], path: Path) -> Path:
     """Draw error and peak force over CPU time: a curve per motion, a dot per time step, filled for the default step."""
     figure, axes = new_figure(1, 2, (10.0, 4.0))
-    columns = (("force_rms", "force, RMS error [N]"), ("peak_contact_force", "peak contact force [N]"))
+    columns = (("force_rms", "force, RMS error [N]"), ("peak_impedance_force", "peak force of the impedance [N]"))
     for axis, (column, label) in zip(axes.flat, columns, strict=True):
         for motion in MOTIONS:
             rows = [row for row in results["rows"] if row["motion"] == motion]

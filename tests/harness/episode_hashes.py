@@ -25,7 +25,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from point_env import PERIOD, PointEnv, demonstrations, pose, to_action
 
 import guiderail
 from guiderail.diagrams.guidance.registry import possible_guidance
@@ -33,10 +32,9 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import robot_names
-from oracles.parts import square_peg
 
 STEPS = 60  # largest number of environment steps of an episode
-INFO = ("constraint_violation", "measured_violation", "contact_force", "fallback")
+INFO = ("constraint_violation", "measured_violation", "force", "fallback")
 EXTRA_CASES: list[tuple[str, dict[str, Any]]] = [
     ("BncConnector", {"guidance": "kgrl", "wrench_noise": [0.2, 0.01], "wrench_delay": 2, "action_repeat": 5}),
     ("BncConnector", {"guidance": "skgrl", "reward": "shaped"}),
@@ -126,6 +124,8 @@ def guided_hash(options: dict[str, Any]) -> str:
     Args:
         options: Arguments of `GuidedEnv` beyond the demonstrations, the frame and the two conversions.
     """
+    from point_env import PERIOD, PointEnv, demonstrations, pose, to_action  # see `main`
+
     env = guiderail.GuidedEnv(
         PointEnv(),
         demonstrations=demonstrations(),
@@ -151,7 +151,11 @@ def _hash_of(env: gymnasium.Env, steps: int, resets: tuple[dict[str, Any], ...])
             action = np.clip(0.7 * action + 0.5 * rng.normal(size=action.shape), -1.0, 1.0)
             observation, reward, terminated, truncated, info = env.step(action.astype(np.float32))
             count += 1
-            values = (info[name] for name in INFO if name in info)
+            force = info.get("impedance_force", np.nan)  # NaN without an impedance
+            own = info | (
+                {"force": info["contact_force"] if np.isnan(force) else force} if "contact_force" in info else {}
+            )
+            values = (own[name] for name in INFO if name in own)
             numbers = [float(reward), terminated, truncated, *map(float, values)]
             digest.update(np.ascontiguousarray(observation).tobytes())
             digest.update(np.array(numbers, dtype=float).tobytes())
@@ -190,6 +194,7 @@ def make_part(folder: Path) -> str:
     """Create the task folder of a square peg from two mesh files; return the name of its task."""
     from guiderail.diagrams.tasks.registry import register_task_folder
     from guiderail_parts.create_task import create_task
+    from oracles.parts import square_peg  # see `main`
 
     plug, socket = square_peg().write(folder)
     create_task(plug, socket, folder / "square_peg", unit="mm", hard_episodes=0)
@@ -242,6 +247,7 @@ def differences(first: dict[str, str], second: dict[str, str]) -> list[str]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the program; return the exit code."""
+    sys.path.append(str(Path(__file__).parents[1]))  # modules of the tests, as in pytest's `pythonpath`
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(dest="command", required=True)
     write_parser = commands.add_parser("write", help="run the episodes and write their hashes")

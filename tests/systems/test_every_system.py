@@ -95,7 +95,7 @@ def system_by_name():
         systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
-        systems.ImpedanceMonitor(np.ones(6)),
+        systems.ForceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
         systems.ChunkReference(
             lambda observation: observation,

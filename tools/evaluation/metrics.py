@@ -180,8 +180,19 @@ COLUMNS = (
     Metric(
         "steps", STEPS, "length (in actions if the environment does not count control steps)", lambda e: len(e.trace)
     ),
-    Metric("peak_force", "N", "largest contact force of any control step", _statistic("peak_force")),
-    Metric("mean_force", "N", "contact force, mean over control steps", _statistic("mean_force")),
+    Metric(
+        "peak_force",
+        "N",
+        "largest force of the impedance, or of the contact without an impedance, of any control step",
+        _statistic("peak_force"),
+    ),
+    Metric(
+        "peak_contact_force",
+        "N",
+        "largest contact force of any control step, low-pass filtered (10 ms)",
+        _statistic("peak_contact_force"),
+    ),
+    Metric("mean_force", "N", "force as in peak_force, mean over control steps", _statistic("mean_force")),
     Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
     *(
         Metric(f"jerk_{which}_{part}", unit, f"third derivative of the {which} {of}, mean norm", _jerk(which, part))
@@ -211,8 +222,9 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     """Return an episode's row for an environment that is not of this package, with the columns that `info` provides.
 
     `infos` are those of all steps. The episode succeeds if `is_success`, or without it `success`, is true at any step;
-    without either in any step, the column `REPORTS_SUCCESS` is 0. The largest `constraint_violation` and
-    `contact_force` of any step are the columns `max_commanded_violation` and `peak_force`. `steps` is the last
+    without either in any step, the column `REPORTS_SUCCESS` is 0. The largest `constraint_violation`,
+    `impedance_force` and `contact_force` of any step are the columns `max_commanded_violation`, `peak_force` and
+    `peak_contact_force`; without an impedance, `peak_force` is the largest `contact_force`. `steps` is the last
     `control_steps`, which `GuidedEnv` counts, or the number of actions if `info` does not have it. `is_terminated` is
     False if the episode was truncated.
 
@@ -227,7 +239,12 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
         "termination": "success" if success else "terminated" if is_terminated else "time_limit",
         "steps": as_whole(infos[-1].get("control_steps", len(infos)), "control_steps in info"),
     }
-    for column, name in (("max_commanded_violation", "constraint_violation"), ("peak_force", "contact_force")):
+    own_force = "impedance_force" if any("impedance_force" in info for info in infos) else "contact_force"
+    for column, name in (
+        ("max_commanded_violation", "constraint_violation"),
+        ("peak_force", own_force),
+        ("peak_contact_force", "contact_force"),
+    ):
         if values := [float(info[name]) for info in infos if name in info]:
             row[column] = float(np.max(values))  # NaN if any value is NaN
     return row | {REPORTS_SUCCESS: int(any("is_success" in info or "success" in info for info in infos))}
@@ -332,6 +349,7 @@ _STATISTICS = (
     Metric("mean_steps", STEPS, "length, mean over episodes", _mean("steps")),
     Metric("total_steps", STEPS, "length of all episodes together", _total("steps")),
     Metric("peak_force", "N", "largest force of any episode", _largest("peak_force")),
+    Metric("peak_contact_force", "N", "largest contact force of any episode", _largest("peak_contact_force")),
     Metric("mean_force", "N", "each episode's mean force, mean over episodes", _mean("mean_force")),
     Metric("mean_squared_force", "N²", "mean squared force, mean over episodes", _mean("mean_squared_force")),
     Metric(SINCE, "N²", "mean squared force of the episodes after convergence", _force_since_convergence),

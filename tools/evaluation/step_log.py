@@ -29,7 +29,8 @@ MEANINGS = {
     "pose_i": ("m, rad", "measured pose"),
     "commanded_violation": (SLACK, "violation of the commanded pose"),
     "measured_violation": (SLACK, "violation of the measured pose"),
-    "contact_force": ("N", "contact force"),
+    "force": ("N", "force of the impedance or, without an impedance, of the contact"),
+    "contact_force": ("N", "contact force, low-pass filtered"),
     "wrench_i": ("N, Nm", "wrench of the surroundings on the tool"),
     "saturation": ("", "1 while the controller is at a limit; in the plane, the largest excess of a joint's force [N]"),
     "collision": ("", "True in a collision"),
@@ -92,7 +93,7 @@ def table(trace: EpisodeTrace, episode: int) -> pa.Table:
         "step": np.arange(num_steps, dtype=np.int32),
     }
     columns |= _numbered("desired_pose", trace.commanded) | _numbered("pose", trace.measured)
-    columns["contact_force"] = trace.force
+    columns["force"] = trace.force
     for name, values in trace.signals.items():
         if name in _FLAGS:
             columns[name] = values[:, 0] > 0.0

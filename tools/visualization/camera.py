@@ -56,7 +56,7 @@ class Frames(EnvCallback):
         if len(self.frames) == self._max_frames:
             self.frames, self._stride = self.frames[::2], 2 * self._stride
         time = len(self.base.trace) * self.base.task.control_period
-        self.frames.append((time, transition.info["contact_force"], self.env.render()))
+        self.frames.append((time, float(self.base.trace.force[-1]), self.env.render()))
 
     def select(self, number: int) -> list[Any]:
         """Return `number` evenly spaced frames, including the first and the last."""

@@ -42,7 +42,7 @@ PAIRS = (
         f"constraint violation [{VIOLATION}]\n(negative is slack)",
         {"max_commanded_violation": "commanded", "max_measured_violation": "measured"},
     ),
-    ("contact force [N]", {"peak_force": "peak", "mean_force": "mean"}),
+    ("force [N]", {"peak_force": "peak", "mean_force": "mean"}),
     ("mean jerk [m/s³]", {"jerk_commanded_linear": "commanded", "jerk_measured_linear": "measured"}),
 )
 PLOTTED = {"success", "return", *(column for _, columns in PAIRS for column in columns)}

@@ -250,7 +250,7 @@ class BncConnector(DemonstratedInsertion):
         self.offsets = BncUncertainty(
             o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
         )
-        self.collision = Threshold("contact_force", o.largest_force_limit)
+        self.collision = Threshold("impedance_force", o.largest_force_limit)
         dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
         dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer, slot_clearance=o.slot_clearance)
         self._workcell = BncWorkcell(dimensions, friction=o.friction, margin=o.contact_margin, equal_area=o.equal_area)

@@ -252,7 +252,7 @@ class GridClamp(InsertionTask):
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         self.offsets = GridClampUncertainty(self.options.fixture_offset)
-        self.collision = Threshold("contact_force", self.options.largest_force_limit)
+        self.collision = Threshold("impedance_force", self.options.largest_force_limit)
         # The default is 100 actions at 10 Hz; the thesis's episodes have 140 actions on average.
         self.num_steps = round(self.options.seconds / self.control_period)
         o, dimensions = self.options, NOMINAL.with_clearance(self.options.clearance)

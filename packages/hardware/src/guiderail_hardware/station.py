@@ -184,7 +184,7 @@ class HardwareStation(Station):
         add_system(builder, "rate_limiter", rate_limiter, desired_pose=safe_pose)
         limited_pose = rate_limiter.get_limited_pose_output_port()
         controller, impedance_monitor, tank = add_controller(
-            builder, model, self.impedance, period, compensate_gravity=False
+            builder, model, self.impedance, period, contact_wrench=measured_wrench, compensate_gravity=False
         )
         pose = controller.get_pose_output_port()
         self._limiter = limiter = add_system(
@@ -240,6 +240,7 @@ class HardwareStation(Station):
             pose=pose,
             wrench=measured_wrench,
             contact_force=impedance_monitor.get_contact_force_output_port(),
+            impedance_force=impedance_monitor.get_impedance_force_output_port(),
             saturation=controller.get_saturation_output_port(),
             command_timed_out=limiter.get_not_following_output_port(),
             max_wrench=max_wrench,

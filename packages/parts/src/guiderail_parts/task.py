@@ -253,7 +253,7 @@ class PartInsertion(DemonstratedInsertion):
                 "or offset_shape=ring"
             )
         self.offsets = PartUncertainty(self.options)
-        self.collision = Threshold("contact_force", self.options.largest_force_limit)
+        self.collision = Threshold("impedance_force", self.options.largest_force_limit)
         self.num_steps = self.reference().num_steps
         self.insertion_length = self.file.motion.travel
         self._check_length_and_start()

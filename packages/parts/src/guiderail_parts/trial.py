@@ -173,7 +173,7 @@ def insert(
         is_blocked=lowest > file.tolerance.height,
         pose=pose,
         lowest=lowest,
-        peak_force=float(recording["contact_force"].max()),
+        peak_force=float(recording["impedance_force"].max()),
         penetration=depths.deepest,
         resting_penetration=depths.deepest_at_rest,
         snap=depths.deepest_snap,

@@ -42,7 +42,7 @@ REQUIRED_COLUMNS = (
 )  # fmt: skip
 PALETTE = ("#1f77b4", "#d62728", "#2ca02c", "#9467bd", "#8c564b", "#e377c2", "#7f7f7f", "#bcbd22", "#17becf")
 STEP_LOG_COLUMNS = (
-    "commanded_violation", "measured_violation", "contact_force", "collision", "saturation", "command_timed_out",
+    "commanded_violation", "measured_violation", "force", "collision", "saturation", "command_timed_out",
     "fallback",
 )  # fmt: skip
 
@@ -97,7 +97,7 @@ class Run:
         return of_episodes | {
             "source": "step_log",
             "steps": len(steps),
-            **_extremes(steps, "", "contact_force"),
+            **_extremes(steps, "", "force"),
             "collision_steps": int(steps["collision"].sum()),
             "saturated_steps": int((steps["saturation"] > 0).sum()),
             "timed_out_steps": int(steps["command_timed_out"].sum()),

@@ -194,7 +194,7 @@ class SkillExecutor:
         self._clock.advance(self._simulator, station, self._steps)
         context = station.GetMyContextFromRoot(root_context)
         arm_state, fault = (int(station.GetOutputPort(name).Eval(context)[0]) for name in ("arm_state", "fault"))
-        force, limit = float(station.get_contact_force_output_port().Eval(context)[0]), self._task.collision.above
+        force, limit = float(station.get_impedance_force_output_port().Eval(context)[0]), self._task.collision.above
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
             return Outcome(Fault(fault), describe_stop(Fault(fault), station.driver), 0)
         if self._is_stop_requested():
@@ -257,7 +257,7 @@ class SkillExecutor:
         self.trace.append(
             guidance.GetOutputPort("desired_pose").Eval(guidance_context),
             station.get_pose_output_port().Eval(station_context),
-            float(station.get_contact_force_output_port().Eval(station_context)[0]),
+            float(station.get_impedance_force_output_port().Eval(station_context)[0]),
             np.nan,  # no reward is computed on hardware
             signals,
         )

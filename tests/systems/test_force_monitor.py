@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.impedance_monitor import ImpedanceMonitor
+from guiderail.systems.force_monitor import ForceMonitor
 
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
 
 
 def read(wrench, limits=LIMITS):
     """Return the contact force [N] and the saturation of an impedance wrench (6,)."""
-    monitor = ImpedanceMonitor(limits)
+    monitor = ForceMonitor(limits)
     context = monitor.CreateDefaultContext()
     monitor.get_impedance_wrench_input_port().FixValue(context, wrench)
     force, saturation = monitor.get_contact_force_output_port(), monitor.get_saturation_output_port()
@@ -42,4 +42,4 @@ def test_limits_may_be_a_list_of_numbers_below_one():
 @pytest.mark.parametrize("limits", [np.ones(5), np.zeros(6), np.full(6, np.nan), [1.0] * 5 + [0.0], [-1.0] + [1.0] * 5])
 def test_constructor_refuses_limits_out_of_range(limits):
     with pytest.raises(InputError):
-        ImpedanceMonitor(limits)
+        ForceMonitor(limits)
