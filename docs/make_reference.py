@@ -237,7 +237,7 @@ def api() -> str:
     from guiderail.diagrams.guidance.registry import REQUIREMENTS
     from guiderail.diagrams.stations.station import OUTPUTS
     from guiderail.models import primitives
-    from guiderail.systems.episode_monitor import TERMINATIONS
+    from guiderail.models.common.termination import TERMINATIONS
 
     page = (
         "# Public names\n\nNames that `guiderail`, `guiderail.models.primitives` and `guiderail.diagrams.guidance` "
@@ -256,7 +256,7 @@ def api() -> str:
     rows = [
         ("guiderail.diagrams.envs.observation.CLOCKS", CLOCKS, "signals that every observation can have"),
         (
-            "guiderail.systems.episode_monitor.TERMINATIONS",
+            "guiderail.models.common.termination.TERMINATIONS",
             TERMINATIONS,
             "terminations of an episode; the empty one while it runs",
         ),

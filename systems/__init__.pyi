@@ -10,7 +10,6 @@ from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_detector import ContactDetector as ContactDetector
 from .energy_tank import EnergyTank as EnergyTank
-from .episode_monitor import TERMINATIONS as TERMINATIONS
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .episode_monitor import TerminationTerm as TerminationTerm
 from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor

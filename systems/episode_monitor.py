@@ -8,20 +8,9 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.termination import EVALUATED, Termination
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
-
-TERMINATIONS = ("", "success", "collision", "spill", "blocked", "violation", "time_limit")
-"""Reasons for the end of an episode; a ``termination`` port outputs an index into this tuple.
-
-- ``""``: the episode continues.
-- ``"success"``: the goal of the task was reached.
-- ``"collision"``: the contact force exceeded the limit of the task, or an obstacle was touched.
-- ``"spill"``: a ball was spilled.
-- ``"blocked"``: no progress for a number of steps.
-- ``"violation"``: a constraint was violated.
-- ``"time_limit"``: the maximum number of steps was reached.
-"""
 
 
 @dataclass(frozen=True)
@@ -29,7 +18,7 @@ class TerminationTerm:
     """Condition that terminates an episode.
 
     Args:
-        termination: Reason that is reported, one of `TERMINATIONS`.
+        termination: Reason that is reported, one of `EVALUATED`, such as "success".
         inputs: Size of each signal that the condition depends on, by name. Terms of one monitor that name the same
             signal share its port.
         condition: Pure function with these signals as keyword arguments; returns True if the condition is met.
@@ -51,8 +40,8 @@ class TerminationTerm:
     min_progress: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.termination not in TERMINATIONS[1:]:
-            raise InputError(f"an episode can't end as '{self.termination}', only as one of {TERMINATIONS[1:]}")
+        if self.termination not in EVALUATED:
+            raise InputError(f"an episode can't end as '{self.termination}', only as {', '.join(EVALUATED)}")
         if not is_whole(self.steps, 1):
             raise InputError(f"the steps of a condition must be a whole number of at least 1, not {brief(self.steps)}")
         if not 0.0 <= self.min_progress < np.inf:
@@ -74,7 +63,7 @@ class EpisodeMonitor(LeafSystem):
         output_ports:
         - termination
 
-    ``termination`` is (1,), an index into `TERMINATIONS`; 0 while the episode continues.
+    ``termination`` is (1,), an index of a `Termination`; 0 while the episode continues.
 
     Args:
         terms: Termination terms in order of precedence, at least one.
@@ -97,7 +86,7 @@ class EpisodeMonitor(LeafSystem):
             for function in filter(None, (term.condition, term.progress)):
                 check_signature(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")
         self._terms = tuple(terms)
-        self._indices = [TERMINATIONS.index(term.termination) for term in terms]
+        self._indices = [Termination(term.termination).index for term in terms]
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
 
         # [count, progress at the last reset of the count] of each term, then the index of the termination.
@@ -108,7 +97,7 @@ class EpisodeMonitor(LeafSystem):
         declare.update_after_start(self, period, self._update, declare.reset_to_default(self))
 
     get_signal_input_port = declare.get_signal_input_port
-    get_termination_output_port = output_getter("termination", "index into `TERMINATIONS`, (1,)")
+    get_termination_output_port = output_getter("termination", "index of a `Termination`, (1,)")
 
     def _calc_next(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)

@@ -20,7 +20,7 @@ from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.episode_monitor import TERMINATIONS
+from guiderail.models.common.termination import TERMINATIONS, Termination
 
 RECORDED_SIGNALS = (
     "commanded_violation",
@@ -48,8 +48,6 @@ INFO_KEYS = (
 )
 """Reserved keys of `info`; reward terms and the values that a task's reset samples must have other names."""
 
-_TIME_LIMIT = TERMINATIONS.index("time_limit")
-
 # Error messages of Drake, or of a system with another physics engine, that report failed physics and not wrong wiring.
 # A failed assertion of Drake is a SystemExit in Python.
 _SIMULATION_FAILURE = re.compile(
@@ -70,7 +68,7 @@ class DiagramEnv(DrakeGymEnv):
     steps, which are counted by an integer. The ports are read at the end of each control step, before the events of
     that instant; the observation is read at the end of the last control step only.
 
-    `info` has, at every step and at a reset, `is_success`, `termination` (one of `TERMINATIONS`),
+    `info` has, at every step and at a reset, `is_success`, `termination` (a `Termination`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `impedance_force` and
     `contact_force` (maxima of the step [N]; without an impedance the first is NaN), `fallback` (True if guidance fell
     back to a safe command), every reward term by name (summed over the step), and `control_steps` since the
@@ -326,7 +324,7 @@ class DiagramEnv(DrakeGymEnv):
         terminated = termination != 0
         truncated = not terminated and (self._failure is not None or self._control_steps >= self.task.num_steps)
         if truncated and self._failure is None:
-            termination = _TIME_LIMIT
+            termination = Termination.TIME_LIMIT.index
         if self._control_steps == first_step:
             # The simulation failed before the first control step ended.
             commanded_violation, measured_violation = self._violations
@@ -410,8 +408,8 @@ class DiagramEnv(DrakeGymEnv):
     ) -> dict[str, Any]:
         failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
-            "is_success": TERMINATIONS[termination] == "success",
-            "termination": TERMINATIONS[termination],
+            "is_success": TERMINATIONS[termination] == Termination.SUCCESS,
+            "termination": TERMINATIONS[termination].value,
             "constraint_violation": commanded_violation,
             "measured_violation": measured_violation,
             "impedance_force": forces[0],

@@ -82,7 +82,7 @@ class TaskDiagram:
     ``observation``         observation of the policy: a vector, or an abstract `ImageRgba8U`
     ``reward``              (1,) reward of the control step that has just ended
     one per reward term     (1,) each, named as in `reward_terms`
-    ``termination``         (1,) an index into `guiderail.systems.episode_monitor.TERMINATIONS`
+    ``termination``         (1,) index of a `guiderail.models.common.termination.Termination`
     ``commanded_violation`` (1,) max(c - G y) over all constraints G y ≥ c for the commanded pose y; negative is slack
     ``measured_violation``  (1,) max(c - G y) for the measured pose y
     ``contact_force``       (1,) magnitude of the contact force [N]

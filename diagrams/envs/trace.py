@@ -1,6 +1,5 @@
 """Trace of an episode: commands, measurements and rewards of every control step, and their statistics."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -117,7 +116,7 @@ class EpisodeTrace:
             "peak_force": float(self.force.max(initial=0.0)),
             "peak_contact_force": float(self.signals["contact_force"].max(initial=0.0))
             if "contact_force" in self._signals
-            else math.nan,
+            else 0.0,
             # Forces are added in the order of the steps, because the order of NumPy's mean rounds differently.
             "mean_force": float(np.cumsum(self.force)[-1] / len(self)) if len(self) else 0.0,
             "collisions": float((collision & ~np.append(False, collision[:-1])).sum()),

@@ -21,10 +21,11 @@ from guiderail.diagrams.envs.trace import Metric
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.registry import stations_for
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, TIME_UNIT, Impedance, Station, whole_multiple
+from guiderail.models.common.termination import TERMINATIONS
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TERMINATIONS, TerminationTerm
+from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:

@@ -3,10 +3,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.episode_monitor import TERMINATIONS, EpisodeMonitor, TerminationTerm
+from guiderail.models.common.termination import Termination
+from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
 
 PERIOD = 0.1
-SUCCESS, BLOCKED = TERMINATIONS.index("success"), TERMINATIONS.index("blocked")
+SUCCESS, BLOCKED = Termination.SUCCESS.index, Termination.BLOCKED.index
 
 
 class Episode:

@@ -8,16 +8,22 @@ LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
 
 
 def read(wrench, limits=LIMITS):
-    """Return the contact force [N] and the saturation of an impedance wrench (6,)."""
+    """Return the force [N] and the saturation of an impedance wrench (6,)."""
     monitor = ForceMonitor(limits)
     context = monitor.CreateDefaultContext()
     monitor.get_impedance_wrench_input_port().FixValue(context, wrench)
-    force, saturation = monitor.get_contact_force_output_port(), monitor.get_saturation_output_port()
+    force, saturation = monitor.get_impedance_force_output_port(), monitor.get_saturation_output_port()
     return force.Eval(context)[0], saturation.Eval(context)[0]
 
 
-def test_contact_force_is_the_norm_of_the_force():
+def test_forces_are_the_norms_of_their_own_wrenches():
     assert read([3.0, 4.0, 12.0, 2.0, 2.0, 2.0]) == (13.0, 0.0)
+    monitor = ForceMonitor(LIMITS)
+    context = monitor.CreateDefaultContext()
+    monitor.get_contact_wrench_input_port().FixValue(context, [0.0, -6.0, 8.0, 9.0, 9.0, 9.0])
+    assert monitor.get_contact_force_output_port().Eval(context)[0] == 10.0
+    monitor.get_impedance_wrench_input_port().FixValue(context, np.zeros(6))
+    assert monitor.get_impedance_force_output_port().Eval(context)[0] == 0.0
 
 
 @pytest.mark.parametrize("axis", range(6))

@@ -21,6 +21,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole, find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.termination import Termination
 
 CONFIDENCE = 0.95  # level of all confidence intervals
 RESAMPLES = 1000  # number of bootstrap resamples
@@ -131,7 +132,7 @@ class Episode:
     @property
     def termination(self) -> str:
         """Reason why the episode ended."""
-        return "simulation_failure" if "simulation_failure" in self.info else self.info["termination"]
+        return Termination.SIMULATION_FAILURE.value if "simulation_failure" in self.info else self.info["termination"]
 
 
 def jerk(poses: np.ndarray, period: float) -> dict[str, float]:
@@ -236,7 +237,7 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
         "episode": index,
         "return": total,
         "success": int(success),
-        "termination": "success" if success else "terminated" if is_terminated else "time_limit",
+        "termination": _outside_termination(success, is_terminated).value,
         "steps": as_whole(infos[-1].get("control_steps", len(infos)), "control_steps in info"),
     }
     own_force = "impedance_force" if any("impedance_force" in info for info in infos) else "contact_force"
@@ -248,6 +249,12 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
         if values := [float(info[name]) for info in infos if name in info]:
             row[column] = float(np.max(values))  # NaN if any value is NaN
     return row | {REPORTS_SUCCESS: int(any("is_success" in info or "success" in info for info in infos))}
+
+
+def _outside_termination(success: bool, is_terminated: bool) -> Termination:
+    if success:
+        return Termination.SUCCESS
+    return Termination.TERMINATED if is_terminated else Termination.TIME_LIMIT
 
 
 def reports_success(rows: pd.DataFrame) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.metrics import summary
@@ -106,5 +107,5 @@ def evaluate_on_robot(
                             path, failure = write_record(path, write)
                             if failure:
                                 log(f"the motion was executed, but {failure}")
-    stopped = sum(row["termination"] == "stopped" for row in rows)
+    stopped = sum(row["termination"] == Termination.STOPPED for row in rows)
     return {"rows": str(path), **summary(pd.DataFrame(rows), STATISTICS), "stopped": stopped}

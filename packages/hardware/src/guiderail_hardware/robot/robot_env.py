@@ -16,6 +16,7 @@ from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.tasks.insertion import HoldTest, InsertionTask
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import MM
 from guiderail_hardware.drivers.clock import Clock
 from guiderail_hardware.drivers.driver import describe_stop
@@ -204,12 +205,12 @@ class RobotEnv(DiagramEnv):
             self._come_to_rest()
             terms = dict.fromkeys(self.task.reward_terms, 0.0)
             info = self._info(0, *self._statistics(first), terms)
-            info |= {"termination": "stopped", "stopped": str(stop)}
+            info |= {"termination": Termination.STOPPED.value, "stopped": str(stop)}
             return self._observation, 0.0, False, True, info
         if terminated or truncated:
             self._extend_return_path()
             if info["is_success"] and not self._holds():
-                info |= {"is_success": False, "termination": "did_not_hold"}
+                info |= {"is_success": False, "termination": Termination.DID_NOT_HOLD.value}
             if info["is_success"] and self._snaps_in:
                 self._must_be_freed = "the workpiece has snapped in"
         return observation, reward, terminated, truncated, info

@@ -15,6 +15,7 @@ import pandas as pd
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.step_log import step_log_file, table
@@ -31,7 +32,11 @@ from guiderail_hardware.robot.executor import record_size
 from guiderail_hardware.robot.robot_env import RobotEnv
 from guiderail_hardware.robot.session import robot_session
 
-EXCLUDED_TERMINATIONS = ("stopped", "did_not_hold", "simulation_failure")  # their episodes are not used for training
+EXCLUDED_TERMINATIONS = (
+    Termination.STOPPED,
+    Termination.DID_NOT_HOLD,
+    Termination.SIMULATION_FAILURE,
+)  # their episodes are not used for training
 NICENESS = 5  # niceness of the training process, which must not delay the control loop
 
 

@@ -18,13 +18,17 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.options import kernel_from_options
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.termination import Termination
 from guiderail.models.primitives.gains import deviation
 from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.learning.run_folder import RunConfig
 
-LABEL_REWARDS = {"success": 50.0, "failure": -50.0}  # added to the reward when the supervisor labels an episode
+LABEL_REWARDS = {
+    Termination.SUCCESS: 50.0,
+    Termination.FAILURE: -50.0,
+}  # added to the reward when the supervisor labels an episode
 VIA_POINT_SPACING = 5  # control steps between two via-points of a correction
 
 
@@ -59,7 +63,7 @@ class SupervisedEnv(gymnasium.Wrapper):
         label = None if terminated or truncated else self._supervisor.label()
         if label is None:
             return observation, reward, terminated, truncated, info
-        info = {**info, "is_success": label == "success", "termination": label}
+        info = {**info, "is_success": label == Termination.SUCCESS, "termination": Termination(label).value}
         reward = float(reward) + LABEL_REWARDS.get(label, 0.0)
         return observation, reward, label in LABEL_REWARDS, label not in LABEL_REWARDS, info
 
