@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import logging
 from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
@@ -40,8 +39,6 @@ from guiderail.models.common.plugins import is_sibling_module
 from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
-
-logging.getLogger("drake").setLevel(logging.WARNING)  # pydrake sets INFO
 
 
 def make_station(task: Task) -> Station:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -386,9 +387,14 @@ class DemonstratedInsertion(InsertionTask):
         eye, target = (self.insertion_length * np.array(place) for place in ([2.4, 0.0, 2.4], [0.0, 0.0, -0.3]))
         return Camera(WRIST_IMAGE_SIZE, np.deg2rad(40.0), look_at(eye, target), frame="grasp")
 
+    @cached_property
+    def _demonstrated_start(self) -> np.ndarray:
+        """First pose of the demonstrations' mean, (6,); a reset must not read the demonstrations' file again."""
+        return self.reference().means[0]
+
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return the demonstrations' start plus a sampled offset, inside the constraints."""
-        start = self.reference().means[0].copy()
+        start = self._demonstrated_start.copy()
         if self.options.start_offset_max > 0.0:
             start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
         return self.constraints().nearest(start)

@@ -122,7 +122,8 @@ class _MessageHandler(logging.Handler):
 
 
 def _show_messages() -> None:
-    """Print the library's messages, from level INFO on."""
+    """Print the library's messages, from level INFO on, and Drake's from level WARNING on."""
+    logging.getLogger("drake").setLevel(logging.WARNING)
     logger = logging.getLogger("guiderail")
     logger.setLevel(logging.INFO)
     if not any(isinstance(handler, _MessageHandler) for handler in logger.handlers):

@@ -25,7 +25,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
 from guiderail.tools.learning.run_folder import RunConfig
 
-LABEL_REWARDS = {
+LABEL_REWARDS: dict[str, float] = {
     Termination.SUCCESS: 50.0,
     Termination.FAILURE: -50.0,
 }  # added to the reward when the supervisor labels an episode
