@@ -11,7 +11,6 @@ from typing import Any, cast
 
 import gymnasium
 from gymnasium.envs.registration import load_env_creator
-from threadpoolctl import threadpool_limits
 
 from guiderail.diagrams.envs.options import (
     KERNEL_OPTIONS,
@@ -286,12 +285,11 @@ def _parse_numbers(value: Any) -> Any:
 
 
 def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """Make the environment of a task, and limit this process to one thread; see `make_env`.
+    """Make the environment of a task; see `make_env`.
 
     Raises:
         InputError: If the task or an argument is unknown, or options are incompatible.
     """
-    threadpool_limits(1)
     arguments = check_environment(task, arguments)
     return gymnasium.make(environment_id(task), disable_env_checker=True, render_mode=render_mode, **arguments)
 

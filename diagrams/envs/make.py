@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections import defaultdict
 from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydrake.systems.framework import Diagram, System
-from threadpoolctl import threadpool_limits
 
 from guiderail.diagrams.envs.assemble import (
     SkillDiagram,
@@ -24,8 +22,8 @@ from guiderail.diagrams.envs.assemble import (
 )
 from guiderail.diagrams.envs.config import EnvConfig, freeze
 from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
+from guiderail.diagrams.envs.pool import BuiltDiagram, DiagramPool
 from guiderail.diagrams.envs.task_checks import call_checked, workcell_of
-from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.diagrams.stations.disturbances import disturbed
@@ -122,9 +120,7 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
 def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
     """Build the environment that `gymnasium.make("guiderail/<Task>-v0", ...)` returns without its wrappers.
 
-    From this call on, numerical libraries use one thread in this process. The matrices are small: if other processes
-    use the cores, several threads that wait for each other take eighty times as long. The number of threads would also
-    change the rounding of sums.
+    Until the environment is closed, numerical libraries use one thread in this process; see `DiagramPool`.
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
@@ -142,21 +138,17 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
             f"station={config.station!r} is a real robot, which a reset cannot move: train and evaluate in a "
             "simulation, and execute the policy by guiderail deploy"
         )
-    threadpool_limits(1)
     exported = render_mode if render_mode == "rgb_array" else None
     new_task = config.make_task()
     key = _key(new_task, exported)
-    idle = [] if key is None else _IDLE[key]
-    # A diagram that a user has added to another diagram cannot be simulated alone.
-    idle[:] = [each for each in idle if each.diagram.diagram.GetSystemPathname().count("::") == 1]
-    built = idle.pop() if idle else _build(new_task, exported)
+    built = _POOL.acquire(key, lambda: _build(new_task, exported))
     # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
     # task that built the diagram. The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
     new_task.episode_constants = built.diagram.declaration.episode_constants
     randomize = make_randomize(new_task, built.station, built.guidance)
     diagram = replace(built.diagram, randomize=randomize, declaration=new_task)
-    release = partial(idle.append, built)
+    release = partial(_POOL.release, key, built)
     try:
         return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
     except BaseException:  # for example if the browser view finds no free port
@@ -185,25 +177,11 @@ def make_skill(
     """
     check_render_mode(render_mode)
     new_task = _config(task, options).make_task()
-    threadpool_limits(1)
     station = make_station(new_task)
     return build_skill_diagram(new_task, station, make_guidance(new_task, station), policy, render_mode=render_mode)
 
 
-@dataclass(frozen=True)
-class _Built:
-    diagram: TaskDiagram
-    station: Station
-    guidance: Diagram
-
-
-_IDLE: defaultdict[Hashable, list[_Built]] = defaultdict(list)
-"""Built diagrams that no environment uses, by `_key`, for reuse by later environments.
-
-A diagram that contains a LeafSystem written in Python is never freed: C++ holds references to the system's methods, the
-methods hold the system, and no garbage collector finds this cycle. Reuse is safe because everything that changes during
-a simulation is in a context, and each environment creates its own.
-"""
+_POOL = DiagramPool()
 
 
 def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
@@ -216,10 +194,10 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
     return task
 
 
-def _build(task: Task, render_mode: str | None) -> _Built:
+def _build(task: Task, render_mode: str | None) -> BuiltDiagram:
     station = make_station(task)
     guidance = make_guidance(task, station)
-    return _Built(build_task_diagram(task, station, guidance, render_mode=render_mode), station, guidance)
+    return BuiltDiagram(build_task_diagram(task, station, guidance, render_mode=render_mode), station, guidance)
 
 
 def _key(task: Task, render_mode: str | None) -> Hashable:

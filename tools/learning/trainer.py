@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import gymnasium
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
@@ -98,6 +99,7 @@ def run_training(
     learning_log = LearningLog(folder.logs, log)
     torch.set_num_threads(1)  # faster for two runs at once, and sums do not depend on the number of cores
     with ExitStack() as stack:
+        stack.enter_context(threadpool_limits(1))
         env = stack.enter_context(closing(make_environment(config.task, config.environment)))
         if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
             raise InputError(

@@ -9,13 +9,11 @@ import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
-import threadpoolctl
 from safetensors.numpy import load_file
 
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.learning import actors, trainer
@@ -382,12 +380,6 @@ def test_resume_refuses_rows_with_other_columns(bead_config, bead_run):
     with pytest.raises(InputError, match="another version"):
         run_training(folder, replace(bead_config, episodes=9), resume=True)
     assert (folder.path / "episodes.csv").read_bytes() == before
-
-
-def test_environment_limits_threads_to_one():
-    threadpoolctl.threadpool_limits(2)
-    make_environment("Bead", {})
-    assert {pool["num_threads"] for pool in threadpoolctl.threadpool_info()} == {1}
 
 
 @pytest.mark.parametrize(
