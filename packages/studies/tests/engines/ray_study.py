@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 
-TESTS = Path(__file__).parents[3]
+TESTS = Path(__file__).parents[4] / "tests"
 sys.path.insert(0, str(TESTS))
 from oracles.same_runs import differences  # noqa: E402
 
