@@ -1,4 +1,4 @@
-"""MuJoCo gantry as a system; `tests/diagrams/stations/test_mujoco.py` tests the physics."""
+"""MuJoCo gantry as a system; `packages/mujoco/tests/test_station.py` tests the physics."""
 
 import numpy as np
 import pytest
