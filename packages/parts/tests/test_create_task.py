@@ -35,7 +35,6 @@ from guiderail_parts.task import (
     load_task_folder,
 )
 from guiderail_parts.task_file import Bounds, MotionNumbers, PartTaskFile, read_task_file
-from guiderail_studies.declaration import load_study
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -133,10 +132,11 @@ def test_rank_prefers_seating_then_allowed_depth_then_speed():
 
 
 def test_task_of_a_study_may_be_a_task_folder(folder, tmp_path, monkeypatch):
+    declaration = pytest.importorskip("guiderail_studies.declaration", reason="needs guiderail-studies")
     file = tmp_path / "study.yaml"
     file.write_text("{name: short, task: ./peg, methods: {random: {policy: uniform_random}}, seeds: [0]}")
     monkeypatch.chdir(folder.parent)
-    study = load_study(file)
+    study = declaration.load_study(file)
     assert (study.task, study.imports) == ("parts/peg", (str(folder.resolve()),))
 
 
@@ -194,7 +194,7 @@ def test_hard_is_calibrated_with_a_single_episode(folder):
 
 
 def test_parts_of_convex_pieces_are_simulated_in_mujoco(folder):
-    pytest.importorskip("mujoco")
+    pytest.importorskip("guiderail_mujoco.station", reason="needs guiderail-mujoco")
     file = read_task_file(folder)
     assert "mujoco" in load_task_folder(folder).stations()
     assert len(file.plug.convex) >= 1
