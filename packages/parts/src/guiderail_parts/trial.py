@@ -20,8 +20,8 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.offsets import control_steps
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.common.plugins import MissingSiblingError, load_plugin, require_sibling
+from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.primitives import Demonstrations
@@ -302,8 +302,9 @@ def add_convex_pieces(
     tolerance: float,
     log: Callable[[str], None],
 ) -> PartTaskFile:
-    """Return the task file with the names of both parts' convex pieces; unchanged if cutting or an insertion fails,
-    or if guiderail-mujoco is not installed.
+    """Return the task file with the names of both parts' convex pieces; unchanged if cutting or an insertion fails.
+
+    It is also unchanged if guiderail-mujoco is not installed.
 
     If the contact geometry of a part consists of convex pieces, they are used. Otherwise pieces are cut from its
     surface and written; they may exceed the surface by twice the `tolerance` [m]. A sentence on the result is logged.
