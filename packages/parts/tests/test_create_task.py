@@ -226,6 +226,7 @@ def with_floor_only(folder, file):
 
 @pytest.mark.parametrize("offset", [0.0, 1.5e-3])
 def test_offset_plug_is_blocked_only_by_the_walls(folder, offset):
+    pytest.importorskip("guiderail_mujoco", reason="a task has convex pieces only with guiderail-mujoco")
     file = read_task_file(folder)
     with_walls = trial.insert(folder, file, offset=(offset, 0.0))
     assert (with_walls.success, with_walls.is_blocked) == (offset == 0.0, offset > 0.0)
@@ -450,6 +451,7 @@ def test_options_of_a_created_task_are_listed(folder, capsys):
 
 
 def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
     call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
     assert str(task_file) in capsys.readouterr().out.splitlines()[-1]
     constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
@@ -462,6 +464,7 @@ def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
 
 
 def test_fitted_bounds_are_refused_when_excluding_the_target(folder, tmp_path, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
     before = (folder / "task.yaml").read_text()
     demonstrations = Demonstrations.load(folder / "demonstrations.npz")
     shifted = [outputs + [0.005, *[0.0] * 5] for outputs in demonstrations.outputs]
@@ -472,6 +475,8 @@ def test_fitted_bounds_are_refused_when_excluding_the_target(folder, tmp_path, c
 
 
 def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
+
     def fail(*paths):
         raise OSError(28, "No space left on device")
 
@@ -483,6 +488,8 @@ def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, ca
 
 
 def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
+
     def fail(*_):
         raise InputError("no room")
 
