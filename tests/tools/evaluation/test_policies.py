@@ -14,7 +14,7 @@ from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, Policy, chunk_samples, find_base_policy
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, make_environment, task_content
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
@@ -28,6 +28,7 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.imports import trust_imports
 from guiderail.tools.pretrained import find_run
+from guiderail_lerobot.base_policy import BASE_POLICIES, chunk_samples, find_base_policy
 
 OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
 

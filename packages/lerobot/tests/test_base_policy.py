@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, FORMAT, Policy, chunk_samples, find_base_policy, mean_and_variance
+from guiderail.models.policy import FORMAT, Policy
+from guiderail_lerobot.base_policy import BASE_POLICIES, chunk_samples, find_base_policy, mean_and_variance
 
 
 def make_chunk_policy(ensemble=2, points=3, outputs=2, seed=0):
