@@ -6,8 +6,6 @@
 - The source raises only `InputError`, `PolicyError`, `DivergedError` and `AttributeError`.
 """
 
-import ast
-import inspect
 import re
 import subprocess
 import sys
@@ -16,9 +14,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.common.value import Value
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, LeafSystem, OutputPort, ValueProducer
+from pydrake.systems.framework import LeafSystem
 
 import guiderail.systems
 from guiderail import systems
@@ -31,25 +28,14 @@ from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTra
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
 from guiderail_hardware.models.joint_status import StatusLimits
-from guiderail_lerobot.chunk_guard import ChunkGuard
-from guiderail_mujoco.station import MujocoStation
 from oracles.franka import FRANKA_LIMITS
+from oracles.systems import check_documentation, check_getters, check_prerequisites, check_source, classes, system_names
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent
 FILES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "__init__")
 PERIOD = 0.125
 BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
-
-
-def classes(path):
-    """Return the syntax trees of the classes of a file."""
-    return [node for node in ast.parse(path.read_text()).body if isinstance(node, ast.ClassDef)]
-
-
-def system_names(path):
-    """Return the names of the classes of a file that derive from LeafSystem."""
-    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id == "LeafSystem" for b in c.bases)]
 
 
 NAMES = [name for path in FILES for name in system_names(path)]
@@ -97,23 +83,10 @@ def system_by_name():
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
-        systems.ChunkReference(
-            lambda observation: observation,
-            2,
-            primitive(0).reference,
-            horizon=1,
-            replan_steps=1,
-            covariance_floor=1.0,
-            period=PERIOD,
-        ),
-        systems.ChunkSafetyLimiter(
-            ChunkGuard(BOX, np.ones(2), np.ones(2), period=PERIOD, start=np.zeros(2)), 4, 2, PERIOD
-        ),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
-        MujocoStation(BncWorkcell()).gantry,
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
         systems.ProgressClock(StateProgress((1.0, 1.0), 3), 2, PERIOD),
@@ -138,19 +111,6 @@ def system_by_name():
 @pytest.fixture(params=NAMES)
 def system(request, system_by_name):
     return system_by_name[request.param]
-
-
-def ports(system):
-    """Yield kind ("input" or "output"), name and port of each port of a system."""
-    for kind in ("input", "output"):
-        for index in range(getattr(system, f"num_{kind}_ports")()):
-            port = getattr(system, f"get_{kind}_port")(index)
-            yield kind, port.get_name(), port
-
-
-def getters(system, kind):
-    """Return the getters of ports of a kind that the class of the system defines, by name."""
-    return {name: getattr(system, name) for name in vars(type(system)) if re.fullmatch(rf"get_\w+_{kind}_port", name)}
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
@@ -187,64 +147,17 @@ def test_these_tests_cover_every_system(system_by_name):
 
 
 def test_every_port_has_a_documented_getter(system):
-    for kind, name, port in ports(system):
-        methods = getters(system, kind)
-        method = methods.get(f"get_{name}_{kind}_port")
-        if method is not None:
-            result = method()
-        else:
-            # Ports whose names are constructor arguments share a getter with the argument `name`.
-            (method,) = (m for m in methods.values() if "name" in inspect.signature(m).parameters)
-            result = method(name)
-        assert result is port
-        assert inspect.signature(method).return_annotation is (InputPort if kind == "input" else OutputPort)
-        assert inspect.getdoc(method)
+    check_getters(system)
 
 
 def test_documented_ports_are_the_declared_ports(system):
-    (block,) = re.findall(r"\.\. pydrake_system::\n\n((?:    .*\n)+)", inspect.getdoc(type(system)) + "\n")
-    assert re.search(r"name: (\w+)", block)[1] == type(system).__name__
-    for kind in ("input", "output"):
-        documented = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block)
-        lines = re.findall(r"- (.*)", documented[1]) if documented else []
-        actual = [name for k, name, _ in ports(system) if k == kind]
-        named = [line.split(" (")[0] for line in lines if not line.startswith("one per ")]
-        assert actual[: len(named)] == named
-        assert len(actual) == len(named) or len(named) < len(lines)
+    check_documentation(system)
 
 
 def test_output_depends_only_on_declared_prerequisites(system):
-    """Default prerequisites would cause an evaluation at every plant step and false direct feedthrough."""
-    nothing, parameters = system.nothing_ticket(), system.all_parameters_ticket()
-    probe = system.DeclareCacheEntry(
-        "probe", ValueProducer(allocate=lambda: Value(0), calc=lambda context, value: None), {nothing}
-    )
-    entries = [system.get_cache_entry(CacheIndex(i)) for i in range(int(probe.cache_index()))]
-    declared = {int(e.ticket()): e for e in entries if int(e.ticket()) > int(system.configuration_ticket())}
-    sources = {int(nothing), int(parameters)}
-    sources |= {int(port.ticket()) for kind, _, port in ports(system) if kind == "input"}
-    states = range(system.CreateDefaultContext().num_discrete_state_groups())
-    sources |= {int(system.discrete_state_ticket(DiscreteStateIndex(i))) for i in states}
-    outputs = [e for e in entries if e.description().startswith("output port ")]
-    assert len(outputs) == system.num_output_ports()
-    pending = list(outputs)
-    while pending:
-        entry = pending.pop()
-        assert not entry.has_default_prerequisites(), entry.description()
-        for ticket in map(int, entry.prerequisites()):
-            if ticket in declared:
-                pending.append(declared[ticket])
-            else:
-                assert ticket in sources, f"{entry.description()} depends on ticket {ticket}"
+    check_prerequisites(system)
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)
 def test_source_gives_prerequisites_and_raises_input_errors(path):
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
-            name = node.func.attr
-            if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
-                assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
-        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            exceptions = ("InputError", "PolicyError", "DivergedError", "AttributeError")
-            assert node.exc.func.id in exceptions, f"line {node.lineno}"
+    check_source(path)
