@@ -103,7 +103,7 @@ def task_options(task: str) -> dict[str, Any]:
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a task's environment with all defaults filled in; register its base policy, if any.
+    """Return the arguments of a task's environment with all defaults filled in.
 
     Raises:
         InputError: If the task or an argument is unknown, or a value is invalid.
@@ -111,10 +111,6 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
-        if isinstance(source := arguments.get("base_policy"), str) and source:
-            from guiderail.tools.evaluation.policies import add_base_policy
-
-            arguments = {**arguments, "base_policy": add_base_policy(source)}
         return EnvConfig.resolve(task, arguments).options
     options = task_options(task)
     for name, value in arguments.items():

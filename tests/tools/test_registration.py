@@ -11,11 +11,11 @@ from guiderail.diagrams.stations.registry import STATIONS, register_station
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, register_base_policy
 from guiderail.models.primitives.kernels import KERNELS, register_kernel
 from guiderail.models.robots.robot import register_end_effector, register_robot
 from guiderail.tools.learning.learner import LEARNERS, register_learner
 from guiderail_hardware.drivers.driver import DRIVERS, Driver, register_driver
+from guiderail_lerobot.base_policy import BASE_POLICIES, register_base_policy
 from guiderail_studies.engines.engine import ENGINES, make_engine, register_engine
 
 

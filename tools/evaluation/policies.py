@@ -27,10 +27,10 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
+from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.rollout import Callback, PolicyFn, has_same_shapes, is_compatible
-from guiderail.tools.imports import import_modules, is_trusted, module_name
+from guiderail.tools.imports import import_modules, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
@@ -209,7 +209,7 @@ def as_policy(given: Any) -> PolicyFn:
 
 def is_policy_file(source: str | Path) -> bool:
     """Return True if a source has the ending of a policy's file, or is `module:function`."""
-    return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
+    return Path(source).suffix in ENDINGS or function_of(str(source)) is not None
 
 
 def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
@@ -225,7 +225,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
         InputError: If the file or function is missing, the file is damaged, it can execute code and is not trusted, or
             its package is not installed.
     """
-    if (function := _function_of(str(source))) is not None:
+    if (function := function_of(str(source))) is not None:
         return _load_function(*function)
     path = find_run(source)
     if path.suffix not in ENDINGS:
@@ -240,27 +240,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
 
 
-def add_base_policy(source: str) -> str:
-    """Return the name of a base policy; register it first if it is given as a file or `module:function`.
-
-    Another source, such as the folder of a run, is returned unchanged.
-
-    Raises:
-        InputError: If the source can execute code and `trust_imports` is not active, or the policy cannot be loaded.
-    """
-    if source in BASE_POLICIES.names() or not is_policy_file(source):
-        return source
-    module, separator, function = source.rpartition(":") if _function_of(source) is not None else (source, "", "")
-    path = module if separator and not module.endswith(".py") else str(Path(module).resolve())
-    name = path + separator + function
-    if name not in BASE_POLICIES.names():
-        if Path(source).suffix != ".onnx" and not is_trusted():
-            raise InputError(f"the base policy {source} can execute code: give --trust-imports if you trust its origin")
-        BASE_POLICIES.register(name, load_policy(source, trust_policy=True))
-    return name
-
-
-def _function_of(source: str) -> tuple[str, str] | None:
+def function_of(source: str) -> tuple[str, str] | None:
     """Return the module and the function's name of `module:function`; None for another source."""
     module, separator, name = source.rpartition(":")
     is_name = bool(separator) and name.isidentifier() and bool(module) and not source.startswith(PRETRAINED)

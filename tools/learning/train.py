@@ -99,8 +99,8 @@ class Run:
 
 def _names_code(config: Mapping[str, Any]) -> bool:
     """Return True if a run's configuration names code, which a new process loads only within `trust_imports`."""
-    base_policy = str(config["environment"].get("base_policy", ""))
-    has_code = is_policy_file(base_policy) and not base_policy.endswith(".onnx")
+    values = [value for value in config["environment"].values() if isinstance(value, str)]
+    has_code = any(is_policy_file(value) and not value.endswith(".onnx") for value in values)
     return has_code or not all(map(is_task_folder, config["imports"]))
 
 

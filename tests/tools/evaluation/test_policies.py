@@ -14,8 +14,8 @@ from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, Policy, chunk_samples, find_base_policy
-from guiderail.tools.environments import check_environment, make_environment, task_content
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
     PredictPolicy,
@@ -26,7 +26,6 @@ from guiderail.tools.evaluation.policies import (
 )
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.imports import trust_imports
 from guiderail.tools.pretrained import find_run
 
 OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
@@ -114,44 +113,6 @@ def test_onnx_acts_as_its_network(batch, env, tmp_path):
     np.testing.assert_allclose(act(OBSERVATION), np.tanh(OBSERVATION @ weight + bias), rtol=1e-6)
     single, double = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
     assert single == double
-
-
-@pytest.fixture
-def base_policies(monkeypatch):
-    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
-    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
-    return BASE_POLICIES
-
-
-def test_base_policy_of_a_file_needs_trust_when_executable(tmp_path, monkeypatch, base_policies):
-    (tmp_path / "policy.onnx").write_bytes(linear_policy(np.zeros((3, 4), np.float32), np.zeros(4, np.float32), 1))
-    torch.jit.trace(Script(), torch.zeros(1, 3)).save(tmp_path / "policy.pt")
-    (tmp_path / "lab_base.py").write_text("raise RuntimeError\n")
-    monkeypatch.chdir(tmp_path)
-    environment = {"guidance": "kgrl_base_policy", "base_policy": "policy.onnx"}
-    resolved = check_environment("NarrowPassage", environment)["base_policy"]
-    assert resolved == str(tmp_path / "policy.onnx")
-    assert chunk_samples(find_base_policy(resolved), np.zeros(3, np.float32), 2).shape == (1, 2, 2)
-    for source in ("policy.pt", "lab_base.py:chunk"):
-        with pytest.raises(InputError, match="give --trust-imports"):
-            check_environment("NarrowPassage", environment | {"base_policy": source})
-    with trust_imports():
-        check_environment("NarrowPassage", environment | {"base_policy": "policy.pt"})
-    assert str(tmp_path / "policy.pt") in base_policies.names()
-
-
-def test_base_policy_of_a_function_is_stored_with_path_and_code(tmp_path, monkeypatch, base_policies):
-    file = tmp_path / "lab_chunk.py"
-    file.write_text("import numpy as np\ndef chunk(observation):\n    return np.zeros((1, 2, 2))\n")
-    monkeypatch.chdir(tmp_path)
-    with trust_imports():
-        environment = check_environment(
-            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "lab_chunk.py:chunk"}
-        )
-    assert environment["base_policy"] == f"{file}:chunk"
-    before = task_content("NarrowPassage", environment, ())
-    file.write_text(file.read_text().replace("zeros", "ones"))
-    assert task_content("NarrowPassage", environment, ()) != before
 
 
 def test_functions_in_files_of_equal_name_are_separate_policies(tmp_path):

@@ -16,8 +16,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.evaluation.rollout import Transition
 from guiderail.tools.learning.cloning import BcLearner
-from guiderail.tools.learning.config import ChunkConfig
 from guiderail.tools.learning.learner import register_learner
+from guiderail_lerobot.config import ChunkConfig
 
 MIN_SCALE = 1e-6  # minimum scale of an output; the standard deviation of a constant output is zero
 
