@@ -131,7 +131,11 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"action_repeat must be a whole number of control steps, at least 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
-        view = None if render_mode != "human" or task.query is None else View(task.query)
+        view = (
+            None
+            if render_mode != "human" or task.query is None
+            else View(task.query, contact_results=task.contact_results)
+        )
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
         self.metadata = {}  # the parent class would write its render modes into the class attribute

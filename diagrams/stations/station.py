@@ -27,8 +27,8 @@ output               size   meaning
 `command_timed_out`  1      1 while commands are missing or not finite, and the last safe pose is held
 ===================  =====  ========================================================================================
 
-A simulated station also has `query` (of the scene graph) and `body_poses` (of the plant), for cameras, rewards and
-terminations.
+A simulated station also has `query` (of the scene graph), and `body_poses` and `contact_results` (of the plant), for
+cameras, rewards, terminations and views; the plane and the pouring station have no `body_poses`.
 
 The orientation of X_TP is Rz(a) Ry(b) Rx(c). T is the target frame of the workcell: the pose is zero when the task is
 done. T is fixed in the world by the *nominal* fixture; offsets of the fixture do not move it.
@@ -349,7 +349,13 @@ def export_station_ports(
         builder.ExportOutput(impedance_force, "impedance_force")
 
 
+def export_scene_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Export the ports that a view of a simulated station draws."""
+    builder.ExportOutput(scene_graph.get_query_output_port(), "query")
+    builder.ExportOutput(plant.get_contact_results_output_port(), "contact_results")
+
+
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Export the ports of simulated stations."""
-    builder.ExportOutput(scene_graph.get_query_output_port(), "query")
+    export_scene_ports(builder, plant, scene_graph)
     builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")
