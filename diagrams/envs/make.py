@@ -59,7 +59,8 @@ def make_station(task: Task) -> Station:
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, call_checked(task, "impedance"))
     else:
         station = build()
-    if config.control_period is not None and station.nominal_period != task.control_period:
+    rounding = 1e-9 if arguments.get("time_step") else 0.0  # see `exact_periods`
+    if config.control_period is not None and abs(station.nominal_period - task.control_period) > rounding:
         if takes_period:
             raise InputError(
                 f"time_unit of {task.name} is {task.time_unit!r} s, and the period {station.nominal_period!r} s of "
