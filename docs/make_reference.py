@@ -15,6 +15,8 @@ from typing import Any
 
 from pydantic_core import PydanticUndefined
 
+from guiderail.models.common.plugins import is_sibling_module
+
 SECTION = re.compile(r"^(Args|Attributes|Raises|Returns|Yields):\s*(.*)$")
 ENTRY = re.compile(r"^(\*{0,2}[\w, /*]+):\s+(.*)$")
 DIAGRAM = re.compile(r"\.\. pydrake_system::\n\n(?:    .*\n?|\n)+")
@@ -137,7 +139,7 @@ def field_words(kind: type) -> dict[str, str]:
     """Return the description of each field: from the docstring, the pydantic field or the comment behind it."""
     words: dict[str, str] = {}
     for base in reversed(kind.__mro__):
-        if not base.__module__.startswith("guiderail."):
+        if not is_sibling_module(base.__module__):
             continue
         lines = textwrap.dedent(inspect.getsource(base)).splitlines()
         for node in ast.parse("\n".join(lines)).body[0].body:  # type: ignore[attr-defined]
@@ -652,7 +654,8 @@ def errors() -> str:
     """Return the page of exceptions and exit codes."""
     from guiderail.models.common.errors import InputError, RunsFailedError
     from guiderail.models.primitives import UnsolvableError
-    from guiderail.systems import DivergedError, PolicyError
+    from guiderail.systems import PolicyError
+    from guiderail_mujoco.gantry import DivergedError
 
     page = (
         "# Errors\n\n| exit code | meaning |\n|---|---|\n"

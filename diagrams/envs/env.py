@@ -83,7 +83,7 @@ class DiagramEnv(DrakeGymEnv):
 
     `info` has, at every step and at a reset, `is_success`, `termination` (a `Termination`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `impedance_force` and
-    `contact_force` (maxima of the step [N]; without an impedance the first is NaN), `fallback` (True if guidance fell
+    `contact_force` (maxima of the step [N]; the first is 0 without an impedance), `fallback` (True if guidance fell
     back to a safe command), every reward term by name (summed over the step), and `control_steps` since the
     reset. Here a step is a call of `step`, with all its control steps. The `info` of a reset also has the values that
     the task sampled.
@@ -459,8 +459,8 @@ class DiagramEnv(DrakeGymEnv):
         return observation
 
     def _forces(self, force: float, contact_force: float) -> tuple[float, float]:
-        """Return the forces of the impedance, NaN if there is none, and of the contact [N]."""
-        return (force if self._has_impedance else math.nan), contact_force
+        """Return the forces of the impedance, 0 if there is none, and of the contact [N]."""
+        return (force if self._has_impedance else 0.0), contact_force
 
     def _info(
         self,

@@ -16,7 +16,7 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.recorder import Recorder, Recording
 
-SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "impedance_force": 1, "saturation": 1}
+SIGNALS = {"desired_pose": POSE_SIZE, "pose": POSE_SIZE, "wrench": 6, "contact_force": 1, "saturation": 1}
 
 
 class DrivenStation:
@@ -24,7 +24,7 @@ class DrivenStation:
 
     Attributes:
         station: Driven station.
-        recorder: Recorder of `SIGNALS`.
+        recorder: Recorder of `SIGNALS`, and of `impedance_force` if the station has an impedance.
         diagram: Diagram of station, source and recorder.
         simulator: Simulator of this diagram.
     """
@@ -46,8 +46,9 @@ class DrivenStation:
         hold = ZeroOrderHold(CONTROL_PERIOD, POSE_SIZE)
         desired_pose = add_system(builder, "hold", hold, source.get_output_port(0)).get_output_port()
         builder.Connect(desired_pose, station.get_desired_pose_input_port())
-        recorder = Recorder(SIGNALS, num_samples, CONTROL_PERIOD)
-        measured = {name: station.GetOutputPort(name) for name in SIGNALS if name != "desired_pose"}
+        forces = station.impedance_force()
+        recorder = Recorder(SIGNALS | dict.fromkeys(forces, 1), num_samples, CONTROL_PERIOD)
+        measured = {name: station.GetOutputPort(name) for name in SIGNALS if name != "desired_pose"} | forces
         self.recorder = add_system(builder, "recorder", recorder, desired_pose=desired_pose, **measured)
         self.diagram: Diagram = builder.Build()
         self.simulator = Simulator(self.diagram)

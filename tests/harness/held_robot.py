@@ -82,7 +82,7 @@ def main() -> None:
         for progress in options.progress:
             infos = run_episodes(progress, begin, options.episodes)
             reasons = dict(Counter(info["termination"] for info in infos))
-            delay, force = np.mean([info["delay"] for info in infos]), max(info["contact_force"] for info in infos)
+            delay, force = np.mean([info["delay"] for info in infos]), max(info["impedance_force"] for info in infos)
             success = f"{reasons.get('success', 0)}/{len(infos)}"
             print(f"{progress} | {begin} | {success} | {reasons} | {delay:.2f} | {force:.1f}")
 

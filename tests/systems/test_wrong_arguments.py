@@ -10,14 +10,11 @@ from guiderail import systems
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, ReferenceTrajectory
 from guiderail.models.templates import load_template
-from guiderail_hardware.models.joint_status import StatusLimits
 
 PERIOD = 0.02
 HOLE = {"hole": RigidTransform()}
 STIFFNESS = np.diag([600.0] * 3 + [25.0] * 3)
 LIMITS = np.array([20.0] * 3 + [2.0] * 3)
-ONES = (1.0,) * 6
-SAFETY = systems.SafetyLimits(ONES, ONES, ONES, decay_time=1.0)
 GAINS = systems.ImpedanceGains(STIFFNESS, LIMITS, posture=np.zeros(6))
 
 
@@ -106,8 +103,6 @@ ZEROS = np.zeros(6)
         (lambda: systems.RelativePoses(PLANT, [TOOL], OTHER), "reference has the body body5 of another plant"),
         (lambda: systems.ExternalTorqueSensor(PLANT, OTHER, ZEROS, ZEROS, period=PERIOD), "of another plant"),
         (lambda: systems.ExternalTorqueSensor(PLANT, WORLD.body(), ZEROS, ZEROS, period=PERIOD), "is the world"),
-        (lambda: systems.StatusWatchdog(DRAFT, StatusLimits(ONES), ONES, period=PERIOD), "must be finalized"),
-        (lambda: systems.TorqueSafetyLimiter(DRAFT, SAFETY, period=PERIOD), "must be finalized"),
         (lambda: make_wrench_sensor(tool=[OTHER, HAND]), "tool has the body body5 of another plant"),
         (lambda: make_wrench_sensor(tool=TOOL), "tool is a list of at least one body"),
         (lambda: make_wrench_sensor(tool=[TOOL]), "welded to it: add hand"),
@@ -185,14 +180,12 @@ def test_history_refuses_sizes_beyond_its_limit(outputs, length):
         (lambda: systems.EpisodeMonitor(["success"], PERIOD), "a monitor needs a list of TerminationTerm objects"),
         (lambda: systems.Recorder(["pose"], 4, PERIOD), "signals are sizes by name"),
         (lambda: systems.Recorder({1: 6}, 4, PERIOD), "a signal needs a name, not 1"),
-        (lambda: systems.GripperCommand("a", ONES, ONES, period=PERIOD), "lower is not an array of numbers"),
         (lambda: systems.ForceMonitor({}), "limits is not an array of numbers"),
         (lambda: systems.Residual("a"), "gain is not an array of numbers"),
         (lambda: systems.SensorDisturbance(PERIOD, "a"), "noise is not an array of numbers"),
         (lambda: systems.CommandWatchdog(PERIOD, timeout=None), "timeout must be a number, not None"),
         (lambda: systems.CommandWatchdog("a"), "a system's period must be a number, not 'a'"),
         (lambda: systems.CommandWatchdog(PERIOD, pose_size="6"), "pose_size must be a whole number"),
-        (lambda: systems.PoseRateLimiter(period=None), "a system's period must be a number, not None"),
         (lambda: systems.HistoryLengthSchedule([1], PERIOD, dwell_steps=np.nan), "dwell_steps must be a whole"),
         (lambda: make_wrench_sensor(period="a"), "a system's period must be a number, not 'a'"),
         (lambda: make_wrench_sensor(time_constant=None), "time_constant must be a number, not None"),

@@ -97,7 +97,7 @@ def test_printed_evaluate_command_is_trusted_and_quoted(bead_run, canary):
 COMMANDS = (
     ("evaluate", "RUN"), ("robustness", "RUN"), ("certify", "RUN"), ("visualize", "RUN"), ("report", "RUN"),
     ("train", "--resume", "--out", "RUN"), ("deploy", "RUN", "--sim", "--yes"),
-    ("evaluate", "RUN", "--station", "hardware", "--sim", "--yes"), ("study", "STUDY", "--out", "OUT"),
+    ("deploy", "RUN", "--sim", "--yes", "--episodes", "1"), ("study", "STUDY", "--out", "OUT"),
 )  # fmt: skip
 
 

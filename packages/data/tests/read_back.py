@@ -1,6 +1,6 @@
 """Read exported demonstrations with the libraries of the formats: LeRobot's, and MCAP's for ROS 2.
 
-Run `python tests/tools/datasets/read_back.py --environment FOLDER [--interpreter python3.12]`. If FOLDER has no virtual
+Run `python packages/data/tests/read_back.py --environment FOLDER [--interpreter python3.12]`. If FOLDER has no virtual
 environment, the program creates one with both libraries (5 GB), which cannot be installed together with this package.
 The exit code is 1 if a number differs by more than the rounding of its format.
 """

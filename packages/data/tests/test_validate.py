@@ -6,22 +6,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.files import load_demonstrations
 from guiderail_data.convert import import_recording
-from guiderail_data.validate import fit_bounds, warn_of_deviation
-
-
-def test_strong_regularization_causes_a_warning():
-    assert warn_of_deviation("NarrowPassage", {}) is None
-    warning = warn_of_deviation("NarrowPassage", {"lambda_": 1e4, "beta": 1e4})
-    assert warning.startswith("without actions, ")
-    assert "dataset validate FILE --fit" in warning
-
-
-def test_task_without_demonstrations_causes_no_warning():
-    assert warn_of_deviation("Pouring", {}) is None
-
-
-def test_long_length_scale_causes_a_warning():
-    assert "standard deviation" in warn_of_deviation("NarrowPassage", {"length_scale": 50.0})
+from guiderail_data.validate import fit_bounds
 
 
 def test_recording_in_another_unit_causes_a_remark(tmp_path):

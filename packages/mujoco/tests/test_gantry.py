@@ -1,4 +1,4 @@
-"""MuJoCo gantry as a system; `tests/diagrams/stations/test_mujoco.py` tests the physics."""
+"""MuJoCo gantry as a system; `packages/mujoco/tests/test_station.py` tests the physics."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.systems import MovedBodies, MujocoGantry
+from guiderail_mujoco.gantry import MovedBodies, MujocoGantry
 from guiderail_mujoco.station import MujocoStation
 
 FREE = np.array([0.0, 0.0, 0.05, 0.3, 0.0, 0.0])  # pose 50 mm above the jack

@@ -70,7 +70,7 @@ def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
     final = recording["pose"][LOCKED - 1]
     assert np.abs(final[:3] - offset).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
-    assert recording["contact_force"][:LOCKED].max() < 15.0
+    assert recording["impedance_force"][:LOCKED].max() < 15.0
     assert not recording["saturation"][1:LOCKED].any()  # from the first command on
 
 
@@ -80,7 +80,7 @@ def test_wrench_equals_the_force_of_the_impedance(locked_and_pulled):
     measured = np.linalg.norm(recording["wrench"][turning, :3], axis=1)
     # Sliding over facets causes vibrations, so averages over five control steps (0.1 s) are compared.
     window = np.ones(5) / 5
-    expected = np.convolve(recording["contact_force"][turning, 0], window, "valid")
+    expected = np.convolve(recording["impedance_force"][turning, 0], window, "valid")
     np.testing.assert_allclose(np.convolve(measured, window, "valid"), expected, atol=0.6)
 
 
@@ -125,7 +125,7 @@ def test_snap_force_peaks_at_the_lip(inserted):
     driven, recording = inserted
     X_FG = workpiece_in_fixture(driven, "clamp", "table")
     assert np.abs((CLAMP.X_FT.inverse() @ X_FG).translation()).max() < 0.1 * MM
-    assert recording["contact_force"].max() <= 10.0
+    assert recording["impedance_force"].max() <= 10.0
     z, force = recording["pose"][:, 2] / MM, recording["wrench"][:, 2]
     resistance = force[z > 0.85].max()
     assert 2.0 < resistance < 8.0

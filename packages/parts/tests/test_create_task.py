@@ -35,7 +35,6 @@ from guiderail_parts.task import (
     load_task_folder,
 )
 from guiderail_parts.task_file import Bounds, MotionNumbers, PartTaskFile, read_task_file
-from guiderail_studies.declaration import load_study
 
 pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
@@ -133,10 +132,11 @@ def test_rank_prefers_seating_then_allowed_depth_then_speed():
 
 
 def test_task_of_a_study_may_be_a_task_folder(folder, tmp_path, monkeypatch):
+    declaration = pytest.importorskip("guiderail_studies.declaration", reason="needs guiderail-studies")
     file = tmp_path / "study.yaml"
     file.write_text("{name: short, task: ./peg, methods: {random: {policy: uniform_random}}, seeds: [0]}")
     monkeypatch.chdir(folder.parent)
-    study = load_study(file)
+    study = declaration.load_study(file)
     assert (study.task, study.imports) == ("parts/peg", (str(folder.resolve()),))
 
 
@@ -194,7 +194,7 @@ def test_hard_is_calibrated_with_a_single_episode(folder):
 
 
 def test_parts_of_convex_pieces_are_simulated_in_mujoco(folder):
-    pytest.importorskip("mujoco")
+    pytest.importorskip("guiderail_mujoco.station", reason="needs guiderail-mujoco")
     file = read_task_file(folder)
     assert "mujoco" in load_task_folder(folder).stations()
     assert len(file.plug.convex) >= 1
@@ -226,6 +226,7 @@ def with_floor_only(folder, file):
 
 @pytest.mark.parametrize("offset", [0.0, 1.5e-3])
 def test_offset_plug_is_blocked_only_by_the_walls(folder, offset):
+    pytest.importorskip("guiderail_mujoco", reason="a task has convex pieces only with guiderail-mujoco")
     file = read_task_file(folder)
     with_walls = trial.insert(folder, file, offset=(offset, 0.0))
     assert (with_walls.success, with_walls.is_blocked) == (offset == 0.0, offset > 0.0)
@@ -450,6 +451,7 @@ def test_options_of_a_created_task_are_listed(folder, capsys):
 
 
 def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
     call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
     assert str(task_file) in capsys.readouterr().out.splitlines()[-1]
     constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
@@ -462,6 +464,7 @@ def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
 
 
 def test_fitted_bounds_are_refused_when_excluding_the_target(folder, tmp_path, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
     before = (folder / "task.yaml").read_text()
     demonstrations = Demonstrations.load(folder / "demonstrations.npz")
     shifted = [outputs + [0.005, *[0.0] * 5] for outputs in demonstrations.outputs]
@@ -472,6 +475,8 @@ def test_fitted_bounds_are_refused_when_excluding_the_target(folder, tmp_path, c
 
 
 def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
+
     def fail(*paths):
         raise OSError(28, "No space left on device")
 
@@ -483,6 +488,8 @@ def test_task_is_unchanged_when_bounds_cannot_be_written(folder, monkeypatch, ca
 
 
 def test_task_is_unchanged_when_bounds_cannot_be_drawn(folder, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("guiderail_data", reason="needs guiderail-data")
+
     def fail(*_):
         raise InputError("no room")
 

@@ -6,11 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+import guiderail_studies.robustness as module
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
-from guiderail.tools.evaluation import robustness as module
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.rollout import HELD_OUT_SEED

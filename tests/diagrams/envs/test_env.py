@@ -210,7 +210,7 @@ def test_info_is_nan_when_a_control_step_is_nan(port, key, action_repeat):
     env.reset(options={"start": 0.0})
     env.toy.nan_port = port
     info = env.step([1.0])[-1]
-    assert {name for name, value in info.items() if value != value} == {key, "impedance_force"}  # no impedance here
+    assert {name for name, value in info.items() if value != value} == {key}
 
 
 def test_trace_has_every_control_step():

@@ -58,7 +58,7 @@ def test_arm_inserts_and_locks_at_the_nominal_pose(robot):
     X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert WORKCELL.is_locked(X)
     assert np.abs(X.translation()).max() < 0.3 * MM
-    assert recording["contact_force"].max() < 15.0
+    assert recording["impedance_force"].max() < 15.0
     assert not recording["saturation"].any()
     # In the first second, the plug moves in free space.
     assert np.abs(recording["pose"] - recording["desired_pose"])[:50, :3].max() < 1.5 * MM

@@ -51,7 +51,7 @@ def test_plug_locks_at_the_nominal_pose(locked):
     final = locked["pose"][-1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
-    assert locked["contact_force"].max() < 15.0
+    assert locked["impedance_force"].max() < 15.0
     assert not locked["saturation"].any()
 
 
@@ -59,7 +59,7 @@ def test_wrench_equals_the_force_of_the_impedance(locked):
     """While the plug turns slowly, from 5.0 s to 6.6 s."""
     turning = slice(250, 330)
     np.testing.assert_allclose(
-        np.linalg.norm(locked["wrench"][turning, :3], axis=1), locked["contact_force"][turning, 0], atol=0.6
+        np.linalg.norm(locked["wrench"][turning, :3], axis=1), locked["impedance_force"][turning, 0], atol=0.6
     )
 
 
@@ -157,4 +157,4 @@ def test_uncorrected_offset_of_1_5_mm_jams():
     times, motion = insert_and_lock()
     _, recording = drive_along(GantryStation(WORKCELL), times, motion, move)
     assert recording["pose"][-1, 2] > ENTRY_BOTTOM * MM + 2.0 * MM
-    assert recording["contact_force"].max() > 15.0
+    assert recording["impedance_force"].max() > 15.0

@@ -45,7 +45,7 @@ def test_plug_locks_at_the_nominal_pose(locked_and_pulled):
     final = locked_and_pulled["pose"][round(insert_and_lock()[0][-1] / 0.02) - 1]
     assert np.abs(final[:3]).max() < 0.3 * MM
     assert np.abs(np.rad2deg(final[3:])).max() < 1.0
-    assert locked_and_pulled["contact_force"][:400].max() < HARD.collision.above
+    assert locked_and_pulled["impedance_force"][:400].max() < HARD.collision.above
 
 
 def test_locked_plug_resists_a_pull(locked_and_pulled):

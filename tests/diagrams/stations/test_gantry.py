@@ -43,7 +43,7 @@ def test_static_displacement_equals_compliance_times_wrench(control):
     gantry_station.advance(1.5)
     expected = wrench[[0, 1, 2, 5, 4, 3]] / STIFFNESS  # angles about z, y, x
     np.testing.assert_allclose(gantry_station.read("pose") - before, expected, rtol=0.02)
-    assert gantry_station.read("contact_force")[0] == pytest.approx(np.linalg.norm(wrench[:3]), rel=0.01)
+    assert gantry_station.read("impedance_force")[0] == pytest.approx(np.linalg.norm(wrench[:3]), rel=0.01)
     assert gantry_station.read("saturation")[0] == 0.0
 
 
@@ -62,7 +62,7 @@ def test_force_is_limited():
     gantry_station.push([60.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     gantry_station.advance(0.2)
     assert gantry_station.read("saturation")[0] == 1.0
-    assert gantry_station.read("contact_force")[0] == pytest.approx(40.0)
+    assert gantry_station.read("impedance_force")[0] == pytest.approx(40.0)
 
 
 def test_stations_with_both_impedances_have_equal_ports():

@@ -50,7 +50,7 @@ def test_clamp_snaps_in_with_at_most_10_n(inserted):
     driven, recording = inserted
     X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.1 * MM
-    assert recording["contact_force"].max() <= 10.0
+    assert recording["impedance_force"].max() <= 10.0
     assert np.abs(recording["wrench"][:, :3]).max() <= 10.0
 
 
@@ -131,7 +131,7 @@ def test_clamp_inserts_when_the_command_includes_the_offset(part):
     assert blocked["pose"][-1, 2] > SURFACE - 0.2 * MM
     _, result = descend([0, 0.88, 1.2], [16, -6, -6], **{part: offset}, xy_mm=-offset if part == "grasp_mm" else offset)
     assert abs(result["pose"][-1, 2]) < 0.1 * MM
-    assert result["contact_force"].max() <= 10.0
+    assert result["impedance_force"].max() <= 10.0
 
 
 def test_sticking_contact_does_not_creep():
@@ -153,4 +153,4 @@ def test_arm_inserts_the_clamp():
     driven, recording = descend([0.0, 1.8, 2.0], [16.0, -6.0, -6.0], station=ArmStation)
     X = WORKCELL.workpiece_in_target(driven.station.plant, driven.plant_context)
     assert np.abs(X.translation()).max() < 0.3 * MM
-    assert recording["contact_force"].max() <= 10.0
+    assert recording["impedance_force"].max() <= 10.0

@@ -144,7 +144,7 @@ def test_episode_ends_by_collision_when_force_is_not_bounded():
     )
     info, total, _ = play(env, lambda _: np.array([0.0, 0.0, -1.0]), seed=0, options={"offset": (0.0015, 0.0)})
     assert info["termination"] == "collision"
-    assert info["contact_force"] > COLLISION_FORCE
+    assert info["impedance_force"] > COLLISION_FORCE
     assert env.trace.statistics()["collisions"] == 1
     assert total < -45.0
 

@@ -124,7 +124,7 @@ def test_push_is_a_collision_without_the_cuboid():
     env = make_env("GridClamp", guidance="none", active_constraints=False, bounded_force=False)
     info, _, _ = play(env, lambda _: np.array([0, 0, -0.5, 0, 0, 0]), seed=0, options={"offset": (0.003, 0.0)})
     assert info["termination"] == "collision"
-    assert info["contact_force"] > COLLISION_FORCE
+    assert info["impedance_force"] > COLLISION_FORCE
 
 
 def test_returns_of_both_rewards_differ_by_the_force_cost(env_without_offsets):
@@ -142,7 +142,7 @@ def test_observation_has_position_and_force(env):
         observation, _, _, _, info = env.step(DOWN)
     position, force = (SCALE * observation + CENTER)[[2, 5]]
     assert position == pytest.approx(12.0 * MM, abs=0.1 * MM)
-    assert force == pytest.approx(info["contact_force"], rel=0.25)
+    assert force == pytest.approx(info["impedance_force"], rel=0.25)
     assert force > 5.0
 
 

@@ -60,7 +60,7 @@ class SimulatedRun:
                 self.pose = self.pose + period * velocity
             self.station.get_desired_pose_input_port().FixValue(self.context, self.pose)
             self.clock.advance(self.simulator, self.station, STATUSES_PER_STEP)
-            self.max_force = max(self.max_force, float(self["contact_force"][0]))
+            self.max_force = max(self.max_force, float(self["impedance_force"][0]))
 
     def resume(self) -> None:
         """End a stop, and command the present pose until the blend factor is 1."""

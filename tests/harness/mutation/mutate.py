@@ -43,6 +43,7 @@ CONSTANTS = (bool, int, float, str, tuple, list, frozenset, set, np.ndarray)
 WRAPPERS = (property, classmethod, staticmethod, cached_property)
 TEST_MODULES: set[str] = set()
 PRIMITIVES = ["tests/models/primitives"]
+HARDWARE = "packages/hardware"
 TEMPLATES = ["tests/models/templates"]
 TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
@@ -53,19 +54,28 @@ TARGETS = {
     "models/templates/geometry.py": TEMPLATES,
     "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
     "models/control/cartesian_impedance.py": ["tests/models/control/test_cartesian_impedance.py"],
-    "models/control/joint_status.py": ["tests/models/control/test_joint_status.py"],
-    "models/control/message_sequence.py": ["tests/models/control/test_message_sequence.py"],
-    "models/control/state_estimator.py": ["tests/models/control/test_state_estimator.py"],
-    "diagrams/hardware/driver_guard.py": ["tests/diagrams/hardware/test_driver_guard.py"],
-    "diagrams/hardware/monitor.py": ["tests/diagrams/hardware/test_monitor.py"],
+    f"{HARDWARE}/src/guiderail_hardware/models/joint_status.py": [f"{HARDWARE}/tests/models/test_joint_status.py"],
+    f"{HARDWARE}/src/guiderail_hardware/models/message_sequence.py": [
+        f"{HARDWARE}/tests/models/test_message_sequence.py"
+    ],
+    f"{HARDWARE}/src/guiderail_hardware/models/state_estimator.py": [
+        f"{HARDWARE}/tests/models/test_state_estimator.py"
+    ],
+    f"{HARDWARE}/src/guiderail_hardware/drivers/driver_guard.py": [f"{HARDWARE}/tests/drivers/test_driver_guard.py"],
+    f"{HARDWARE}/src/guiderail_hardware/monitor.py": [f"{HARDWARE}/tests/drivers/test_monitor.py"],
     **{
         f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
         for path in sorted((ROOT / "systems").glob("*.py"))
         if path.stem != "__init__"
     },
+    **{
+        f"{HARDWARE}/src/guiderail_hardware/systems/{path.name}": [f"{HARDWARE}/tests/systems/test_{path.name}"]
+        for path in sorted((ROOT / HARDWARE / "src/guiderail_hardware/systems").glob("*.py"))
+        if path.stem != "__init__"
+    },
     "systems/support/last_valid_pose.py": [
         "tests/systems/test_command_watchdog.py",
-        "tests/systems/test_torque_safety_limiter.py",
+        f"{HARDWARE}/tests/systems/test_torque_safety_limiter.py",
     ],
     "systems/support/last_valid_bound.py": [
         "tests/systems/test_energy_tank.py",

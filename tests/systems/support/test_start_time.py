@@ -9,14 +9,9 @@ from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.stepper import StateProgress
-from guiderail_lerobot.chunk_guard import ChunkGuard
 
 PERIOD = 0.02
 BOX = LinearConstraints.box([-1.0], [1.0])
-
-
-def chunk_limiter():
-    return systems.ChunkSafetyLimiter(ChunkGuard(BOX, [1.0], [90.0], period=PERIOD, start=[0.0]), 8, 3, PERIOD)
 
 
 def command_filter():
@@ -35,7 +30,6 @@ CASES = {
         lambda: systems.ProgressClock(StateProgress((0.01, 0.1), 2), 1, PERIOD),
         {"command": [1.0], "pose": [0.0]},
     ),
-    "chunk limiter": (chunk_limiter, {"chunk": np.full(8, 0.5), "pose": [0.0]}),
     "disturbance": (lambda: systems.CommandDisturbance(1, PERIOD, 0.0, 2), {"command": [1.0], "pose": [0.0]}),
     "monitor": (episode_monitor, {"x": [1.0]}),
 }

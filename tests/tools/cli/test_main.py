@@ -10,7 +10,6 @@ import pytest
 import typer
 
 import guiderail
-from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.plugins import SIBLINGS
@@ -51,7 +50,7 @@ def call(capsys, *arguments):
         (["train", "Bead", "--out", "new", "--episodes", "1000000001"], "at most 1000000000 episodes"),
         (["train", "Bead", "--out", "new", "--episodes", "many"], "see guiderail train --help"),
         (["train", "Bead", "--out", "new", "--evaluate", "0"], "give at least 1, not 0"),
-        (["train", "Bead", "--out", "new", "--station", "hardware", "--evaluate", "3"], "leave --evaluate out"),
+        (["train", "Bead", "--out", "new", "--station", "hardware"], "use guiderail train-on-robot TASK --out RUN"),
         (["train", "Bead", "--out", "new", "--seed", "-1"], "a seed is a whole number"),
         (["train", "Bead", "--out", "new", "--set", "batch_size"], "name=value"),
         (["train", "Bead", "--out", "new", "--set", "batchsize=3"], "did you mean batch_size?"),
@@ -76,22 +75,12 @@ def call(capsys, *arguments):
         (["train", "Bead", "--out", "new", "--env", "action_repeat=two"], "give a value such as 1"),
         (["train", "Bead", "--out", "new", "--env", "wall=[1, 2]"], "give a value such as 1.0"),
         (["train", "BncConnector", "--out", "new", "--robot", "panda"], "give --env robot=panda"),
-        (["train", "BncConnector", "--out", "new", "--robot-url", "memq://"], "it is an option of station='hardware'"),
-        (["train", "BncConnector", "--out", "new", "--rate", "0.5"], "give --station hardware too"),
-        (["train", "BncConnector", "--out", "new", "--scenario", "lab.yaml"], "give --station hardware too"),
-        (["train", "BncConnector", "--out", "new", "--station", "hardware", "--log", "csv"], "leave --log out"),
         (["evaluate", "new"], "not a run"),
         (["evaluate", "new", "--guidance", "kgrl"], "there is no option --guidance here: give --env guidance=kgrl"),
         (["robustness", "new", "--station=arm"], "give --env station=arm"),
         (["certify", "new", "--reward"], "give --env reward=VALUE"),
         (["visualize", "new", "--action-repeat", "5"], "give --env action_repeat=5"),
-        (["evaluate", "new", "--sim"], "give --station hardware too"),
-        (["evaluate", "new", "--station", "hardware", "--sim", "--resample-offsets"], "leave --env"),
-        (["evaluate", "new", "--station", "hardware", "--sim", "--seed", "7"], "--seed and --resample-offsets out"),
-        *(
-            (["evaluate", "new", "--station", "hardware", "--sim", *options], f"{options[0]}, ")
-            for options in (["--signal", "measured"], ["--processes", "2"], ["--trust-policy"])
-        ),
+        (["evaluate", "new", "--station", "hardware"], "use guiderail deploy RUN --episodes N"),
         (["evaluate", "new", "--task", "Bead"], "no policy 'new'"),
         (["evaluate", "mypol.py", "--task", "Bead"], "mypol.py:FUNCTION"),
         (["evaluate", "nomod:zero", "--task", "Bead"], "to import for nomod:zero: give MODULE:FUNCTION or FILE.py"),
@@ -184,16 +173,6 @@ def test_visualize_refuses_a_baseline_for_a_run(capsys, bead_run):
     code, _, err = call(capsys, "visualize", bead_run, "--policy", "zero", "--image", "picture.png")
     assert code == 2
     assert err == "guiderail: --policy acts in a task: name the task instead of a folder, or leave --policy out\n"
-
-
-@pytest.mark.parametrize("policy", ["none", "uniform_random,scripted", "unifrm_random"])
-def test_evaluate_refuses_unknown_policy_on_hardware(policy, capsys, bead_run):
-    hardware = ["--station", "hardware", "--sim"]
-    code, out, err = call(capsys, "evaluate", bead_run, *hardware, "--episodes", 1, "--policy", policy)
-    assert (code, out) == (2, "")
-    assert f"Bead has no policy {policy!r}" in err
-    assert err.count("\n") == 1
-    assert not (bead_run / "hardware").exists()
 
 
 def test_json_has_null_for_nan_and_infinity_at_any_depth():
@@ -516,52 +495,6 @@ def test_evaluate_prints_a_column_for_each_baseline(capsys, bead_run):
     for name in ("mean return", "collisions", "mean force [N]", "peak force [N]"):
         (line,) = (line for line in table.splitlines() if line.startswith(name + " "))
         assert len(line.removeprefix(name).split()) == 4
-
-
-STATION = """
-from guiderail.diagrams.stations.registry import register_station
-
-
-@register_station("desk", workcell_kind="insertion", is_simulated=False)
-def desk(workcell):
-    raise NotImplementedError
-"""
-
-
-@pytest.mark.parametrize(
-    ("options", "robot"),
-    [([], "iiwa14"), (["--robot", "panda"], "panda"), (["--env", "robot=panda"], "panda")],
-)
-def test_train_passes_robot_and_imports_to_hardware(options, robot, capsys, tmp_path, monkeypatch):
-    passed = {}
-
-    def train_on_robot(task, out, connection, **keywords):
-        passed.update(keywords, connection=connection)
-        return {"run": str(out)}
-
-    monkeypatch.setattr("guiderail_hardware.robot.train.train_on_robot", train_on_robot)
-    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
-    file = tmp_path / "desk.py"
-    file.write_text(STATION)
-    hardware = ["--station", "desk", "--import", file, "--out", "new", "--robot-url", "memq://"]
-    assert call(capsys, "train", "BncConnector", *hardware, *options)[0] == 0
-    assert (passed["connection"].robot, passed["connection"].robot_url) == (robot, "memq://")
-    assert passed["given"]["imports"] == (str(file),)
-
-
-def test_evaluate_imports_the_station_before_its_use(capsys, tmp_path, monkeypatch, bead_run):
-    passed = {}
-
-    def evaluate_on_robot(run, connection, episodes, **keywords):
-        passed.update(keywords)
-        return {"episodes": episodes}
-
-    monkeypatch.setattr("guiderail_hardware.robot.evaluate.evaluate_on_robot", evaluate_on_robot)
-    monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
-    file = tmp_path / "other_desk.py"
-    file.write_text(STATION)
-    assert call(capsys, "evaluate", bead_run, "--station", "desk", "--import", file, "--robot-url", "memq://")[0] == 0
-    assert passed["station"] == "desk"
 
 
 def test_policy_file_without_its_ending_is_named(capsys, tmp_path):

@@ -32,7 +32,7 @@ def test_step_log_has_every_step_and_agrees_with_the_rows(logged):
         assert steps["step"].tolist() == list(range(row["steps"]))
         assert steps["commanded_violation"].max() == row["max_commanded_violation"] <= TOLERANCE
         assert steps["measured_violation"].max() == row["max_measured_violation"]
-        assert steps["contact_force"].max() == row["peak_force"]
+        assert steps["force"].max() == row["peak_force"]
         assert steps["collision"].sum() == row["collision_steps"]
         assert steps["fallback"].sum() == row["fallback_steps"]
         assert not steps["command_timed_out"].any()

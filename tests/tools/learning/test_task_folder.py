@@ -94,7 +94,7 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, run):
 
 @pytest.mark.parametrize(
     "arguments",
-    [["evaluate"], ["evaluate", "--station", "hardware", "--sim"], ["robustness"], ["visualize"], ["deploy", "--sim"]],
+    [["evaluate"], ["deploy", "--sim", "--episodes", "1"], ["robustness"], ["visualize"], ["deploy", "--sim"]],
     ids=" ".join,
 )
 def test_run_is_not_evaluated_when_its_task_folder_changed(arguments, folder, run, capsys):

@@ -94,7 +94,7 @@ def test_station_tracks_poses_and_measures_the_force():
     loop.advance(rotated, 1.75)
     loop.advance(rotated + [0, 0, lug_top - 0.012 - 10.0 / 1500.0, 0, 0, 0], 1.0)
     assert loop["wrench"][2] == pytest.approx(10.0, abs=1.5)
-    assert loop["contact_force"][0] == pytest.approx(10.0, abs=1.5)
+    assert loop["impedance_force"][0] == pytest.approx(10.0, abs=1.5)
     assert loop["pose"][2] == pytest.approx(lug_top, abs=5e-4)
 
 
@@ -363,6 +363,7 @@ def test_stations_have_the_same_ports():
         assert inputs == {"desired_pose": 6, "command_time": 1}
         ports = [station.get_output_port(i) for i in range(station.num_output_ports())]
         outputs = {port.get_name(): port.size() for port in ports if port.get_name() not in one_kind_only}
+        assert outputs.pop("impedance_force") == 1
         assert outputs == {"pose": 6, "wrench": 6, "contact_force": 1, "saturation": 1, "command_timed_out": 1}
         assert station.num_input_ports() == 2
 

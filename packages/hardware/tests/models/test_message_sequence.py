@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+import guiderail_hardware.models.message_sequence as module
 from guiderail.models.common.errors import InputError
-from guiderail.models.control import message_sequence as module
 from guiderail_hardware.models.joint_status import MALFORMED_STATUS, MAX_MISSED_MESSAGES, JointStatus
 from guiderail_hardware.models.message_sequence import CommandSequence, StatusSequence
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import guiderail_hardware.models.state_estimator as module
 from guiderail.models.common.errors import InputError
-from guiderail.models.control import state_estimator as module
 from guiderail_hardware.models.joint_status import (
     MALFORMED_STATUS,
     Fault,

@@ -12,7 +12,7 @@ from guiderail_hardware.drivers.lcm_simulated import SimulatedIiwa
 from guiderail_hardware.robot.connection import RobotConnection
 from guiderail_hardware.robot.scenario import load_scenario
 
-SHIPPED = Path(__file__).parents[3] / "examples" / "connector.scenario.yaml"
+SHIPPED = Path(__file__).parents[4] / "examples" / "connector.scenario.yaml"
 DRIVER_WITH = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus, %s}}\n"
 DRIVER = "model_drivers: {iiwa14: !IiwaDriver {control_mode: torque_only, lcm_bus: bus}}\n"
 BUS = "lcm_buses: {bus: {lcm_url: 'udpm://239.255.76.67:7668?ttl=0'}}\n"

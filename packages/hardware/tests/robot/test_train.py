@@ -295,7 +295,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
         violations = env.trace.signals[signal]
         assert row[column] == violations.max() > violations[:5].max()
         assert infos[-1][-1][key] == violations[5:].max()
-    assert infos[-1][-1]["contact_force"] == env.trace.force[5:].max()
+    assert infos[-1][-1]["impedance_force"] == env.trace.force[5:].max()
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from ruckig import ControlInterface, InputParameter, Result, Ruckig, RuckigError
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems import pose_motion_limiter
+from guiderail_hardware.systems import pose_motion_limiter
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from oracles.franka import FRANKA_LIMITS
 

@@ -1,4 +1,4 @@
-"""Status watchdog as a system: ports and clock; `tests/models/control/test_state_estimator.py` tests the estimator."""
+"""Status watchdog as a system: ports and clock; `tests/models/test_state_estimator.py` tests the estimator."""
 
 from dataclasses import replace
 

@@ -1,6 +1,7 @@
 """Demonstrations by a scripted operator that presses keys on a page in headless Chromium.
 
-`python tests/tools/teleop/record_in_browser.py TASK OUT.npz [SCREENSHOT.png]`, with Chromium and websockets installed.
+`python packages/hardware/tests/teleop/record_in_browser.py TASK OUT.npz [SCREENSHOT.png]`, with Chromium and
+websockets installed.
 """
 
 import asyncio

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/export.py"
+FILE = Path(__file__).parents[2] / "src/lerobot_robot_guiderail/export.py"
 DOUBLES = {
     "lerobot.configs": ("FeatureType", "PolicyFeature"),
     "lerobot.utils.constants": ("ACTION", "OBS_STATE"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/guard.py"
+FILE = Path(__file__).parents[2] / "src/lerobot_robot_guiderail/guard.py"
 PERIOD, VELOCITY, JERK, BOUND = 0.1, 0.5, 5.0, 0.2  # [s], [unit/s], [unit/s³], [unit]
 NAMES = ["a.pos", "b.pos"]
 

@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-FILE = Path(__file__).parents[2] / "integrations/lerobot_robot_guiderail/lerobot_robot_guiderail/robot.py"
+FILE = Path(__file__).parents[2] / "src/lerobot_robot_guiderail/robot.py"
 
 
 @pytest.fixture

@@ -303,7 +303,7 @@ class PartTaskFile(Options):
     stiction_tolerance: Number = Field(1e-5, gt=0, description="largest slip speed of a sticking contact [m/s]")
     demonstrations: DemonstrationFile = DemonstrationFile.model_validate({})
     action_dims: tuple[int, ...] | None = Field((0, 1), description="indices of the outputs that an action moves")
-    sides: tuple[str, ...] = Field((), description="symmetries of both parts: see models/parts/assembly_check.py")
+    sides: tuple[str, ...] = Field((), description="symmetries of both parts: see geometry/assembly_check.py")
     rim_sides: tuple[str, ...] = Field((), description="symmetries that nearly hold for a plug on the rim")
     recommended: Recommended = Recommended.model_validate({})
     search: SearchNumbers = SearchNumbers.model_validate({})

@@ -20,6 +20,7 @@ from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.tasks.offsets import control_steps
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.plugins import MissingSiblingError, load_plugin, require_sibling
 from guiderail.models.common.transforms import DEGREE, POSE_NAMES
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.sdf import TriangleMesh
@@ -27,7 +28,6 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.systems.recorder import Recording
 from guiderail.systems.support.drake_multibody import pose_to_transform, transform_to_vector
-from guiderail_mujoco.station import MujocoStation
 from guiderail_parts.geometry.demonstrator import demonstrator_motions, socket_offsets, socket_turns
 from guiderail_parts.geometry.drake_check import piece_text
 from guiderail_parts.geometry.preparation import CUT_SECONDS, ContactSurface, cut_bodies
@@ -304,12 +304,15 @@ def add_convex_pieces(
 ) -> PartTaskFile:
     """Return the task file with the names of both parts' convex pieces; unchanged if cutting or an insertion fails.
 
+    It is also unchanged if guiderail-mujoco is not installed.
+
     If the contact geometry of a part consists of convex pieces, they are used. Otherwise pieces are cut from its
     surface and written; they may exceed the surface by twice the `tolerance` [m]. A sentence on the result is logged.
     """
     written: list[Path] = []
     changes: dict[str, PartModel] = {}
     try:
+        require_sibling("mujoco", "station=mujoco")
         for name, model in (("plug", file.plug), ("socket", file.socket)):
             names = [piece.file for piece in model.pieces if piece.modulus is not None and piece.file.endswith(".obj")]
             if len(names) < len(model.pieces):
@@ -329,7 +332,7 @@ def add_convex_pieces(
             raise IsolatedError(
                 "an aligned plug does not seat" if not is_seated else "a misaligned plug is not blocked"
             )
-    except IsolatedError as error:
+    except (IsolatedError, MissingSiblingError) as error:
         log(f"station=mujoco is not offered: {error}")
         for path in written:
             path.unlink(missing_ok=True)
@@ -347,7 +350,7 @@ def insert_in_mujoco(folder: Path, file: PartTaskFile, offset: float = 0.0) -> t
     """
     times, poses = file.motion.plan_straight_insertion()
     poses[:, 0] += offset
-    station = MujocoStation(write_workcell(folder, file), time_step=file.time_step)
+    station = load_plugin("station", "mujoco", "mujoco")(write_workcell(folder, file), time_step=file.time_step)
     _, recording = drive_along(station, times, poses)
     x, y, z, Rz, Ry, Rx = recording["pose"][-1]
     is_seated = file.tolerance.accepts(np.array([x, y, z, Rx, Ry, Rz]))  # tilts are small

@@ -1,7 +1,7 @@
 """Run a study of eight runs in two processes, and on a Ray cluster that loses one of its two machines.
 
-    python tests/tools/experiments/engines/ray_study.py --out FOLDER         # the narrow passage
-    python tests/tools/experiments/engines/ray_study.py --out FOLDER --bead  # half a minute
+    python packages/studies/tests/engines/ray_study.py --out FOLDER         # the narrow passage
+    python packages/studies/tests/engines/ray_study.py --out FOLDER --bead  # half a minute
 
 On the cluster, a worker is killed during a run, and then one of the two machines with all its processes. The exit code
 is 1 if the study on the cluster is not complete, or differs in any bit from the study in two processes. Ray must be
@@ -23,7 +23,7 @@ from typing import Any
 
 import yaml
 
-TESTS = Path(__file__).parents[3]
+TESTS = Path(__file__).parents[4] / "tests"
 sys.path.insert(0, str(TESTS))
 from oracles.same_runs import differences  # noqa: E402
 

@@ -67,7 +67,7 @@ def test_job_fails_when_three_workers_are_lost():
 @pytest.mark.parametrize("stop_signal", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_workers_end_when_the_study_is_killed(stop_signal, tmp_path):
     (tmp_path / "parent.py").write_text(PARENT)
-    paths = os.pathsep.join([str(Path(__file__).parents[3]), *filter(None, sys.path)])
+    paths = os.pathsep.join([str(Path(__file__).parents[4] / "tests"), *filter(None, sys.path)])
     with subprocess.Popen(
         [sys.executable, tmp_path / "parent.py"],
         env=os.environ | {"PYTHONPATH": paths},
