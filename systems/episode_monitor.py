@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.termination import EVALUATED, Termination
+from guiderail.models.common.termination import EVALUATED, TERMINATIONS, Termination
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
 
@@ -53,7 +53,7 @@ class EpisodeMonitor(LeafSystem):
 
     Each term counts the control steps in which its condition is met. At the end of a step, the output already counts
     this step, and the update event of the same instant stores the count. The output is constant after a term has
-    terminated the episode.
+    terminated the episode. `simulator.set_monitor(episode_monitor.monitor)` ends the simulation with it.
 
     .. pydrake_system::
 
@@ -78,6 +78,7 @@ class EpisodeMonitor(LeafSystem):
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
         super().__init__()
+        self._period = period
         self._of_task = f" of {task_name}" if task_name else ""
         check_terms(terms, TerminationTerm, f"a monitor{self._of_task}")
         if not terms:
@@ -98,6 +99,20 @@ class EpisodeMonitor(LeafSystem):
 
     get_signal_input_port = declare.get_signal_input_port
     get_termination_output_port = output_getter("termination", "index of a `Termination`, (1,)")
+
+    def monitor(self, root_context: Context) -> EventStatus:
+        """End a simulation at the end of the control step in which an episode ends, for `Simulator.set_monitor`.
+
+        The status that `Simulator.AdvanceTo` returns then has the reason as its message, such as "success".
+        """
+        context = self.GetMyContextFromRoot(root_context)
+        steps = context.get_time() / self._period
+        if abs(steps - round(steps)) > 1e-6:  # within a control step
+            return EventStatus.DidNothing()
+        index = int(self.GetOutputPort("termination").Eval(context)[0])
+        if index == 0:
+            return EventStatus.DidNothing()
+        return EventStatus.ReachedTermination(self, TERMINATIONS[index].value)
 
     def _calc_next(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)

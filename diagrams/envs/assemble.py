@@ -22,7 +22,14 @@ from guiderail.diagrams.envs.observation import (
     affine,
 )
 from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
-from guiderail.diagrams.envs.scene import Camera, add_meshcat, add_observation_camera, add_picture, scene_of
+from guiderail.diagrams.envs.scene import (
+    Camera,
+    add_meshcat,
+    add_observation_camera,
+    add_picture,
+    contact_results_of,
+    scene_of,
+)
 from guiderail.diagrams.envs.task_checks import call_checked, check_takes_arguments, refuse_half_turns, threshold_of
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
@@ -288,7 +295,12 @@ class Loop:
 
 
 def build_task_diagram(
-    task: Task, station: Station, guidance: Diagram, *, render_mode: str | None = None
+    task: Task,
+    station: Station,
+    guidance: Diagram,
+    *,
+    render_mode: str | None = None,
+    before_build: Callable[[DiagramBuilder], object] | None = None,
 ) -> TaskDiagram:
     """Build the diagram of a task: control loop, reward and episode monitor. The policy's `action` is an input port.
 
@@ -297,6 +309,7 @@ def build_task_diagram(
         station: Station.
         guidance: Diagram with the ports of `Guidance`.
         render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
+        before_build: Function that adds systems to the builder, such as loggers, before the diagram is built.
 
     Raises:
         InputError: As `Loop`, or if the name of a reward term is reserved, or "rgb_array" is given without a camera.
@@ -349,6 +362,8 @@ def build_task_diagram(
         builder.ExportOutput(port, name)
     if render_mode == "rgb_array":
         add_picture(builder, station, task.camera(), task.name)
+    if before_build is not None:
+        before_build(builder)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
     displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only if actions displace outputs
@@ -361,6 +376,7 @@ def build_task_diagram(
         randomize=make_randomize(task, station, guidance),
         push=_push(station) if task.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
+        contact_results=contact_results_of(station),
         symmetry=task.symmetry() if displaces else None,
         near_symmetry=task.near_symmetry() if displaces else None,
         declaration=task,
@@ -389,6 +405,7 @@ def build_skill_diagram(
     policy: System | Callable[[np.ndarray], np.ndarray],
     *,
     render_mode: str | None = None,
+    before_build: Callable[[DiagramBuilder], object] | None = None,
 ) -> SkillDiagram:
     """Build the diagram of a learned skill, without reward and episode monitor.
 
@@ -399,6 +416,7 @@ def build_skill_diagram(
         policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
             periods; or a system with an input `observation` and an output `action`.
         render_mode: None, "human" (browser view) or "rgb_array" (exports the image of the task's camera).
+        before_build: Function that adds systems to the builder, such as loggers, before the diagram is built.
 
     Raises:
         InputError: As `Loop`, or if there is no scene for "human" or no camera for "rgb_array", the policy is neither a
@@ -421,9 +439,11 @@ def build_skill_diagram(
         builder.ExportOutput(port, name)
     for name in OUTPUTS:
         builder.ExportOutput(guidance.GetOutputPort(name), name)
-    meshcat = add_meshcat(builder, scene_of(station)) if render_mode == "human" else None
+    meshcat = add_meshcat(builder, scene_of(station), contact_results_of(station)) if render_mode == "human" else None
     if render_mode == "rgb_array":
         add_picture(builder, station, task.camera(), task.name)
+    if before_build is not None:
+        before_build(builder)
     diagram = builder.Build()
     diagram.set_name(f"{task.name.replace('/', '_')}_skill")
     return SkillDiagram(

@@ -5,6 +5,7 @@ import re
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +13,10 @@ import gymnasium
 import numpy as np
 from pydrake.gym import DrakeGymEnv
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.analysis import Simulator
+from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, PortDataType
 
+from guiderail.diagrams.envs.episode_state import EpisodeState
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
@@ -47,6 +49,17 @@ INFO_KEYS = (
     "simulation_failure",
 )
 """Reserved keys of `info`; reward terms and the values that a task's reset samples must have other names."""
+
+_EPISODE_FIELDS = (
+    "sampled",
+    "privileged",
+    "_control_steps",
+    "_running",
+    "_observation",
+    "_failure",
+    "_violations",
+)
+"""Attributes of a `DiagramEnv` that belong to the episode; the context holds everything else."""
 
 # Error messages of Drake, or of a system with another physics engine, that report failed physics and not wrong wiring.
 # A failed assertion of Drake is a SystemExit in Python.
@@ -118,7 +131,11 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"action_repeat must be a whole number of control steps, at least 1, not {action_repeat}")
         diagram = task.diagram
         _check_view(task, render_mode)
-        view = None if render_mode != "human" or task.query is None else View(task.query)
+        view = (
+            None
+            if render_mode != "human" or task.query is None
+            else View(task.query, contact_results=task.contact_results)
+        )
         self.task = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
         self.metadata = {}  # the parent class would write its render modes into the class attribute
@@ -215,6 +232,54 @@ class DiagramEnv(DrakeGymEnv):
             self.sampled = self.task.randomize(context, self.np_random, dict(options or {}))
             self.simulator.Initialize()
         return self._begin_episode()
+
+    def save(self) -> EpisodeState:
+        """Return the state of the episode, from which `restore` continues any number of times.
+
+        Raises:
+            ResetNeeded: If no episode has begun.
+            InputError: If the environment is closed.
+        """
+        if self._closed:
+            raise InputError("the environment is closed: make another one")
+        if self._observation is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset() first")
+        context = self._pristine.Clone()  # without the values in the caches, which are computed again
+        context.SetTimeStateAndParametersFrom(self.simulator.get_context())
+        return EpisodeState(
+            diagram=self.task.diagram,
+            context=context,
+            action=self.action_port.Eval(self.simulator.get_context()).copy(),
+            rng=self.np_random.bit_generator.state,
+            trace=deepcopy(self.trace),
+            fields=deepcopy({name: getattr(self, name) for name in _EPISODE_FIELDS}),
+        )
+
+    def restore(self, state: EpisodeState) -> np.ndarray:
+        """Continue from a saved state of this environment's diagram; return the observation of that moment.
+
+        Equal actions then give equal observations, rewards and `info`, bit for bit. Later resets without a seed are
+        equal as well, because the state includes the random generator.
+
+        Raises:
+            InputError: If `state` is none of `save`, or belongs to another diagram; or if the environment is closed.
+        """
+        if self._closed:
+            raise InputError("the environment is closed: make another one")
+        if not isinstance(state, EpisodeState):
+            raise InputError(f"an episode is restored from what save() returned, not from {brief(state)}")
+        if state.diagram is not self.task.diagram:
+            raise InputError("this state was saved by an environment with another diagram: save it in this one")
+        self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(state.context)
+        self._action_value.GetMutableData().set_value(state.action)
+        # The events of this instant follow in the next step, as they would have without the interruption.
+        self.simulator.Initialize(InitializeParams(suppress_initialization_events=True))
+        self.np_random.bit_generator.state = state.rng
+        self.trace.assign(state.trace)
+        for name, value in deepcopy(state.fields).items():
+            setattr(self, name, value)
+        assert self._observation is not None
+        return self._observation
 
     def _begin_episode(self) -> tuple[np.ndarray | None, dict[str, Any]]:
         """Return observation and info of a reset, after the simulator was initialized or has failed."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Diagram, System
+from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from guiderail.diagrams.envs.assemble import (
     SkillDiagram,
@@ -58,7 +58,8 @@ def make_station(task: Task) -> Station:
         station = disturbed(build, disturbances, kind.is_simulated, kind.name, call_checked(task, "impedance"))
     else:
         station = build()
-    if config.control_period is not None and station.nominal_period != task.control_period:
+    rounding = 1e-9 if arguments.get("time_step") else 0.0  # see `exact_periods`
+    if config.control_period is not None and abs(station.nominal_period - task.control_period) > rounding:
         if takes_period:
             raise InputError(
                 f"time_unit of {task.name} is {task.time_unit!r} s, and the period {station.nominal_period!r} s of "
@@ -116,7 +117,13 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
     return build_prior_knowledge(new_task, make_station(new_task))
 
 
-def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options: Any) -> DiagramEnv:
+def make_env(
+    task: str | EnvConfig,
+    *,
+    render_mode: str | None = None,
+    before_build: Callable[[DiagramBuilder], object] | None = None,
+    **options: Any,
+) -> DiagramEnv:
     """Build the environment that `gymnasium.make("guiderail/<Task>-v0", ...)` returns without its wrappers.
 
     Until the environment is closed, numerical libraries use one thread in this process; see `DiagramPool`.
@@ -124,6 +131,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
     Args:
         task: Configuration, or name of the task, or path of a task folder.
         render_mode: None, "human" (browser view at `env.unwrapped.task.meshcat.web_url()`) or "rgb_array".
+        before_build: Function that is called with the builder of the environment's diagram before it is built, and may
+            add systems to it: loggers, visualizers, publishers. Its subsystems "station" and "guidance" have the ports.
         options: Options of the environment, if `task` is not a configuration; `guiderail list TASK` lists them.
 
     Raises:
@@ -139,8 +148,8 @@ def make_env(task: str | EnvConfig, *, render_mode: str | None = None, **options
         )
     exported = render_mode if render_mode == "rgb_array" else None
     new_task = config.make_task()
-    key = _key(new_task, exported)
-    built = _POOL.acquire(key, lambda: _build(new_task, exported))
+    key = None if before_build is not None else _key(new_task, exported)
+    built = _POOL.acquire(key, lambda: _build(new_task, exported, before_build))
     # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
     # task that built the diagram. The hidden values of a run belong to the new task alone.
     assert built.diagram.declaration is not None
@@ -160,6 +169,7 @@ def make_skill(
     policy: System | Callable[[np.ndarray], np.ndarray],
     *,
     render_mode: str | None = None,
+    before_build: Callable[[DiagramBuilder], object] | None = None,
     **options: Any,
 ) -> SkillDiagram:
     """Build a learned skill as a diagram for a `Simulator`: observation → policy → guidance → station.
@@ -168,6 +178,7 @@ def make_skill(
         task: Configuration, or name or folder of the task that the policy was trained on.
         policy: Saved `Policy`, function from observation to action, or system with ports `observation` and `action`.
         render_mode: None, "human" (browser view) or "rgb_array" (output `rgb_image`).
+        before_build: As in `make_env`.
         options: Options of the environment that the policy was trained in, if `task` is not a configuration.
 
     Raises:
@@ -177,7 +188,8 @@ def make_skill(
     check_render_mode(render_mode)
     new_task = _config(task, options).make_task()
     station = make_station(new_task)
-    return build_skill_diagram(new_task, station, make_guidance(new_task, station), policy, render_mode=render_mode)
+    guidance = make_guidance(new_task, station)
+    return build_skill_diagram(new_task, station, guidance, policy, render_mode=render_mode, before_build=before_build)
 
 
 _POOL = DiagramPool()
@@ -193,10 +205,13 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
     return task
 
 
-def _build(task: Task, render_mode: str | None) -> BuiltDiagram:
+def _build(
+    task: Task, render_mode: str | None, before_build: Callable[[DiagramBuilder], object] | None
+) -> BuiltDiagram:
     station = make_station(task)
     guidance = make_guidance(task, station)
-    return BuiltDiagram(build_task_diagram(task, station, guidance, render_mode=render_mode), station, guidance)
+    diagram = build_task_diagram(task, station, guidance, render_mode=render_mode, before_build=before_build)
+    return BuiltDiagram(diagram, station, guidance)
 
 
 def _key(task: Task, render_mode: str | None) -> Hashable:

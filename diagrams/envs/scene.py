@@ -27,7 +27,8 @@ from pydrake.geometry import (
     SceneGraph,
 )
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.meshcat import ContactVisualizer, ContactVisualizerParams
+from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.systems.framework import Context, DiagramBuilder, EventStatus, OutputPort
 from pydrake.systems.sensors import CameraInfo, RgbdSensor
 
@@ -37,6 +38,8 @@ from guiderail.models.common.errors import InputError
 
 _OBSERVATION_RENDERER, _PICTURE_RENDERER = "vtk", "vtk_picture"
 PUBLISH_PERIOD = 1 / 50  # simulated time between two publications of a browser view [s]
+# Scale of the drawn contacts: 20 N and 2 Nm have the length of a hand.
+NEWTONS_PER_METER, NEWTON_METERS_PER_METER = 200.0, 20.0
 
 
 # Observations have Drake's default light, from the camera. Pictures have a white background and light from above, which
@@ -179,6 +182,11 @@ def scene_of(station: Any) -> OutputPort:
     return station.GetOutputPort("query")
 
 
+def contact_results_of(station: Any) -> OutputPort | None:
+    """Return the port of a station's contact results; None without a simulation of Drake."""
+    return station.GetOutputPort("contact_results") if station.HasOutputPort("contact_results") else None
+
+
 def check_rendering() -> None:
     """Check that EGL is installed, because without it Drake would abort the process.
 
@@ -192,6 +200,32 @@ def check_rendering() -> None:
             "images need libEGL.so.1, which this machine lacks: install it (Debian, Ubuntu: apt install libegl1), or "
             "use observation='state' without render_mode='rgb_array'"
         ) from None
+
+
+def contact_visualizer(meshcat: Meshcat) -> ContactVisualizer:
+    """Return Drake's visualizer of contact forces, with a scale for contacts of a tool."""
+    return ContactVisualizer(
+        meshcat,
+        ContactVisualizerParams(
+            publish_period=PUBLISH_PERIOD,
+            newtons_per_meter=NEWTONS_PER_METER,
+            newton_meters_per_meter=NEWTON_METERS_PER_METER,
+            radius=0.001,
+        ),
+    )
+
+
+def contact_forces(results: ContactResults) -> np.ndarray:
+    """Return points [m] and forces [N] of all contacts in the world, (k, 6), the largest force first."""
+    rows = []
+    for index in range(results.num_point_pair_contacts()):
+        pair = results.point_pair_contact_info(index)
+        rows.append(np.concatenate([pair.contact_point(), pair.contact_force()]))
+    for index in range(results.num_hydroelastic_contacts()):
+        surface = results.hydroelastic_contact_info(index)
+        rows.append(np.concatenate([surface.contact_surface().centroid(), surface.F_Ac_W().translational()]))
+    rows.sort(key=lambda row: -float(np.linalg.norm(row[3:])))
+    return np.array(rows).reshape(-1, 6)
 
 
 def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisualizer]:
@@ -210,14 +244,18 @@ def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisual
     return meshcat, MeshcatVisualizer(meshcat, parameters)
 
 
-def add_meshcat(builder: DiagramBuilder, query: OutputPort) -> Meshcat:
-    """Add a browser view to a diagram and return its page.
+def add_meshcat(builder: DiagramBuilder, query: OutputPort, contact_results: OutputPort | None = None) -> Meshcat:
+    """Add a browser view to a diagram, with contact forces if their port is given, and return its page.
 
     Raises:
         InputError: As `open_meshcat`.
     """
     meshcat, visualizer = open_meshcat()
     add_system(builder, "meshcat", visualizer, query)
+    if contact_results is not None:
+        contacts = builder.AddNamedSystem("contact_visualizer", contact_visualizer(meshcat))
+        builder.Connect(contact_results, contacts.contact_results_input_port())
+        builder.Connect(query, contacts.query_object_input_port())
     return meshcat
 
 
@@ -231,8 +269,10 @@ class View:
         meshcat: Meshcat page.
     """
 
-    def __init__(self, query: OutputPort, meshcat: Meshcat | None = None):
+    def __init__(self, query: OutputPort, meshcat: Meshcat | None = None, contact_results: OutputPort | None = None):
         """Open the view of a scene graph's query port, on a new page if none is given.
+
+        With the port of the plant's contact results, the view also draws the forces of the contacts.
 
         Raises:
             InputError: As `open_meshcat`.
@@ -240,6 +280,10 @@ class View:
         self._query = query
         self.meshcat, self._visualizer = open_meshcat(meshcat)
         self._context = self._visualizer.CreateDefaultContext()
+        self._contact_results = contact_results
+        if contact_results is not None:
+            self._contacts = contact_visualizer(self.meshcat)
+            self._contacts_context = self._contacts.CreateDefaultContext()
         self._published = -1.0  # time of the last publication [s]
 
     def follow(self, context: Context) -> EventStatus:
@@ -257,6 +301,12 @@ class View:
         scene = self._query.Eval(self._query.get_system().GetMyContextFromRoot(context))
         self._visualizer.query_object_input_port().FixValue(self._context, scene)
         self._visualizer.ForcedPublish(self._context)
+        if self._contact_results is not None:
+            station = self._contact_results.get_system()
+            results = self._contact_results.Eval(station.GetMyContextFromRoot(context))
+            self._contacts_context.SetTime(self._published)
+            self._contacts.contact_results_input_port().FixValue(self._contacts_context, results)
+            self._contacts.ForcedPublish(self._contacts_context)
 
 
 Viewpoint = tuple[tuple[float, float, float], tuple[float, float, float]]

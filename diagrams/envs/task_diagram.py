@@ -116,6 +116,7 @@ class TaskDiagram:
         push: Function that displaces the measured pose; its arguments are the root context and the displacement (O,).
             None if the robot cannot be pushed.
         query: Query port of the scene, for a browser view.
+        contact_results: Port of the plant's contact results, for a browser view.
         view: Browser view of an environment made with `render_mode="human"`.
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
         near_symmetry: `symmetry`, extended by symmetries that hold only for most of an episode.
@@ -135,6 +136,7 @@ class TaskDiagram:
     randomize: Callable[[Context, np.random.Generator, Mapping[str, Any]], dict[str, Any]] = lambda *_: {}
     push: Callable[[Context, np.ndarray], None] | None = None
     query: OutputPort | None = None
+    contact_results: OutputPort | None = None
     view: View | None = None
     symmetry: Symmetry | None = None
     near_symmetry: Symmetry | None = None

@@ -1,5 +1,7 @@
 """Trace of an episode: commands, measurements and rewards of every control step, and their statistics."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -74,6 +76,14 @@ class EpisodeTrace:
     def clear(self) -> None:
         """Delete all control steps."""
         self._length = 0
+
+    def assign(self, other: EpisodeTrace) -> None:
+        """Replace the control steps by those of a trace of the same task."""
+        self._length = len(other)
+        for name in ("commanded", "measured", "force", "reward"):
+            getattr(self, name)[:] = getattr(other, name)
+        for name, values in self.signals.items():
+            values[:] = other.signals[name]
 
     def append(
         self,

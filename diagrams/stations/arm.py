@@ -22,8 +22,8 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     Station,
     add_workcell_plant,
+    exact_periods,
     export_simulation_ports,
-    whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
@@ -208,8 +208,8 @@ class ArmStation(Station):
         end_effector = find_end_effector(end_effector)
         if time_step is None:
             time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
+        control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
-        whole_multiple(control_period, time_step)
         self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)
         self.plant, self.scene_graph, self.arm = add_workcell_plant(
             builder, workcell, time_step, lambda plant: add_arm(plant, workcell, robot, end_effector)

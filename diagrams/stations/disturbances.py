@@ -28,7 +28,7 @@ from guiderail.systems.command_disturbance import CommandDisturbance
 from guiderail.systems.sensor_disturbance import SensorDisturbance
 from guiderail.systems.wrench_tare import WrenchTare
 
-SIMULATION_PORTS = ("query", "body_poses")
+SIMULATION_PORTS = ("query", "body_poses", "contact_results")  # those that a station has
 EXACT_WRENCH = "exact_wrench"
 """Port of the wrench without sensor errors, (6,)."""
 
@@ -81,7 +81,7 @@ class DisturbedStation(Station):
             max_wrench=station.GetInputPort("max_wrench") if station.HasInputPort("max_wrench") else None,
             **outputs,
         )
-        for name in SIMULATION_PORTS:
+        for name in filter(station.HasOutputPort, SIMULATION_PORTS):
             builder.ExportOutput(station.GetOutputPort(name), name)
         builder.ExportOutput(exact, EXACT_WRENCH)
         builder.BuildInto(self)

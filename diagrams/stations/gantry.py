@@ -31,9 +31,9 @@ from guiderail.diagrams.stations.station import (
     Station,
     add_workcell_plant,
     check_pose,
+    exact_periods,
     export_simulation_ports,
     set_at_rest,
-    whole_multiple,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
@@ -109,8 +109,8 @@ class GantryStation(Station):
         is_joint = impedance_control == "joint"
         if time_step is None:
             time_step = PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD
+        control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
-        whole_multiple(control_period, time_step)
         if not is_joint:
             _check_time_step(impedance, time_step)
         self.plant, self.scene_graph, self.gantry = add_workcell_plant(

@@ -21,7 +21,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Integer, Number, Options, Pair, increases, satisfies
@@ -30,7 +29,7 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 
 CONTROL_PERIOD = 4 * round_period(0.005)  # default time between commands [s]
-MAX_HALVINGS = 7  # largest number of halvings of `CONTROL_PERIOD` to a plant's time step
+MAX_SUBSTEPS = 128  # largest number of a plant's time steps in `CONTROL_PERIOD`
 ImpedanceControl = Literal["joint", "cartesian"]
 MAX_CALIBRATION_ERROR = 0.01  # largest error [m], [rad]; a larger one is probably in millimeters or degrees
 MAX_FACTOR = 100.0
@@ -43,22 +42,15 @@ class ContactOptions(Options):
     time_step: Number | None = Field(
         None,
         gt=0,
-        description=f"time step of the plant [s]: {CONTROL_PERIOD:g}, or half, a quarter, an eighth … of it, "
-        "which divides control_period",
+        description="time step of the plant [s], which divides control_period, such as 0.001 or 0.0025",
     )
 
     @field_validator("time_step")
     @classmethod
-    def _part_of_control_period(cls, value: float | None) -> float | None:
-        if value is None:
-            return None
-        halvings = np.log2(CONTROL_PERIOD / value)
-        if abs(halvings - round(halvings)) > 1e-6 or not 0 <= round(halvings) <= MAX_HALVINGS:
-            raise ValueError(
-                f"it is {CONTROL_PERIOD:g} s, or half, a quarter, … of it, at most {MAX_HALVINGS} times halved"
-            )
-        # Multiples of this value are exact: see `round_period`.
-        return CONTROL_PERIOD / 2 ** round(halvings)
+    def _at_least_shortest(cls, value: float | None) -> float | None:
+        if value is not None and value < 0.999 * CONTROL_PERIOD / MAX_SUBSTEPS:
+            raise ValueError(f"it is at least {CONTROL_PERIOD / MAX_SUBSTEPS:.2g} s")
+        return value
 
 
 class ArmOptions(ContactOptions):

@@ -17,6 +17,7 @@ from guiderail.diagrams.stations.station import (
     add_plant,
     check_pose,
     command_timeout,
+    export_scene_ports,
     export_station_ports,
     set_at_rest,
     whole_multiple,
@@ -147,7 +148,7 @@ class PlaneStation(Station):
             saturation=excess.get_output_port(),
             command_timed_out=watchdog.get_command_timed_out_output_port(),
         )
-        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
+        export_scene_ports(builder, self.plant, self.scene_graph)
         builder.BuildInto(self)
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:

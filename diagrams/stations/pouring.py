@@ -12,7 +12,13 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, StateInterpolatorWithDiscreteDerivative
 
 from guiderail.diagrams.stations.registry import register_station
-from guiderail.diagrams.stations.station import ControllerPlant, Station, add_plant, export_station_ports
+from guiderail.diagrams.stations.station import (
+    ControllerPlant,
+    Station,
+    add_plant,
+    export_scene_ports,
+    export_station_ports,
+)
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
@@ -219,7 +225,7 @@ class PouringStation(Station):
             builder.ExportOutput(system.get_relative_poses_output_port(), name)
         builder.ExportOutput(contact_detector.get_collision_output_port(), "collision")
         builder.ExportOutput(contact_detector.get_has_collided_output_port(), "touched")
-        builder.ExportOutput(self.scene_graph.get_query_output_port(), "query")
+        export_scene_ports(builder, self.plant, self.scene_graph)
         builder.BuildInto(self)
 
     def set_mug(self, root_context: Context, X_TMug: RigidTransform) -> None:

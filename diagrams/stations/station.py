@@ -27,8 +27,8 @@ output               size   meaning
 `command_timed_out`  1      1 while commands are missing or not finite, and the last safe pose is held
 ===================  =====  ========================================================================================
 
-A simulated station also has `query` (of the scene graph) and `body_poses` (of the plant), for cameras, rewards and
-terminations.
+A simulated station also has `query` (of the scene graph), and `body_poses` and `contact_results` (of the plant), for
+cameras, rewards, terminations and views; the plane and the pouring station have no `body_poses`.
 
 The orientation of X_TP is Rz(a) Ry(b) Rx(c). T is the target frame of the workcell: the pose is zero when the task is
 done. T is fixed in the world by the *nominal* fixture; offsets of the fixture do not move it.
@@ -39,6 +39,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -50,6 +51,7 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPor
 
 from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
+from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.control.wrench import POSE_ORDER, WrenchBound
@@ -70,6 +72,8 @@ OUTPUTS = ("pose", "wrench", "contact_force", "saturation", "command_timed_out")
 PLANT_PERIOD = CONTROL_PERIOD / 2  # default time step of a plant [s]
 TIME_UNIT = CONTROL_PERIOD / 4  # a control period is a whole multiple of it [s]
 COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; at least two control periods
+
+_FINEST = 2**47  # largest denominator of a time step of which a day's multiples are exact, [1/s]
 
 # Limits of the force along x, y and z as fractions of the limit of its norm. The norm of these fractions is below 1.
 FORCE_SHARES = (0.45, 0.45, 0.75)
@@ -142,6 +146,23 @@ def whole_multiple(control_period: float, unit: float) -> float:
     if number < 1 or abs(number * unit - control_period) > 1e-6:
         raise InputError(f"control_period must be a whole multiple of {unit:g} s, not {control_period:g} s")
     return number * unit
+
+
+def exact_periods(control_period: float, time_step: float) -> tuple[float, float]:
+    """Return a control period and a time step [s] whose multiples are exact in double precision; see `round_period`.
+
+    The control period changes only if its part is not exact, by at most a picosecond for each of its time steps.
+
+    Raises:
+        InputError: If the control period is not a whole multiple of the time step.
+    """
+    whole_multiple(control_period, time_step)
+    count = round(control_period / time_step)
+    exact = Fraction(control_period) / count
+    if exact.denominator <= _FINEST:
+        return control_period, float(exact)
+    step = round_period(control_period / count)
+    return count * step, step
 
 
 def command_timeout(period: float) -> float:
@@ -349,7 +370,13 @@ def export_station_ports(
         builder.ExportOutput(impedance_force, "impedance_force")
 
 
+def export_scene_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
+    """Export the ports that a view of a simulated station draws."""
+    builder.ExportOutput(scene_graph.get_query_output_port(), "query")
+    builder.ExportOutput(plant.get_contact_results_output_port(), "contact_results")
+
+
 def export_simulation_ports(builder: DiagramBuilder, plant: MultibodyPlant, scene_graph: SceneGraph) -> None:
     """Export the ports of simulated stations."""
-    builder.ExportOutput(scene_graph.get_query_output_port(), "query")
+    export_scene_ports(builder, plant, scene_graph)
     builder.ExportOutput(plant.get_body_poses_output_port(), "body_poses")

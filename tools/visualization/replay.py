@@ -15,10 +15,10 @@ from typing import Any, cast
 
 import jinja2
 import numpy as np
-from pydrake.geometry import Rgba, Role
+from pydrake.geometry import Cylinder, Rgba, Role
 from pydrake.systems.framework import Context, EventStatus
 
-from guiderail.diagrams.envs.scene import Scene, in_plane
+from guiderail.diagrams.envs.scene import NEWTONS_PER_METER, Scene, contact_forces, in_plane
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import is_task_folder
 from guiderail.models.common.errors import InputError
@@ -37,10 +37,13 @@ _LOGGER = logging.getLogger(__name__)
 POINTS = 400  # largest number of samples of an episode, about the width of a page in pixels
 VISUALIZER_PATH = "/drake/visualizer"  # path of Drake's visualizer in Meshcat's scene tree
 DIGITS = 5  # significant digits of a plotted number
+CONTACTS = 8  # largest number of contacts whose forces are drawn, those with the largest forces
+CONTACT_PATH = "/guiderail/contact"  # path of their lines in Meshcat's scene tree
+CONTACT_RADIUS = 0.001  # radius of a line [m]
 
 
 class MotionRecorder(EnvCallback):
-    """Recorder of the poses of all visible bodies and of the actions at every control step.
+    """Recorder of the poses of all visible bodies, the contacts and the actions at every control step.
 
     The recorder replaces the simulator's monitor.
     """
@@ -51,7 +54,9 @@ class MotionRecorder(EnvCallback):
         self._query = self.base.task.query
         self._system = self._query.get_system()
         self._period = self.base.task.control_period
+        self._contact_results = self.base.task.contact_results
         self._poses: list[np.ndarray] = []
+        self._contacts: list[np.ndarray] = []  # points and forces, (CONTACTS, 6) each
         self._actions: list[np.ndarray] = []
         inspector = self._eval_query(self.base.simulator.get_context()).inspector()
         self._frames = {
@@ -74,6 +79,7 @@ class MotionRecorder(EnvCallback):
     def data(self) -> dict[str, Any]:
         """Return the episode as numbers for a page: `times` [s], `frames`, and the signals at those times.
 
+        `contacts` has the points [m] and forces [N] of up to `CONTACTS` contacts, (n, 6) each in the same encoding.
         `frames` maps each body's path in Meshcat's scene tree to its poses (n, 7), [x, y, z, qw, qx, qy, qz] as float32
         in base64; a body that never moved has a single pose. To preserve peaks, forces [N] and violations are the
         largest since the previous sample. Violations are None without constraints. `time` is in percent of the longest
@@ -96,6 +102,7 @@ class MotionRecorder(EnvCallback):
         data = {
             "times": [0.0, *(round(float(t), 4) for t in trace.period * (ends + 1))],
             "frames": {path: _encode(poses[:, i]) for i, path in enumerate(self._frames)},
+            "contacts": [_encode(values) for values in self._drawn_contacts(np.append(0, ends + 1))],
             "force": largest(trace.force),
             "commanded": largest(signals["commanded_violation"]),
             "measured": largest(signals["measured_violation"]),
@@ -106,6 +113,11 @@ class MotionRecorder(EnvCallback):
             data["state"] = _with_first(signals["state"].ravel()[ends])
         return data
 
+    def _drawn_contacts(self, samples: np.ndarray) -> np.ndarray:
+        """Return points and forces of contacts at samples (n,), (k, n, 6), without contacts that never have a force."""
+        contacts = np.array(self._contacts).reshape(-1, CONTACTS, 6)[samples[samples < len(self._contacts)]]
+        return contacts.transpose(1, 0, 2)[contacts.any(axis=(0, 2))]
+
     def _eval_query(self, root: Context) -> Any:
         return self._query.Eval(self._system.GetMyContextFromRoot(root))
 
@@ -114,12 +126,17 @@ class MotionRecorder(EnvCallback):
         time = root.get_time()
         if time == 0.0:
             self._poses.clear()
+            self._contacts.clear()
         # The tolerance is far smaller than a simulation step, and far larger than rounding errors.
         if time > len(self._poses) * self._period - 1e-6:
             query = self._eval_query(root)
             poses = [query.GetPoseInWorld(frame) for frame in self._frames.values()]
             numbers = [[*X.translation(), *X.rotation().ToQuaternion().wxyz()] for X in poses]
             self._poses.append(np.array(numbers))
+            if self._contact_results is not None:
+                station = self._contact_results.get_system()
+                found = contact_forces(self._contact_results.Eval(station.GetMyContextFromRoot(root)))[:CONTACTS]
+                self._contacts.append(np.pad(found, ((0, CONTACTS - len(found)), (0, 0))))
         return EventStatus.DidNothing()
 
 
@@ -134,7 +151,7 @@ def violation_unit(constraints: LinearConstraints | None, outputs: int) -> tuple
 
 
 def _encode(poses: np.ndarray) -> str:
-    """Return poses (n, 7) as float32 in base64; the first pose alone if all are equal."""
+    """Return poses (n, 7) or contacts (n, 6) as float32 in base64; the first one alone if all are equal."""
     poses = poses.astype("<f4")
     return base64.b64encode((poses[:1] if (poses == poses[0]).all() else poses).tobytes()).decode()
 
@@ -153,7 +170,7 @@ TRANSPARENT_OPACITY = 0.35  # opacity of bodies when the page shows them transpa
 EPISODES = 4  # number of held-out episodes
 
 GRAY, BLACK = (0.55, 0.55, 0.6, 0.8), (0.1, 0.1, 0.1, 1.0)
-GREEN, RED = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0)
+GREEN, RED, ORANGE = (0.1, 0.65, 0.25, 1.0), (0.85, 0.1, 0.1, 1.0), (0.95, 0.55, 0.0, 1.0)
 PALE_OPACITY = 0.3  # opacity of the paths of episodes that are not selected
 
 
@@ -210,7 +227,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     }
     _LOGGER.info("simulating held-out episodes (%d) before and after learning, then writing %s", episodes, html)
     motion = MotionRecorder(env)
-    rows, recorded = [], []
+    rows: list[dict[str, Any]] = []
+    recorded: list[dict[str, Any]] = []
     for side, act in sides.items():
         side_episodes = []
         for index in range(episodes):
@@ -228,6 +246,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     ):
         for index, points in enumerate(lines):
             _draw(meshcat, f"/guiderail/{name}/{index}", points, radius, color)
+    for index in range(max(len(each["contacts"]) for side in recorded for each in side["episodes"])):
+        meshcat.SetObject(f"{CONTACT_PATH}/{index}", Cylinder(CONTACT_RADIUS, 1.0), Rgba(*ORANGE))
     for item in ("/Grid", "/Axes"):
         meshcat.SetProperty(item, "visible", False)
     views = dict(scene.arm_views) if episode.environment.get("station") == "arm" else {}
@@ -238,6 +258,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     data = {
         "sides": recorded,
         "violation": {"unit": unit, "scale": scale},
+        "contact_path": CONTACT_PATH,
+        "newtons_per_meter": NEWTONS_PER_METER,
         "states": [state.name for state in task.template().template.states] if has_template else [],
         "pale_opacity": PALE_OPACITY,
         "transparent_opacity": TRANSPARENT_OPACITY,
@@ -246,6 +268,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     env.close()
     legend = [(_css(GRAY), "demonstrations")] * bool(scene.demonstrations)
     legend += [(_css(RED), "the constraint")] * bool(len(scene.constraint))
+    has_contacts = any(each["contacts"] for side in recorded for each in side["episodes"])
+    legend += [(_css(ORANGE), f"forces of contacts, {NEWTONS_PER_METER / 100:g} N per 10 mm")] * has_contacts
     caption = TEMPLATE.render(
         heading=episode.heading,
         sides=sides,

@@ -90,6 +90,41 @@ def test_hardware_period_is_a_multiple_of_the_drivers():
         whole_multiple(0.0125, station.period)
 
 
+@pytest.mark.parametrize("milliseconds", [0.5, 1.0, 2.0, 2.5, 4.0, 20 / 3])
+@pytest.mark.parametrize("station", ["gantry", "arm"])
+def test_plant_has_equal_numbers_of_steps_in_all_control_periods(station, milliseconds):
+    env = make_env("GridClamp", guidance="sct", station=station, time_step=1e-3 * milliseconds, action_repeat=1)
+    env.reset(seed=0)
+    inner = env.task.diagram.GetSubsystemByName("station")
+    count, times = round(20 / milliseconds), []
+    env.simulator.set_monitor(lambda context: times.append(context.get_time()))
+    assert env.task.control_period == count * inner.plant.time_step() == pytest.approx(0.02, abs=1e-9)
+    for _ in range(7):
+        env.step(np.zeros(3))
+    assert times == [index * inner.plant.time_step() for index in range(1, 7 * count + 1)]
+
+
+@pytest.mark.parametrize(("control_period", "time_step"), [(0.1, 0.001), (0.03, 0.003), (0.05, 0.002)])
+def test_control_period_is_a_multiple_of_any_time_step(control_period, time_step):
+    env = make_env("BncConnector", guidance="kgrl", control_period=control_period, time_step=time_step)
+    env.reset(seed=0)
+    env.step(np.zeros(env.action_space.shape))
+    assert env.simulator.get_context().get_time() == env.action_repeat * env.task.control_period
+
+
+@pytest.mark.parametrize(
+    ("time_step", "message"),
+    [
+        (0.003, r"whole multiple of 0\.003 s, not 0\.02 s"),
+        (0.04, r"whole multiple of 0\.04 s"),
+        (1e-5, r"at least 0\.00016 s"),
+    ],
+)
+def test_time_step_is_refused_when_it_does_not_divide_the_period(time_step, message):
+    with pytest.raises(InputError, match=message):
+        make_env("GridClamp", guidance="sct", time_step=time_step)
+
+
 @pytest.mark.parametrize("invalid", [0.0, -0.01, np.nan, np.inf])
 def test_whole_multiple_is_refused_when_not_positive(invalid):
     for period, unit in ((invalid, 0.01), (0.02, invalid)):

@@ -178,3 +178,21 @@ def test_write_page_refuses_an_ending_before_the_episodes(name, tmp_path):
     with pytest.raises(InputError, match="a page is"):
         write_page(tmp_path / name, spec)
     assert (tmp_path / "policy.safetensors").read_text() == "weights"
+
+
+def test_motion_has_the_contacts_of_a_pressed_tool():
+    env = make_environment(
+        "GridClamp", check_environment("GridClamp", {"guidance": "sct", "action_repeat": 5}), render_mode="human"
+    )
+    env.unwrapped.simulator.set_target_realtime_rate(0.0)
+    motion = MotionRecorder(env)
+    rollout(env, constant_policy(env, np.array([0.3, 0.0, -1.0])), motion, seed=0)
+    data = motion.data()
+    contacts = [np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 6) for text in data["contacts"]]
+    assert 1 <= len(contacts) <= replay.CONTACTS
+    assert {len(values) for values in contacts} == {len(data["times"])}
+    forces = np.linalg.norm(np.array(contacts)[..., 3:], axis=2)
+    assert (np.diff(forces, axis=0) <= 0.0).all()  # the largest first
+    assert forces[0, 0] == 0.0  # no contact at the start
+    assert 0.5 < forces.max() < 100.0
+    env.close()

@@ -23,7 +23,7 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     Station,
     check_pose,
-    whole_multiple,
+    exact_periods,
 )
 from guiderail.diagrams.stations.workcell import ConvexWorkcell, Workcell
 from guiderail.diagrams.wiring import add_system
@@ -219,8 +219,9 @@ class MujocoStation(Station):
                 the time step.
         """
         super().__init__()
-        time_step, self.control_period = PLANT_PERIOD if time_step is None else time_step, control_period
-        whole_multiple(control_period, time_step)
+        time_step = PLANT_PERIOD if time_step is None else time_step
+        control_period, time_step = exact_periods(control_period, time_step)
+        self.control_period = control_period
         if not isinstance(workcell, ConvexWorkcell):
             raise InputError(
                 f"station='mujoco' needs convex solids, which {type(workcell).__name__} does not provide: "

@@ -13,7 +13,7 @@ import yaml
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
-from guiderail.diagrams.stations.options import ContactOptions
+from guiderail.diagrams.stations.options import CONTROL_PERIOD, ContactOptions
 from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.options import COLLISION_FORCE, REPEATABILITY_STD, PriorOptions
 from guiderail.models.common.errors import InputError, brief
@@ -327,6 +327,8 @@ class PartTaskFile(Options):
     @field_validator("time_step")
     @classmethod
     def _check_time_step(cls, value: float | None) -> float | None:
+        if value is not None and abs(CONTROL_PERIOD / value - round(CONTROL_PERIOD / value)) > 1e-6:
+            raise ValueError(f"it divides the control period of {CONTROL_PERIOD:g} s, such as 0.0025")
         return ContactOptions(time_step=value).time_step
 
     @field_validator("tolerance")
