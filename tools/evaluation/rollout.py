@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -14,6 +15,16 @@ import numpy as np
 
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
+from guiderail.tools.contract import checked_reset, checked_step
+from guiderail.tools.spaces import (
+    describe_space,
+    from_tensors,
+    has_layout,
+    has_values,
+    layout,
+    probes,
+    takes_observations,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -92,6 +103,10 @@ def check_seed(seed: object) -> int:
 
 def has_image(space: Any) -> bool:
     """Return True if the observations of a space are images, or contain an image."""
+    if isinstance(space, gymnasium.spaces.Dict):
+        return any(map(has_image, space.spaces.values())) or hasattr(space, "image_shape")
+    if isinstance(space, gymnasium.spaces.Tuple):
+        return any(map(has_image, space.spaces))
     return len(space.shape or ()) == 3 or hasattr(space, "image_shape")
 
 
@@ -122,8 +137,8 @@ def rollout(
 
     Raises:
         InputError: If `env` is no environment, `act` is no policy, the seed is invalid, the reset is refused, an action
-            is invalid, the reward of an environment of another package is NaN, or a callback returns wrong columns
-            (`new_columns`).
+            is invalid, an environment of another package raises an exception or breaks Gymnasium's contract
+            (`checked_step`), or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
     from guiderail.tools.evaluation.policies import as_policy
@@ -140,7 +155,9 @@ def rollout(
     if held_out:  # an environment of another package has no such option: its conditions depend on the seed
         seed = seed or 0
         reset_options = {"held_out": True, **(reset_options or {})} if is_own else reset_options or None
-    observation, _ = env.reset(seed=seed, options=reset_options)
+    reset = env.reset if is_own else partial(checked_reset, env)
+    step = env.step if is_own else partial(checked_step, env)
+    observation, _ = reset(seed=seed, options=reset_options)
     if isinstance(act, Callback) and act not in callbacks:
         callbacks = (act, *callbacks)
     for callback in callbacks:
@@ -149,12 +166,10 @@ def rollout(
     infos: list[Mapping[str, Any]] = []  # `info` of each step, for an environment without a trace
     is_over = False
     while not is_over:
-        action, privileged = _without_batch(act(observation), env), getattr(base, "privileged", None)
+        action, privileged = as_action(act(observation), env), getattr(base, "privileged", None)
         if not is_own:
             _check_action(action, env)
-        next_observation, reward, terminated, truncated, info = env.step(action)
-        if not is_own and math.isnan(reward):
-            raise InputError("the environment returned NaN as reward: a reward is a number")
+        next_observation, reward, terminated, truncated, info = step(action)
         transition = Transition(
             observation, action, float(reward), next_observation, terminated, truncated, info,
             privileged, getattr(base, "privileged", None),
@@ -176,34 +191,29 @@ def rollout(
     return row
 
 
-def _without_batch(action: Any, env: gymnasium.Env) -> Any:
-    """Return the only row of an action (1, A) in an environment with actions (A,), and any other action unchanged."""
-    shape = env.action_space.shape
+def as_action(action: Any, env: gymnasium.Env) -> Any:
+    """Return a policy's result as an action: tensors become arrays, and an action (1, A) becomes (A,) if that fits.
+
+    Raises:
+        InputError: If a tensor cannot be converted.
+    """
+    action, shape = from_tensors(action), env.action_space.shape
     return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
 
 
 def _check_action(action: Any, env: gymnasium.Env) -> None:
-    """Raise an InputError if an action has another shape than the action space, or is outside a discrete space."""
+    """Raise an InputError if an action does not have the layout of the action space, or is outside a discrete space."""
     space = env.action_space
-    expected = space.shape
-    try:
-        shape = np.shape(action)
-    except ValueError:  # ragged
-        shape = None
-    if expected is not None and (shape != expected or action is None):
+    if not has_layout(action, space):
         raise InputError(
-            f"the policy returned {brief(action)}, and the actions of this environment have the shape {expected}"
+            f"the policy returned {brief(action)}, and the actions of this environment have the shape "
+            f"{describe_space(space) if space.shape is None else space.shape}"
         )
-    if isinstance(space, gymnasium.spaces.Discrete):
-        try:
-            is_inside = bool(0 <= action - space.start < space.n)
-        except TypeError:  # not a number
-            is_inside = False
-        if not is_inside:
-            last = space.start + space.n - 1
-            raise InputError(
-                f"the policy returned {brief(action)}, and the actions of this environment are {space.start} to {last}"
-            )
+    if not has_values(action, space):
+        values = describe_space(space)
+        if isinstance(space, gymnasium.spaces.Discrete):
+            values = f"{space.start} to {space.start + space.n - 1}"
+        raise InputError(f"the policy returned {brief(action)}, and the actions of this environment are {values}")
 
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -233,7 +243,7 @@ class Paths(EnvCallback):
 
 
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's observations and actions have the shapes of the environment's; see `has_same_shapes`.
+    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
 
     Raises:
         InputError: If `make_policy` returns no function.
@@ -243,27 +253,27 @@ def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasi
         raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
     try:
         return has_same_shapes(act, env)
-    except (IndexError, ValueError):
+    except (IndexError, TypeError, ValueError):
         return False
 
 
 def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
     """Return True if the policy's actions for several observations have the shape of the environment's actions.
 
-    The policy is called with 21 constant observations from −1 to 1, because a scripted policy may read some components
-    only for certain values of the others. An object with `predict` is not called if it declares both shapes. Otherwise
-    a deep copy of the object is called, if it can be copied. An exception of the policy is not caught.
+    The policy is called with the observations of `probes`. An object with `predict` is not called if it declares both
+    spaces. Otherwise a copy of a policy of another library is called, if it can be copied, so that its internal state
+    does not change. An exception of the policy is not caught.
     """
-    from guiderail.tools.evaluation.policies import PredictPolicy
+    from guiderail.tools.evaluation.policies import ForeignPolicy
 
-    shape = env.observation_space.shape or ()
-    if isinstance(act, PredictPolicy):
-        if act.observation_shape is not None and act.action_shape is not None:
-            return (act.observation_shape, act.action_shape) == (env.observation_space.shape, env.action_space.shape)
+    if isinstance(act, ForeignPolicy):
+        if act.observation_space is not None and act.action_space is not None:
+            is_known = layout(act.action_space) == layout(env.action_space)
+            return is_known and takes_observations(act.observation_space, env.observation_space)
         act = act.copy()
-    observations = (np.full(shape, value, np.float32) for value in np.linspace(-1.0, 1.0, 21))
-    shapes = {np.shape(_without_batch(act(observation), env)) for observation in observations}
-    return shapes == {env.action_space.shape}
+    return all(
+        has_layout(as_action(act(observation), env), env.action_space) for observation in probes(env.observation_space)
+    )
 
 
 WINDOW = 10  # default number of last episodes over which success and return are averaged

@@ -79,7 +79,7 @@ def test_rollout_accepts_models_and_refuses_invalid_arguments(change, message):
 
 def test_reward_that_is_not_a_number_is_refused():
     env = gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), lambda reward: float("nan"))
-    with pytest.raises(InputError, match="the environment returned NaN as reward"):
+    with pytest.raises(InputError, match="the environment returned nan as reward"):
         rollout(env, lambda observation: 0, seed=0)
 
 
