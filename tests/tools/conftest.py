@@ -1,13 +1,1 @@
-import pytest
-from bead_runs import _bead_run, bead_config, bead_run  # noqa: F401
-
-
-@pytest.fixture(autouse=True, scope="session")
-def simplify_pictures():
-    """Omit the layout of labels, half of the time of a picture, and show one episode on the page of a run."""
-    from guiderail.tools.visualization import replay, style
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(style, "LAYOUT", None)
-        patch.setattr(replay, "EPISODES", 1)
-        yield
+from bead_runs import _bead_run, bead_config, bead_run, simplify_pictures  # noqa: F401
