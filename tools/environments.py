@@ -63,8 +63,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     """Return a digest of the files that a task consists of; "" if all of them belong to installed packages.
 
     The digest covers the task folder and the imported files. It also covers the files that an option of the environment
-    names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names, such
-    as a base policy. Relative paths are skipped; `import_modules` returns absolute ones.
+    names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names.
+    Relative paths are skipped; `import_modules` returns absolute ones.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.

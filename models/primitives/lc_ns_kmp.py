@@ -236,7 +236,7 @@ class LcNsKmp:
         null_space_action: np.ndarray | None = None,
         history: np.ndarray | None = None,
     ) -> Prediction:
-        """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
+        """Compute the output at a step from a given window, such as that of a reference system; nothing is cached.
 
         Args:
             step: As in `predict`; it selects the constraints and the times of the window.
