@@ -105,6 +105,6 @@ def test_registration_refuses_an_object_that_is_not_callable():
 def test_study_refuses_an_engine_that_is_none(monkeypatch):
     monkeypatch.setattr(ENGINES, "_entries", dict(ENGINES._entries))
     monkeypatch.setattr(ENGINES, "_origins", dict(ENGINES._origins))
-    register_engine("lab", lambda *arguments: None)
+    register_engine("lab", lambda *arguments, **options: None)
     with pytest.raises(InputError, match="the engine 'lab' must be an Engine, not None"):
         make_engine("lab")
