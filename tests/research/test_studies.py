@@ -6,7 +6,7 @@ from guiderail.tools.evaluation.metrics import statistics_of
 from guiderail.tools.imports import import_modules
 from guiderail_studies.declaration import load_study
 from guiderail_studies.job import Job, check_job
-from research.studies import study_names
+from research.studies import study_names, study_path
 
 
 @pytest.mark.parametrize("name", study_names())
