@@ -111,3 +111,9 @@ def test_base_policy_of_a_function_is_stored_with_path_and_code(tmp_path, monkey
     before = task_content("NarrowPassage", environment, ())
     file.write_text(file.read_text().replace("zeros", "ones"))
     assert task_content("NarrowPassage", environment, ()) != before
+
+
+def test_registration_refuses_an_object_that_is_not_callable():
+    with pytest.raises(InputError, match="registered with a function or a class, not with 3"):
+        BASE_POLICIES.register("lab", 3)
+    assert "lab" not in BASE_POLICIES.names()
