@@ -1,5 +1,6 @@
 """ROS 2 bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
 
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -15,15 +16,21 @@ POSE = "geometry_msgs/msg/Pose"
 ARRAY = "std_msgs/msg/Float64MultiArray"
 
 
+@cache
+def typestore():
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
 def write(path, kind, make, values, topic="/topic"):
     """Write a bag with a message for each of `values`; return its path.
 
     `make` returns a message from the message types by short name and a value.
     """
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typestore()
     types = {name.split("/")[-1]: message_type for name, message_type in store.types.items()}
     with Writer(path, version=8) as writer:
         connection = writer.add_connection(topic, kind, typestore=store)
@@ -161,9 +168,7 @@ def test_bag_export_refuses_time_out_of_range(times, message, tmp_path):
 @pytest.mark.parametrize("size", [1, 3, 6, 7])
 def test_array_without_labels_is_refused_unless_named(topic, size, tmp_path):
     bag = write(tmp_path / "bag", ARRAY, array, [np.arange(size) + n for n in range(3)], topic)
-    with pytest.raises(
-        InputError, match="(have no labels and do not state what they are|states changes, rates or forces)"
-    ):
+    with pytest.raises(InputError, match=r"have no labels|states changes, rates or forces"):
         read_bags(bag, None, None)
     named = read_bags(bag, topic, None)
     assert named.names == tuple(f"output {number}" for number in range(size))
@@ -178,7 +183,7 @@ def test_array_is_refused_when_its_labels_change(tmp_path):
         )
 
     bag = write(tmp_path / "bag", ARRAY, labeled, ["xyz", "xyz", "zyx"])
-    with pytest.raises(InputError, match="message 2 on /topic of .* has other labels"):
+    with pytest.raises(InputError, match=r"message 2 on /topic of .* has other labels"):
         read_bags(bag, None, None)
 
 
@@ -226,7 +231,7 @@ KINDS = {
 FRAMES = [("base_link", "tool"), ("world", "tool"), ("", "tool"), ("base_link", "camera")]
 
 
-@pytest.mark.parametrize(("kind", "second"), product(KINDS, range(len(FRAMES))))
+@pytest.mark.parametrize(("kind", "second"), list(product(KINDS, range(len(FRAMES)))))
 @pytest.mark.parametrize("target", [None, (0.5, 0.0, 0.2, 0.0, 0.0, 0.0)])
 @pytest.mark.parametrize("is_within", [True, False])
 def test_poses_in_different_frames_are_refused(kind, second, target, is_within, tmp_path):

@@ -65,9 +65,9 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
 
     Raises:
         InputError: If a bag cannot be read, or no single topic can be chosen. Also if a topic has several publishers,
-            fewer than two messages, more than `MAX_LINES`, or messages of different sizes, labels, joints or frames. Also
-            if an array has no labels and `topic` is None; if `target` is given for a topic without poses; or if the
-            outputs or frames of two bags differ.
+            fewer than two messages, more than `MAX_LINES`, or messages of different sizes, labels, joints or frames.
+            Also if an array has no labels and `topic` is None; if `target` is given for a topic without poses; or if
+            the outputs or frames of two bags differ.
         MissingExtraError: If rosbags is not installed.
     """
     recorded = Recorded([], [], ())
