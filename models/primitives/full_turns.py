@@ -20,6 +20,7 @@ _ANGLE_NAMES = {
     ("rz", "ry", "rx"): "euler_zyx",
     ("r_x", "r_y", "r_z"): "rotation_vector",
 }
+# Unit at the end of an output's name.
 _DEGREES = re.compile(
     r"(?:[\[(]\s*(?:deg|degrees?|\u00b0)\s*[\])]|_deg)\s*$", re.IGNORECASE
 )  # unit of an output's name
@@ -32,7 +33,8 @@ _MAX_ROTATION = 1.0  # largest rotation between two samples at which a change of
 def orientation_of_names(names: Sequence[str]) -> Orientation | None:
     """Return the representation of the orientation in six outputs with the given names.
 
-    An orientation in degrees is refused, because all guidance computes with radians. Names of orientations are those of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
+    An orientation in degrees is refused, because all guidance computes with radians. Names of orientations are those
+    of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
     `guiderail dataset import` writes them. The result is None for other names and for another number of names.
     """
     plain = _plain([_DEGREES.sub("", name) for name in names])
