@@ -30,10 +30,10 @@ _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 _REGULARIZATIONS = (1.0, 0.1, 0.01)
 _COMPONENTS = (3, 5, 8, 12, 18, 26, 36, 50)  # numbers of mixture components to try
 _EVALUATED = 40  # number of steps at which candidates are compared
-# Motions with more steps are long: their mixture is fitted to fewer steps, at least four for each component, and the
-# final share is computed at fewer steps. A hand moves too slowly for more steps to add information.
-_LONG = 400
-_MIXTURE_STEPS = 200
+LONG = 400
+"""Largest number of steps at which a mixture is fitted to all steps."""
+# Number of evenly spaced steps, at least four for each component, to which the mixture of a long motion is fitted.
+_MIXTURE_STEPS = 150
 
 
 @dataclass(frozen=True)
@@ -126,11 +126,12 @@ def fit(
     times, outputs = resampled.times[0], np.stack(resampled.outputs)
     if len(times) < 4 * _COMPONENTS[0]:
         raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
-    counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(times) // 4]
-    say = log or (lambda text: None)
-    largest = max((count for count in counts if is_whole(count, 1)), default=1)
-    mixture_steps = max(_MIXTURE_STEPS, 4 * largest) if len(times) > _LONG else None
+    mixture_steps = None
+    if len(times) > LONG:
+        mixture_steps = max(_MIXTURE_STEPS, 4 * components if is_whole(components, 1) else 0)
     at = thinned(len(times), mixture_steps)
+    counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(at) // 4]
+    say = log or (lambda text: None)
     say(f"fitting mixtures of {', '.join(map(str, counts))} components to {len(at)} of {len(times)} steps")
     criteria = information_criteria(times[at], outputs[:, at], counts, seed)
     components = min(criteria, key=lambda count: criteria[count])
@@ -153,6 +154,9 @@ def fit(
         reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon, max_deviation=np.inf
     )
     share = share_within_spread(primitive)
+    thinning = ""
+    if len(at) < len(times):
+        thinning = f" The mixture was fitted to {len(at)} evenly spaced steps of {len(times)}."
     return Selection(
         reference=reference,
         components=components,
@@ -163,10 +167,7 @@ def fit(
         share=share,
         criteria=criteria,
         candidates=candidates,
-        why=_explain(components, criteria, selected, candidates, share, times)
-        + (
-            f" The mixture was fitted to {len(at)} evenly spaced steps of {len(times)}." if len(at) < len(times) else ""
-        ),
+        why=_explain(components, criteria, selected, candidates, share, times) + thinning,
     )
 
 
@@ -177,8 +178,8 @@ def share_within_spread(primitive: LcNsKmp) -> float:
     is too wide for the demonstrations or the regularization is too strong; `fit` selects both. Of a long motion without
     a history, 400 evenly spaced steps are evaluated.
     """
-    if not primitive.history and primitive.reference.num_steps > _LONG:
-        steps = thinned(primitive.reference.num_steps, _LONG)
+    if not primitive.history and primitive.reference.num_steps > LONG:
+        steps = thinned(primitive.reference.num_steps, LONG)
         motion = np.array([primitive.predict(step, None, None).output for step in steps.tolist()])
         return float(_within(primitive.reference, motion, steps).mean())
     return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
