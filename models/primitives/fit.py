@@ -128,7 +128,8 @@ def fit(
         raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
     mixture_steps = None
     if len(times) > LONG:
-        mixture_steps = max(_MIXTURE_STEPS, 4 * components if is_whole(components, 1) else 0)
+        is_given = components is not None and is_whole(components, 1)
+        mixture_steps = max(_MIXTURE_STEPS, 4 * int(components or 0)) if is_given else _MIXTURE_STEPS
     at = thinned(len(times), mixture_steps)
     counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(at) // 4]
     say = log or (lambda text: None)

@@ -235,8 +235,8 @@ def _read(
             f"poses stay in {frame}: to convert them, give the pose of the task's target in it as --target"
         )
     used = (*clock, *position, *orientation)
-    left = [column for column in columns if column.name and not any(column is other for other in used)]
-    if left := [column.name for column in left if not column.frame]:
+    unused = [column for column in columns if column.name and not any(column is other for other in used)]
+    if left := [column.name for column in unused if not column.frame]:
         assumptions.append(f"{_listed(left)} {'is' if len(left) == 1 else 'are'} left out")
     if rotations is None:
         return Recorded([times], [positions], POSE_NAMES[:3], assumptions, frames)
@@ -515,7 +515,7 @@ def _rotations(
     if len(kuka) == len(_KUKA):
         units = [unit or "deg" for unit in _units(file, kuka, _ANGLE_UNITS, angles, "--angles")]
         assumptions.append(f"A, B and C are the angles of a KUKA [{units[0]}], Rz(A) Ry(B) Rx(C)")
-        scales = [_ANGLE_UNITS[unit] for unit in units]
+        scales = [_ANGLE_UNITS[str(unit)] for unit in units]
         return kuka, Rotation.from_euler("ZYX", np.column_stack([column.values for column in kuka]) * scales)
     return [], None
 
