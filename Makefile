@@ -6,7 +6,8 @@ OUTSIDE := .venv-outside
 # Distributions of this repository, installed together: the core and its siblings require each other.
 SIBLINGS := hardware parts studies data lerobot mujoco
 EDITABLE := $(SIBLINGS:%=-e packages/%)
-# Meshcat and LCM use this machine's network only.
+# Meshcat and LCM use this machine's network only. Without package_map, Drake's Parser(plant) refuses its remote package
+# drake_models, whose files it would download: `make TARGET DRAKE_ALLOW_NETWORK=meshcat:lcm:package_map` permits it.
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 

@@ -16,6 +16,7 @@ from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor
 from .external_torque_sensor import JointTorqueErrors as JointTorqueErrors
 from .force_monitor import ForceMonitor as ForceMonitor
 from .function_guidance_system import FunctionGuidanceSystem as FunctionGuidanceSystem
+from .gripper_command import GripperCommand as GripperCommand
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
 from .image_observation import ImageObservation as ImageObservation
@@ -26,6 +27,7 @@ from .measured_pose import MeasuredPose as MeasuredPose
 from .phase_wrench_limit import PhaseWrenchLimit as PhaseWrenchLimit
 from .policy_system import PolicyError as PolicyError
 from .policy_system import PolicySystem as PolicySystem
+from .pose_from_transform import PoseFromTransform as PoseFromTransform
 from .pose_wrench import PoseWrench as PoseWrench
 from .progress_clock import ProgressClock as ProgressClock
 from .recorder import Recorder as Recorder
@@ -39,5 +41,8 @@ from .safety_filter import SafetyFilter as SafetyFilter
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
 from .sensor_disturbance import SensorDisturbance as SensorDisturbance
+from .spatial_force_from_wrench import SpatialForceFromWrench as SpatialForceFromWrench
+from .transform_from_pose import TransformFromPose as TransformFromPose
+from .wrench_from_spatial_force import WrenchFromSpatialForce as WrenchFromSpatialForce
 from .wrench_sensor import WrenchSensor as WrenchSensor
 from .wrench_tare import WrenchTare as WrenchTare

@@ -37,6 +37,7 @@ class ActiveConstraintProjector(LeafSystem):
         - requested_pose
         - pose
         - state
+        - frame_poses (optional)
         output_ports:
         - desired_pose
         - last_desired_pose
@@ -62,7 +63,8 @@ class ActiveConstraintProjector(LeafSystem):
             pose is more than 0.2 m or 1 rad outside of the active constraints.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
+            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
     """
 
     def __init__(
@@ -76,11 +78,11 @@ class ActiveConstraintProjector(LeafSystem):
         if not as_number(max_tracking_error, "max_tracking_error") > 0.0:
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
-        self.frames = TemplateFrames(self, template, frames)
         template.check_consistency()
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
+        self.frames = TemplateFrames(self, template, frames)
 
         # [last command (6,), pose (6,) measured at the same instant]
         self._last = self.DeclareDiscreteState(12)
@@ -98,6 +100,9 @@ class ActiveConstraintProjector(LeafSystem):
     get_requested_pose_input_port = input_getter("requested_pose", "requested pose H^im, (6,)")
     get_pose_input_port = input_getter("pose", "measured pose, (6,)")
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_frame_poses_input_port = input_getter(
+        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
+    )
     get_desired_pose_output_port = output_getter("desired_pose", "command H^ac, (6,), inside the active constraints")
     get_last_desired_pose_output_port = output_getter("last_desired_pose", "previous command, (6,)")
     get_fallback_output_port = output_getter("fallback", "flag that the last safe command is repeated, (1,)")

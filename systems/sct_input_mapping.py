@@ -29,6 +29,7 @@ class SctInputMapping(LeafSystem):
         - action
         - pose
         - state
+        - frame_poses (optional)
         output_ports:
         - requested_pose
 
@@ -44,23 +45,27 @@ class SctInputMapping(LeafSystem):
         InputError: If the period is not positive, or a frame is missing or not finite.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
+            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
         check_period(period)
         self._template, self._period = template, period
-        self.frames = TemplateFrames(self, template, frames)
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
+        self.frames = TemplateFrames(self, template, frames)
         sources = [self._action_port, self._pose_port, self._state_port, self.frames.ticket]
         declare.output(self, "requested_pose", 6, self._requested_pose, sources)
 
     get_action_input_port = input_getter("action", "inputs u of a policy or a user, (n,), in [−1, 1]")
     get_pose_input_port = input_getter("pose", "pose H to displace, (6,)")
     get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_frame_poses_input_port = input_getter(
+        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
+    )
     get_requested_pose_output_port = output_getter("requested_pose", "requested pose H^im, (6,), not constrained")
 
     def _requested_pose(self, context: Context) -> np.ndarray:

@@ -28,6 +28,7 @@ class SctStateMachine(LeafSystem):
         input_ports:
         - pose
         - initial_pose
+        - frame_poses (optional)
         output_ports:
         - state
         - transition_distance
@@ -50,15 +51,16 @@ class SctStateMachine(LeafSystem):
             ``initial_pose`` is not finite.
 
     Attributes:
-        frames: Poses of the template's object frames, parameters that a reset can set.
+        frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
+            connected, the poses of the k frames that it has replace them, for objects that move (`TemplateFrames`).
     """
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
         self._template, self._period = template, period
-        self.frames = TemplateFrames(self, template, frames)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._initial_pose_port = self.DeclareVectorInputPort("initial_pose", 6)
+        self.frames = TemplateFrames(self, template, frames)
         self._state = self.DeclareDiscreteState([float(template.initial_state)])
         self.DeclareStateOutputPort("state", self._state)
         sources = [self._pose_port, self._state, self.frames.ticket]
@@ -72,6 +74,9 @@ class SctStateMachine(LeafSystem):
 
     get_pose_input_port = input_getter("pose", "pose at which transition distances are evaluated, (6,)")
     get_initial_pose_input_port = input_getter("initial_pose", "pose that determines the first state, (6,)")
+    get_frame_poses_input_port = input_getter(
+        "frame_poses", "poses of the template's frames, (6·k,), instead of the parameters; optional"
+    )
     get_state_output_port = output_getter("state", "number of the template's state, (1,)")
     get_transition_distance_output_port = output_getter("transition_distance", "transition distance, (1,) [m or rad]")
     get_progress_output_port = output_getter("progress", "progress in the task, (1,)")

@@ -65,6 +65,9 @@ class ActiveConstraintFilter(Diagram):
         builder.ExportInput(self._projector.get_requested_pose_input_port(), "requested_pose")
         builder.ExportInput(self._projector.get_pose_input_port(), "pose")
         builder.ConnectInput("pose", self._machine.get_initial_pose_input_port())
+        if template.frames:
+            builder.ExportInput(self._projector.get_frame_poses_input_port(), "frame_poses")
+            builder.ConnectInput("frame_poses", self._machine.get_frame_poses_input_port())
         for system, names in (
             (self._projector, ("desired_pose", "fallback", "last_desired_pose")),
             (self._machine, ("state", "transition_distance", "progress")),
@@ -81,6 +84,8 @@ class ActiveConstraintFilter(Diagram):
         # The wrench is unused, but all guidance has this port.
         wrench = builder.AddNamedSystem("wrench", PassThrough(WRENCH_SIZE))
         builder.ExportInput(wrench.get_input_port(), "wrench")
+        if self.HasInputPort("frame_poses"):
+            builder.ExportInput(self.GetInputPort("frame_poses"), "frame_poses")
         builder.ExportOutput(hold.get_output_port(), "held_action")
         names = ("desired_pose", "fallback", "state", "transition_distance", "progress", "measured_violation")
         for name in names:
@@ -99,7 +104,8 @@ class SctGuidance(Guidance):
     ``action`` is (n,), the n inputs of the template, from a policy or a user's input device. ``constraint_violation``
     is the command's largest violation of an active constraint [m] or [rad]; it is 0 inside the constraints, or if they
     are not enforced. In addition to the ports of all guidance there are ``state``, ``transition_distance``,
-    ``progress`` and ``measured_violation``, all (1,).
+    ``progress`` and ``measured_violation``, all (1,). The optional input ``frame_poses`` (6·k,) has the poses of the
+    template's k frames, for objects that move; it is the one source of all subsystems.
     """
 
     def __init__(
@@ -141,6 +147,8 @@ class SctGuidance(Guidance):
         builder.Connect(state, self._mapping.get_state_input_port())
         builder.Connect(self._filter.GetOutputPort("last_desired_pose"), self._mapping.get_pose_input_port())
         self._filter.export_ports(builder, hold)
+        if self._mapping.frames.names and self._mapping.frames.names == template.frames:
+            builder.ConnectInput("frame_poses", self._mapping.get_frame_poses_input_port())
         builder.BuildInto(self)
 
     def set_frames(self, root_context: Context, frames: Mapping[str, RigidTransform]) -> None:

@@ -58,24 +58,31 @@ def _to_float(text: str | None) -> float:
         return math.nan
 
 
-def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective]) -> None:
-    """Add the models of Drake model directives to a plant; the directives name files by absolute paths (file://).
+def follow_directives(plant: MultibodyPlant, directives: Sequence[ModelDirective], folder: Path | None = None) -> None:
+    """Add the models of Drake model directives to a plant.
+
+    The directives name files by absolute paths (file://), in the package `guiderail`, which has the models of this
+    package (package://guiderail/robots/iiwa14.urdf), or in a package (folder with a `package.xml`) in `folder`.
 
     Raises:
         InputError: If the directives cannot be processed.
     """
     try:
         with _allow_package_map():
-            ProcessModelDirectives(ModelDirectives(directives=list(directives)), _make_parser(plant))
+            parser = _make_parser(plant)
+            if folder is not None:
+                parser.package_map().PopulateFromFolder(str(folder.resolve()))
+            ProcessModelDirectives(ModelDirectives(directives=list(directives)), parser)
     except (RuntimeError, SystemExit) as error:
         words = " ".join(str(error).split())
-        raise InputError(f"the model directives of the robot's surroundings can't be processed: {words}") from error
+        raise InputError(f"the model directives can't be processed: {words}") from error
 
 
 def _make_parser(plant: MultibodyPlant) -> Parser:
     """Return a parser without the package `drake_models`, whose files Drake would download."""
     parser = Parser(plant)
     parser.package_map().Remove("drake_models")
+    parser.package_map().Add("guiderail", str(Path(__file__).parents[1]))
     return parser
 
 

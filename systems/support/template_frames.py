@@ -1,4 +1,4 @@
-"""Poses of a template's objects as numeric parameters of a system."""
+"""Poses of a template's objects as numeric parameters of a system, or from an input port."""
 
 from collections.abc import Mapping
 
@@ -6,17 +6,21 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
+from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 
 
 class TemplateFrames:
-    """Poses of a template's object frames, declared as numeric parameters of a LeafSystem.
+    """Poses of a template's object frames, declared as numeric parameters of a LeafSystem and as an optional port.
 
-    The poses are constant during an episode. They are therefore parameters instead of input ports: a guidance diagram
-    needs no additional port, and a reset moves an object with `set`.
+    Poses that are constant during an episode are parameters: a guidance diagram needs no additional port, and a reset
+    moves an object with `set`. For objects that move, the input port ``frame_poses`` (6·k,) has the poses of all k
+    frames in the order of `names`, [x y z Rz Ry Rx] each; while it is connected, it replaces the parameters. One source
+    of it, such as a `MeasuredPose` of a fixture, serves all systems of the template. A template without frames has no
+    such port.
 
     Args:
         system: System under construction; outputs that use the frames must depend on `ticket`.
@@ -40,7 +44,12 @@ class TemplateFrames:
         self._indices = [
             system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in template.frames
         ]
-        self._cache = declare.cache(system, "template_frames", self._calc, [system.all_parameters_ticket()])
+        sources: list[declare.Source] = [system.all_parameters_ticket()]
+        self._port = None
+        if self.names:
+            self._port = system.DeclareVectorInputPort("frame_poses", POSE_SIZE * len(self.names))
+            sources.append(self._port)
+        self._cache = declare.cache(system, "template_frames", self._calc, sources)
 
     @property
     def ticket(self) -> DependencyTicket:
@@ -66,10 +75,14 @@ class TemplateFrames:
             context.get_mutable_numeric_parameter(index).SetFromVector(pose)
 
     def _calc(self, context: Context) -> dict[str, RigidTransform]:
-        return {
-            name: pose_to_transform(np.asarray(context.get_numeric_parameter(index).CopyToVector()))
-            for name, index in zip(self.names, self._indices, strict=True)
-        }
+        if self._port is not None and self._port.HasValue(context):
+            poses = list(self._port.Eval(context).reshape(-1, POSE_SIZE))
+            for name, pose in zip(self.names, poses, strict=True):
+                if not is_finite(pose):
+                    raise InputError(f"the frame {name} must be at a finite pose, not at {pose}")
+        else:
+            poses = [np.asarray(context.get_numeric_parameter(index).CopyToVector()) for index in self._indices]
+        return {name: pose_to_transform(pose) for name, pose in zip(self.names, poses, strict=True)}
 
 
 def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:

@@ -34,7 +34,8 @@ def requested_pose(system, action, state, pose=POSE, frames=None):
 
 
 def test_input_mapping_has_its_ports(system):
-    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["action", "pose", "state"]
+    names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
+    assert names == ["action", "pose", "state", "frame_poses"]
     assert system.get_action_input_port().size() == 3
     assert system.get_output_port().get_name() == "requested_pose"
 

@@ -181,6 +181,7 @@ def test_history_refuses_sizes_beyond_its_limit(outputs, length):
         (lambda: systems.Recorder(["pose"], 4, PERIOD), "signals are sizes by name"),
         (lambda: systems.Recorder({1: 6}, 4, PERIOD), "a signal needs a name, not 1"),
         (lambda: systems.ForceMonitor({}), "limits is not an array of numbers"),
+        (lambda: systems.GripperCommand("a", [1.0], [1.0], period=PERIOD), "lower is not an array of numbers"),
         (lambda: systems.Residual("a"), "gain is not an array of numbers"),
         (lambda: systems.SensorDisturbance(PERIOD, "a"), "noise is not an array of numbers"),
         (lambda: systems.CommandWatchdog(PERIOD, timeout=None), "timeout must be a number, not None"),

@@ -65,7 +65,7 @@ def test_sct_has_the_common_ports(template):
     guidance = SctGuidance(template, MUG, PERIOD)
     inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
     outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
-    assert inputs == ["action", "pose", "wrench"]
+    assert inputs == ["action", "pose", "wrench", "frame_poses"]
     assert set(outputs) == {*OUTPUTS, "state", "transition_distance", "progress", "measured_violation"}
     check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from pydrake.math import RigidTransform
 
@@ -32,7 +31,6 @@ def system_by_name():
         systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),
         systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
         systems.PoseRateLimiter(period=PERIOD),
-        systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
         systems.StatusWatchdog(plant, StatusLimits((1.0,) * 7), (1.0,) * 7, period=PERIOD),
         systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),

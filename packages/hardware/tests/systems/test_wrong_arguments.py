@@ -18,7 +18,6 @@ DRAFT = MultibodyPlant(0.0)  # a plant that is not finalized
     [
         (lambda: systems.StatusWatchdog(DRAFT, StatusLimits(ONES), ONES, period=PERIOD), "must be finalized"),
         (lambda: systems.TorqueSafetyLimiter(DRAFT, SAFETY, period=PERIOD), "must be finalized"),
-        (lambda: systems.GripperCommand("a", ONES, ONES, period=PERIOD), "lower is not an array of numbers"),
         (lambda: systems.PoseRateLimiter(period=None), "a system's period must be a number, not None"),
     ],
 )

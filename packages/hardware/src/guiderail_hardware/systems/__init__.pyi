@@ -1,4 +1,3 @@
-from .gripper_command import GripperCommand as GripperCommand
 from .heartbeat_monitor import HeartbeatMonitor as HeartbeatMonitor
 from .meshcat_device import MeshcatDevice as MeshcatDevice
 from .pose_motion_limiter import PoseMotionLimiter as PoseMotionLimiter

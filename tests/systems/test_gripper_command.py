@@ -1,9 +1,13 @@
 import numpy as np
 import pytest
+from pydrake.manipulation import SchunkWsgPositionController
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import PrismaticJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
-from guiderail_hardware.systems.gripper_command import GripperCommand
+from guiderail.systems.gripper_command import GripperCommand
 
 LOWER, UPPER, OPENING = np.array([0.0, -1.0]), np.array([0.04, 1.0]), np.array([0.03, 0.5])
 
@@ -108,3 +112,62 @@ def test_gripper_command_has_its_ports():
     assert system.get_position_input_port().get_name() == "position"
     assert system.get_desired_state_output_port().get_name() == "desired_state"
     assert system.get_desired_state_output_port().size() == 4
+
+
+def test_force_limit_is_the_last_valid_request():
+    system = GripperCommand(LOWER, UPPER, OPENING, period=0.01, max_force=30.0)
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+
+    def force_limit(requested):
+        system.get_requested_force_input_port().FixValue(context, [requested])
+        value = float(system.get_force_limit_output_port().Eval(context)[0])
+        simulator.AdvanceTo(context.get_time() + 0.02)
+        return value
+
+    assert float(system.get_force_limit_output_port().Eval(context)[0]) == 30.0  # not connected
+    assert [force_limit(force) for force in (12.0, np.nan, -1.0, 50.0, 0.0, 5.0)] == [12.0, 12.0, 12.0, 30.0, 30.0, 5.0]
+    for wrong in (0.0, np.inf, np.nan):
+        with pytest.raises(InputError, match="max_force must be positive and finite"):
+            GripperCommand(LOWER, UPPER, OPENING, period=0.01, max_force=wrong)
+
+
+def test_command_moves_the_fingers_of_drakes_wsg_controller():
+    """Two fingers on prismatic joints close on nothing, with the force limit that was requested."""
+    builder = DiagramBuilder()
+    command = builder.AddSystem(GripperCommand.for_wsg(period=0.05))
+    controller = builder.AddSystem(SchunkWsgPositionController())
+    plant = builder.AddSystem(two_fingers())
+    builder.Connect(command.get_desired_position_output_port(), controller.get_desired_position_input_port())
+    builder.Connect(command.get_force_limit_output_port(), controller.get_force_limit_input_port())
+    builder.Connect(plant.get_state_output_port(), controller.get_state_input_port())
+    builder.Connect(controller.get_generalized_force_output_port(), plant.get_actuation_input_port())
+    builder.ExportInput(command.get_position_input_port(), "position")
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    plant_context = plant.GetMyMutableContextFromRoot(context)
+
+    def distance():
+        left, right = plant.GetPositions(plant_context)
+        return right - left
+
+    plant.SetPositions(plant_context, [-0.03, 0.03])
+    diagram.GetInputPort("position").FixValue(context, [0.02])
+    simulator.AdvanceTo(2.0)
+    assert distance() == pytest.approx(0.02, abs=1e-3)
+    diagram.GetInputPort("position").FixValue(context, [1.0])  # beyond the opening
+    simulator.AdvanceTo(4.0)
+    assert distance() == pytest.approx(0.107, abs=1e-3)
+
+
+def two_fingers():
+    """Return a plant of two fingers that slide along x."""
+    plant = MultibodyPlant(0.001)
+    for name in ("left", "right"):
+        body = plant.AddRigidBody(name, SpatialInertia.SolidSphereWithMass(0.05, 0.01))
+        joint = plant.AddJoint(PrismaticJoint(name, plant.world_frame(), body.body_frame(), [1.0, 0.0, 0.0]))
+        plant.AddJointActuator(name, joint)
+    plant.mutable_gravity_field().set_gravity_vector(np.zeros(3))
+    plant.Finalize()
+    return plant
