@@ -34,7 +34,6 @@ def call(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "choose one of"),
         (["trian"], "did you mean train?"),
         (["xyz"], "choose one of"),
         (["train"], "--out"),
