@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from numbers import Real
 from typing import Any
 
@@ -57,9 +58,23 @@ def checked_step(env: gymnasium.Env, action: Any) -> tuple[Any, float, bool, boo
         InputError: If the step raises an exception, or its result breaks the contract: five values; an observation of
             the observation space, without NaN; a finite reward; two truth values; a dictionary.
     """
-    with naming_failures("the environment's step", *_UNCHANGED):
+    with naming_failures("the environment's step", *_UNCHANGED), naming_wrong_counts():
         result: Any = env.step(action)
     return check_step_result(env, result)
+
+
+@contextmanager
+def naming_wrong_counts() -> Iterator[None]:
+    """Convert the error of a wrapper that unpacks a wrong number of results of a step to an `InputError`."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        if not re.search("to unpack|cannot unpack", str(error)):
+            raise
+        raise InputError(
+            f"the environment's step does not return five values, or a wrapper cannot unpack them ({error}): return "
+            "observation, reward, terminated, truncated and info"
+        ) from error
 
 
 def check_step_result(env: gymnasium.Env, result: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:

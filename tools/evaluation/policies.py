@@ -94,7 +94,7 @@ class ForeignPolicy(Callback):
             InputError: If the observation has another shape than the policy takes, or the function raised an exception
                 or called `sys.exit`.
         """
-        if self.observation_shape not in (None, np.shape(observation)):
+        if self.observation_shape is not None and self.observation_shape != np.shape(observation):
             raise InputError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
         try:
             return self._converted(self._act(observation))
@@ -110,10 +110,10 @@ class ForeignPolicy(Callback):
 
     def _converted(self, action: Any) -> Any:
         action = from_tensors(action)
-        if isinstance(action, Mapping | tuple):  # of a space that is no array
+        if isinstance(action, Mapping | tuple | str):  # of a space that is no array
             return action
         array = np.asarray(action)
-        return array[0] if array.ndim == 2 and len(array) == 1 else array
+        return array[0] if array.ndim == 2 and len(array) == 1 and array.shape != self.action_shape else array
 
 
 def _describe_error(error: BaseException) -> str:

@@ -198,6 +198,8 @@ def as_action(action: Any, env: gymnasium.Env) -> Any:
         InputError: If a tensor cannot be converted.
     """
     action, shape = from_tensors(action), env.action_space.shape
+    if isinstance(action, np.ndarray) and shape == (1, *action.shape) and action.shape == (1,):
+        return action[None]  # the row of an action (1, 1) was taken for a batch
     return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
 
 

@@ -20,7 +20,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.tools.contract import check_reset_result, check_step_result, check_values
+from guiderail.tools.contract import check_reset_result, check_step_result, check_values, naming_wrong_counts
 from guiderail.tools.guided.guide import (
     PRIMITIVE_GUIDANCE,
     Guide,
@@ -257,7 +257,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         if self._is_checked:
             check_values(self.env, self._observation, action)
         self._has_begun = self._is_pending = False  # after an error below, the episode cannot be continued
-        result = check_step_result(self.env, self.env.step(action))
+        with naming_wrong_counts():
+            result: Any = self.env.step(action)
+        result = check_step_result(self.env, result)
         self._observation, reward, self._terminated, self._truncated, self._info = result
         if self._is_checked:
             check_values(self.env, self._observation)

@@ -498,3 +498,97 @@ def test_policy_folder_is_loaded_without_code(tmp_path):
     description = {"observation_shape": [3], "action_low": [-1, -1], "action_high": [1, 1]}
     Policy([(np.zeros((2, 3), np.float32), np.zeros(2, np.float32))], description).save(tmp_path)
     np.testing.assert_array_equal(load_policy(tmp_path)(OBSERVATION), [0, 0])
+
+
+class StatefulModule(torch.nn.Module):
+    """Policy that acts in its first three calls, counted in a buffer or an attribute."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.is_buffer = kind != "attribute"
+        self.number = 0
+        self.register_buffer("calls", torch.zeros(1))
+
+    def forward(self, x):
+        self.calls += 1
+        self.number += 1
+        count = self.calls if self.is_buffer else torch.ones(1) * self.number
+        return torch.ones(x.shape[0], 2) * (count <= 3)
+
+
+class ResetModule(StatefulModule):
+    """Policy whose stored state is used up, and which `reset` restores."""
+
+    def __init__(self):
+        super().__init__("buffer")
+        self.calls += 5
+
+    @torch.jit.export
+    def reset(self):
+        self.calls[:] = 0.0
+
+
+class StatefulFunction:
+    """Object that acts in its first three calls; a call after a `reset` is the first again."""
+
+    def __init__(self, kind):
+        self.calls, self.kind = 0, kind
+        if kind == "predict":
+            self.predict = self.act
+
+    def reset(self):
+        self.calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return np.ones(2) * (self.calls <= 3)
+
+    def __call__(self, observation):
+        return self.act(observation)
+
+
+STATEFUL = {
+    "buffer": lambda: StatefulModule("buffer"),
+    "attribute": lambda: StatefulModule("attribute"),
+    "reset": ResetModule,
+    "call": lambda: StatefulFunction("call"),
+    "predict": lambda: StatefulFunction("predict"),
+}
+
+
+class Steps(gymnasium.Env):
+    """Environment of five steps, whose return is the number of steps with actions of one."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (3,)), gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.zeros(3, np.float32), float(np.sum(action) / 2), False, self.count == 5, {}
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+@pytest.mark.parametrize("kind", STATEFUL)
+def test_stateful_policy_starts_every_episode_in_its_first_state(kind, processes, tmp_path):
+    policy = STATEFUL[kind]()
+    if isinstance(policy, torch.nn.Module):
+        torch.jit.script(policy).save(tmp_path / "policy.pt")
+        policy = load_policy(tmp_path / "policy.pt", trust_policy=True)
+    policy = check_compatible(policy, Steps())
+    assert evaluate(policy, Steps(), 5, baselines=(), processes=processes)["mean_return"] == 3.0
+
+
+@pytest.mark.parametrize("kind", STATEFUL)
+def test_state_of_a_policy_is_not_used_up_by_the_check(kind, tmp_path):
+    policy = STATEFUL[kind]()
+    if isinstance(policy, torch.nn.Module):
+        torch.jit.script(policy).save(tmp_path / "policy.pt")
+        policy = load_policy(tmp_path / "policy.pt", trust_policy=True)
+    policy = check_compatible(policy, Steps())
+    if kind == "reset":
+        policy.on_episode_start()
+    assert [policy(np.zeros(3, np.float32))[0] for _ in range(4)] == [1.0, 1.0, 1.0, 0.0]
