@@ -1,7 +1,5 @@
 """Command line of the reproduction, `python -m research.thesis`."""
 
-from pathlib import Path
-
 from guiderail.models.common.errors import InputError
 from research.command import Parser
 from research.reproduction.report import write_report

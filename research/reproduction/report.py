@@ -42,6 +42,7 @@ class Entry:
         tables: Names of the stored files, relative to `research`.
         command: Command that makes the results.
         hours: Core-hours of the runs, if they were measured.
+        title: Title instead of the numbers, for a task that is not in the thesis.
     """
 
     numbers: tuple[str, ...]
@@ -53,6 +54,7 @@ class Entry:
     tables: tuple[str, ...]
     command: str
     hours: float | None = None
+    title: str = ""
 
 
 def write_report(tables: Path = TABLES, page: Path = PAGE) -> Path:
@@ -85,6 +87,8 @@ def format_report(all_entries: list[Entry]) -> str:
 
 
 def _name(entry: Entry) -> str:
+    if entry.title:
+        return entry.title
     tables = [number for number in entry.numbers if number.startswith("table")]
     figures = [number for number in entry.numbers if not number.startswith("table")]
     names = [f"figure{'s' if len(figures) > 1 else ''} {_enumerate(figures)}"] if figures else []
@@ -108,6 +112,7 @@ def entries(tables: Path = TABLES) -> list[Entry]:
         _computed("3.4", "a rendered scene", "Drake instead of Bullet"),
         *_pouring_endings(tables),
         _robot_pouring(),
+        *_hard_pouring(tables),
         _clamp_curves(tables),
         _clamp_return(tables),
         _computed("table 3.2", "settings of the presets", "none"),
@@ -139,7 +144,9 @@ def _stored(number: str) -> dict[str, Any]:
 
 def _results_of(number: str) -> tuple[str, ...]:
     known = ("figure", "the thesis", "command", "seconds", "seeds", "condition", "picture", "table")
-    return tuple(f"{key.replace('_', ' ')}: {_short(value)}" for key, value in _stored(number).items() if key not in known)
+    return tuple(
+        f"{key.replace('_', ' ')}: {_short(value)}" for key, value in _stored(number).items() if key not in known
+    )
 
 
 def _short(value: Any) -> str:
@@ -151,7 +158,14 @@ def _computed(number: str, measure: str, differences: str) -> Entry:
     results = _results_of(number) or ("the picture is drawn by the command",)
     name = REPRODUCED[number]
     return Entry(
-        (number,), HOLDS, measure, results, "no learning", differences, (f"results/{name}.json",), figure_command(number)
+        (number,),
+        HOLDS,
+        measure,
+        results,
+        "no learning",
+        differences,
+        (f"results/{name}.json",),
+        figure_command(number),
     )
 
 
@@ -279,6 +293,59 @@ def _robot_pouring() -> Entry:
     )
 
 
+def _hard_pouring(tables: Path) -> list[Entry]:
+    """Return the entry of pouring at difficulty hard with the shielded template; empty without a table."""
+    table = _read(tables, "pouring_hard_shield")
+    if table is None:
+        return []
+    runs = _runs_of(table, "rl_sct")
+    finished = [run for run in runs if len(run) == 150]
+    spills = [int((run["termination"] == "spill").sum()) for run in runs]
+    evaluated = _read(tables, "pouring_hard_shield_evaluated")
+    ours = [
+        f"{len(finished)} of 10 runs so far have their 150 episodes; episodes done: {_each(runs, len)}",
+        f"spills of each run in training: {', '.join(map(str, spills))}; collisions: "
+        f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}; ten successes in a row begin "
+        f"after {_each(runs, lambda run: converged_at(run['success']))} episodes",
+    ]
+    held_out = []
+    if evaluated is not None:
+        for method, rows in evaluated.groupby("method", sort=False):
+            rates = [f"{int(own['success'].sum())} of {len(own)}" for _, own in rows.groupby("seed")]
+            ours.append(f"held out, {str(method).replace('_', ' ')}: success in {', '.join(rates)} episodes")
+            if method == "rl_sct":
+                held_out = [float(own["success"].mean()) for _, own in rows.groupby("seed")]
+    earlier = read_table(RESULTS / "pouring_hard.csv").set_index("method")
+    before = earlier.loc[["rl_sct", "rl_sct_longer"]]
+    percent = 100 * before["training_ended_in_spill"].sum() / before["training_episodes"].sum()
+    ours.append(
+        f"without the shield {percent:.0f} % of the training episodes spill, and the policies succeed in "
+        f"{before['success_rate'].min():.0%} to {before['success_rate'].max():.0%} of held-out episodes; RL without a "
+        f"template succeeds in {earlier.loc['rl', 'success_rate'].max():.0%}"
+    )
+    enough = len(finished) == 10 and len(held_out) == 10
+    reached = (
+        bool(held_out) and min(held_out) >= 0.97 and all(s <= 0.02 * len(r) for s, r in zip(spills, runs, strict=True))
+    )
+    so_far = "reached" if reached else "not reached"
+    return [
+        Entry(
+            (),
+            f"target {so_far}" if enough else f"{OPEN}: {len(held_out)} of 10 runs evaluated, target {so_far} in them",
+            "at least 97 of 100 held-out episodes of every run, at most 2 % of the training episodes spill",
+            tuple(ours),
+            f"{len(held_out)} of 10 (–)",
+            "not in the thesis: the template expects the mug 35 to 50 mm from its actual position. The template "
+            "`pouring_shielded` tilts beyond 80° only within 15 mm of the line from which both balls fall into the "
+            "observed mug; the policy observes the same position",
+            ("reproduction/tables/pouring_hard_shield.csv", "results/pouring_hard.csv"),
+            "python -m research.thesis --figure hard --resume",
+            _hours(table),
+            "Pouring at difficulty hard",
+        )
+    ]
+
+
 FORCE = {"sct": "with the cost of force", "sct_no_force": "without it"}
 
 
@@ -289,9 +356,9 @@ def _clamp_curves(tables: Path) -> Entry:
         runs = _runs_of(table, method)
         forces[method] = _mean(runs, "mean_squared_force", slice(0, 70))[0]
         ours.append(
-            f"{label}: ten successes in a row begin after {_each(runs, lambda r: converged_at(r['success']))} episodes; "
-            f"success in episodes 71 to 100 {_band(runs, 'success', slice(70, 100), '{:.3f}')}; mean squared force in "
-            f"episodes 1 to 70 {_band(runs, 'mean_squared_force', slice(0, 70))} N², in episodes 71 to 100 "
+            f"{label}: ten successes in a row begin after {_each(runs, lambda r: converged_at(r['success']))} "
+            f"episodes; success in episodes 71 to 100 {_band(runs, 'success', slice(70, 100), '{:.3f}')}; mean squared "
+            f"force in episodes 1 to 70 {_band(runs, 'mean_squared_force', slice(0, 70))} N², in episodes 71 to 100 "
             f"{_band(runs, 'mean_squared_force', slice(70, 100))} N²; control steps of the last ten episodes "
             f"{_band(runs, 'steps', slice(90, 100))}; collisions "
             f"{_each(runs, lambda r: int((r['termination'] == 'collision').sum()))}"
@@ -302,7 +369,9 @@ def _clamp_curves(tables: Path) -> Entry:
     is_learned = all(value is not None and value + STREAK <= 70 for value in converged)
     baselines = read_table(RESULTS / "grid_clamp_baselines.csv").set_index("method")["success_rate"]
     ours.append(f"uniform random actions succeed in {baselines['uniform_random']:.0%} of the standard task's episodes")
-    verdict = HOLDS if is_learned and lower > 0.1 else f"{PARTLY}: learned within 70 episodes, but the force is as large"
+    verdict = (
+        HOLDS if is_learned and lower > 0.1 else f"{PARTLY}: learned within 70 episodes, but the force is as large"
+    )
     verdict = verdict if is_learned else f"{NOT}: not learned within 70 episodes"
     return Entry(
         ("3.10",),
@@ -468,8 +537,8 @@ def _images(tables: Path) -> Entry:
                 for name, rows in baselines.items()
             ),
             f"without averaging the pixels: {len(pixels)} of 10 runs so far",
-            "an earlier version of this page said that the figure is not reproduced: it asked for consecutive exploring "
-            "episodes without any cost, which is stricter than the thesis's measure",
+            "an earlier version of this page said that the figure is not reproduced: it asked for consecutive "
+            "exploring episodes without any cost, which is stricter than the thesis's measure",
         ),
         f"{len(runs)} (not given)",
         "pixels are averaged five by five before the first layer; an action lasts five control steps; the preset "
@@ -517,10 +586,10 @@ def _connector() -> Entry:
 
 def _connector_comparison() -> Entry:
     kgrl, skgrl = (_connector_rows(method)["training_mean_return_last_10"].mean() for method in ("kgrl", "skgrl"))
-    higher = "KGRL's" if kgrl > skgrl else "sKGRL's"
+    returns = "KGRL's return is higher" if kgrl > skgrl else "sKGRL's return is higher in the end, not KGRL's"
     return Entry(
         ("5.9",),
-        f"{PARTLY}: both succeed within 45 episodes; {higher} return is higher in the end",
+        f"{PARTLY}: both succeed within 45 episodes; three runs of sKGRL have no ten successes in a row; {returns}",
         "success in training; return of the last ten episodes",
         (_connector_sentence("kgrl", "KGRL"), _connector_sentence("skgrl", "sKGRL")),
         "10 (10)",

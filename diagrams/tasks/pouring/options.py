@@ -117,9 +117,7 @@ class PouringOptions(Options):
     aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
     pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilting speed in Pour, with aim")
 
-    shield: bool = Field(
-        False, description="allow to tilt only where the balls fall into the observed mug; needs aim"
-    )
+    shield: bool = Field(False, description="allow to tilt only where the balls fall into the observed mug; needs aim")
 
     @property
     def needed(self) -> int:

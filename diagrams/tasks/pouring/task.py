@@ -164,8 +164,8 @@ class Pouring(Task):
 
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
     "hand_shaped" follows 3.8 to 3.10. With the standard template, a constant action pours the balls into the mug. With
-    difficulty="hard", the mug is not at the position that the template assumes. With difficulty="thesis", the template's
-    inputs are as slow as in the thesis.
+    difficulty="hard", the mug is not at the position that the template assumes. With difficulty="thesis", the
+    template's inputs are as slow as in the thesis.
     """
 
     workcell_kind = "pouring"
