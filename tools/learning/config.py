@@ -83,7 +83,7 @@ class OffPolicyConfig(LearnerConfig):
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
-    image_encoder: Literal["average_pooling", "convolutional", "pixels"] = "average_pooling"  # features of observed images
+    image_encoder: Literal["average_pooling", "convolutional", "pixels"] = "average_pooling"  # features of images
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)

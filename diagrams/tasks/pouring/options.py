@@ -69,6 +69,13 @@ HARD: Mapping[str, Any] = {
 }
 """Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed."""
 
+THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0}
+"""Options of difficulty="thesis": the pace of the thesis, whose 65 episodes had 149 actions each on average.
+
+At the standard speed, the scripted policy pours within 28 actions; at this speed within about 90. Uncorrelated random
+inputs then move the thermos four times less, and a success needs four times as many actions in the right direction.
+"""
+
 MOST_BALLS = 8  # largest number of balls
 
 
@@ -110,9 +117,7 @@ class PouringOptions(Options):
     aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
     pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilting speed in Pour, with aim")
 
-    shield: bool = Field(
-        False, description="allow to tilt only where the balls fall into the observed mug; needs aim"
-    )
+    shield: bool = Field(False, description="allow to tilt only where the balls fall into the observed mug; needs aim")
 
     @property
     def needed(self) -> int:

@@ -24,6 +24,7 @@ from guiderail.diagrams.tasks.pouring.options import (
     MAX_MUG_OFFSET,
     POSITION_SCALE,
     SPARSE_INPUT_SPEED,
+    THESIS,
     PouringOptions,
     PouringReset,
     frames_of,
@@ -163,7 +164,8 @@ class Pouring(Task):
 
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
     "hand_shaped" follows 3.8 to 3.10. With the standard template, a constant action pours the balls into the mug. With
-    difficulty="hard", the mug is not at the position that the template assumes.
+    difficulty="hard", the mug is not at the position that the template assumes. With difficulty="thesis", the
+    template's inputs are as slow as in the thesis.
     """
 
     workcell_kind = "pouring"
@@ -173,7 +175,7 @@ class Pouring(Task):
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
     defaults = {"guidance": "sct", "action_repeat": 10}
-    difficulties = {STANDARD: {}, "hard": HARD}
+    difficulties = {STANDARD: {}, "hard": HARD, "thesis": THESIS}
     learner = {"algorithm": "sac", "preset": "pouring"}
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
