@@ -45,17 +45,11 @@ def task_named(name_or_folder: str) -> tuple[str, tuple[str, ...]]:
     An unknown name is returned unchanged.
 
     Raises:
-        InputError: If the folder's task is not valid, or its learner is unknown.
+        InputError: If the folder's task is not valid.
     """
     if name_or_folder in TASKS.names() or not is_task_folder(name_or_folder):
         return name_or_folder, ()
     name = register_task_folder(name_or_folder)
-    from guiderail.tools.learning.config import resolve_preset  # config imports this module
-
-    try:
-        resolve_preset(**{"preset": None, **TASKS.get(name).learner})
-    except InputError as error:
-        raise InputError(f"recommended.learner in {Path(name_or_folder) / 'task.yaml'} is invalid: {error}") from None
     return name, (str(Path(name_or_folder).resolve()),)
 
 

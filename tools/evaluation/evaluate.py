@@ -21,6 +21,7 @@ from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED, Callback, PolicyFn, check_seed, has_image
 from guiderail.tools.evaluation.evaluation import (
     BASELINES_FOLDER,
     COLLISIONS,
@@ -37,17 +38,8 @@ from guiderail.tools.evaluation.evaluation import (
 )
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
-from guiderail.tools.evaluation.policies import as_policy
-from guiderail.tools.evaluation.rollout import (
-    HELD_OUT_SEED,
-    Callback,
-    EpisodeProgress,
-    PolicyFn,
-    check_seed,
-    has_image,
-    is_compatible,
-    rollout,
-)
+from guiderail.tools.evaluation.policies import as_policy, is_compatible
+from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.subject import (
     Subject,
     counts_collisions,

@@ -29,10 +29,10 @@ from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, has_same_shapes, is_compatible
+from guiderail.tools.evaluation.episode import Callback, PolicyFn, as_action
 from guiderail.tools.imports import import_modules, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
-from guiderail.tools.spaces import describe_space, from_tensors
+from guiderail.tools.spaces import describe_space, from_tensors, has_layout, layout, probes, takes_observations
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
@@ -571,3 +571,35 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
         return is_compatible(lambda env: policy, env)
     finally:
         env.close()
+
+
+def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
+    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
+
+    Raises:
+        InputError: If `make_policy` returns no function.
+    """
+    act = make_policy(env)
+    if not callable(act):
+        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
+    try:
+        return has_same_shapes(act, env)
+    except (IndexError, TypeError, ValueError):
+        return False
+
+
+def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
+    """Return True if the policy's actions for several observations have the shape of the environment's actions.
+
+    The policy is called with the observations of `probes`. An object with `predict` is not called if it declares both
+    spaces. Otherwise a copy of a policy of another library is called, if it can be copied, so that its internal state
+    does not change. An exception of the policy is not caught.
+    """
+    if isinstance(act, ForeignPolicy):
+        if act.observation_space is not None and act.action_space is not None:
+            is_known = layout(act.action_space) == layout(env.action_space)
+            return is_known and takes_observations(act.observation_space, env.observation_space)
+        act = act.copy()
+    return all(
+        has_layout(as_action(act(observation), env), env.action_space) for observation in probes(env.observation_space)
+    )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -16,98 +15,16 @@ import numpy as np
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.contract import checked_reset, checked_step
+from guiderail.tools.evaluation.episode import Callback, EnvCallback, PolicyFn, Transition, as_action
+from guiderail.tools.evaluation.policies import as_policy
 from guiderail.tools.spaces import (
     describe_space,
-    from_tensors,
     has_layout,
     has_values,
-    layout,
-    probes,
-    takes_observations,
 )
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-PolicyFn = Callable[[np.ndarray], np.ndarray]
-
-HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
-
-
-@dataclass(frozen=True)
-class Transition:
-    """Action of an episode and its outcome.
-
-    Attributes:
-        observation: Observation before the action, of the shape of the observation space.
-        action: Action, of the shape of the action space.
-        reward: Reward.
-        next_observation: Observation after the action, of the same shape.
-        terminated: True if the task ended the episode.
-        truncated: True if the episode ended for another reason.
-        info: `info` of the environment's step.
-        privileged: Privileged observation before the action, (m,); None if the environment provides none.
-        next_privileged: Privileged observation after the action, (m,), or None.
-    """
-
-    observation: np.ndarray
-    action: np.ndarray
-    reward: float
-    next_observation: np.ndarray
-    terminated: bool
-    truncated: bool
-    info: Mapping[str, Any]
-    privileged: np.ndarray | None = None
-    next_privileged: np.ndarray | None = None
-
-    @property
-    def is_last(self) -> bool:
-        """True if the episode is over."""
-        return self.terminated or self.truncated
-
-
-class Callback:
-    """Base class of callbacks of an episode, such as a learner or a camera."""
-
-    def on_episode_start(self) -> None:
-        """Handle the start of an episode, after the reset."""
-
-    def on_step(self, transition: Transition) -> None:
-        """Handle the transition of an action."""
-
-    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Handle the end of an episode; return further columns of its row."""
-        return {}
-
-
-class EnvCallback(Callback):
-    """Callback that reads data of the environment which a step does not return.
-
-    Attributes:
-        env: Environment.
-        base: Environment without its wrappers.
-    """
-
-    def __init__(self, env: gymnasium.Env):
-        self.env: Any = env
-        self.base: Any = env.unwrapped
-
-
-def check_seed(seed: object) -> int:
-    """Return a seed as an int; raise an InputError if it is not a whole number from 0 to 2^31 - 1."""
-    number = as_whole(seed, "a seed")
-    if not 0 <= number < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {number}")
-    return number
-
-
-def has_image(space: Any) -> bool:
-    """Return True if the observations of a space are images, or contain an image."""
-    if isinstance(space, gymnasium.spaces.Dict):
-        return any(map(has_image, space.spaces.values())) or hasattr(space, "image_shape")
-    if isinstance(space, gymnasium.spaces.Tuple):
-        return any(map(has_image, space.spaces))
-    return len(space.shape or ()) == 3 or hasattr(space, "image_shape")
 
 
 def rollout(
@@ -141,7 +58,6 @@ def rollout(
             (`checked_step`), or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
-    from guiderail.tools.evaluation.policies import as_policy
 
     if not isinstance(env, gymnasium.Env):
         raise InputError(f"an episode runs in an environment, as gymnasium.make returns it, not in {brief(env)}")
@@ -191,18 +107,6 @@ def rollout(
     return row
 
 
-def as_action(action: Any, env: gymnasium.Env) -> Any:
-    """Return a policy's result as an action: tensors become arrays, and an action (1, A) becomes (A,) if that fits.
-
-    Raises:
-        InputError: If a tensor cannot be converted.
-    """
-    action, shape = from_tensors(action), env.action_space.shape
-    if isinstance(action, np.ndarray) and shape == (1, *action.shape) and action.shape == (1,):
-        return action[None]  # the row of an action (1, 1) was taken for a batch
-    return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
-
-
 def _check_action(action: Any, env: gymnasium.Env) -> None:
     """Raise an InputError if an action does not have the layout of the action space, or is outside a discrete space."""
     space = env.action_space
@@ -242,40 +146,6 @@ class Paths(EnvCallback):
         """Return the columns `commanded` and `measured`."""
         trace = self.base.trace
         return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
-
-
-def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
-
-    Raises:
-        InputError: If `make_policy` returns no function.
-    """
-    act = make_policy(env)
-    if not callable(act):
-        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
-    try:
-        return has_same_shapes(act, env)
-    except (IndexError, TypeError, ValueError):
-        return False
-
-
-def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
-    """Return True if the policy's actions for several observations have the shape of the environment's actions.
-
-    The policy is called with the observations of `probes`. An object with `predict` is not called if it declares both
-    spaces. Otherwise a copy of a policy of another library is called, if it can be copied, so that its internal state
-    does not change. An exception of the policy is not caught.
-    """
-    from guiderail.tools.evaluation.policies import ForeignPolicy
-
-    if isinstance(act, ForeignPolicy):
-        if act.observation_space is not None and act.action_space is not None:
-            is_known = layout(act.action_space) == layout(env.action_space)
-            return is_known and takes_observations(act.observation_space, env.observation_space)
-        act = act.copy()
-    return all(
-        has_layout(as_action(act(observation), env), env.action_space) for observation in probes(env.observation_space)
-    )
 
 
 WINDOW = 10  # default number of last episodes over which success and return are averaged

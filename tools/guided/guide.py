@@ -272,7 +272,7 @@ class PrimitiveGuide(Guide):
             past.insert(0, self.frame.to_frame(output, self._orientation, past[0]))
         past = [past[0]] * (length - len(past)) + past
         start = past[-1] if primitive.history == 0 and motion_filter is None else np.array(past)
-        self._stepper: PrimitiveStepper = primitive.start(start, gains, motion=motion_filter)
+        self._stepper: PrimitiveStepper = PrimitiveStepper(primitive, start, gains, motion=motion_filter)
         self._last = past[-1]
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:

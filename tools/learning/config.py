@@ -19,7 +19,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.evaluation.rollout import check_seed
+from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"

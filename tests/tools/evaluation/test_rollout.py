@@ -7,8 +7,9 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
+from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import COLUMNS
-from guiderail.tools.evaluation.rollout import Callback, rollout
+from guiderail.tools.evaluation.rollout import rollout
 
 
 class Recorder(Callback):

@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.cloning import BcLearner
 from guiderail.tools.learning.learner import register_learner
 from guiderail_lerobot.config import ChunkConfig

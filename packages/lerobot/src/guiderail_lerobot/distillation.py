@@ -10,7 +10,8 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import UnsolvableError
-from guiderail.tools.evaluation.rollout import Transition, is_compatible
+from guiderail.tools.evaluation.episode import Transition
+from guiderail.tools.evaluation.policies import is_compatible
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.pretrained import find_run
 from guiderail_lerobot.chunking import ChunkLearner
