@@ -67,7 +67,8 @@ _QUATERNION = tuple(
 # Names of columns that describe an orientation, alone or with others.
 _ORIENTATION = re.compile(
     r"(?:.*[._/ ])?(?:orientation|orient|rotation|rot|rotvec|quaternion|quat|euler|rpy|ypr|roll|pitch|yaw|heading"
-    r"|attitude|o_t_ee|q[._/ ]?[xyzw]|r_?[xyz]|o[xyzw]|r[0-3][0-3])[._/ ]?(?:[xyzw]|[0-9]+)?(?:_rpy)?(?:_deg|_rad)?"
+    r"|rotation_vector|rv|axis_angle|angles?|phi|theta|psi|attitude"
+    r"|o_t_ee|q[._/ ]?[xyzw]|r_?[xyz]|o[xyzw]|r[0-3][0-3])[._/ ]?(?:[xyzw]|[0-9]+)?(?:_rpy)?(?:_deg|_rad)?"
 )
 _ROTATION_VECTOR = ("r_?x", "r_?y", "r_?z")
 _KUKA = ("A", "B", "C")  # angles of a KUKA about z, y and x [degrees]
