@@ -53,14 +53,13 @@ class ImpedanceGains:
     bound: WrenchBound | None = None
 
     def __post_init__(self) -> None:
-        # Copies: writing into a caller's array must not change a running controller.
-        K = _frozen(as_numbers(self.stiffness, "a Cartesian stiffness"))
+        K = as_numbers(self.stiffness, "a Cartesian stiffness")
         is_symmetric = K.shape == (6, 6) and np.allclose(K, K.T)
         if not is_symmetric or not (np.abs(K) <= MAX_STIFFNESS).all() or not (np.linalg.eigvalsh(K) > 0.0).all():
             raise InputError(
                 f"a Cartesian stiffness must be a symmetric, positive definite 6 × 6 matrix, at most {MAX_STIFFNESS:g}"
             )
-        limits = _frozen(as_numbers(self.wrench_limits, "the wrench limits of an impedance"))
+        limits = as_numbers(self.wrench_limits, "the wrench limits of an impedance")
         if limits.shape != (6,) or not ((limits > 0.0) & (limits < np.inf)).all():
             raise InputError(f"an impedance needs six positive, finite wrench limits, not {self.wrench_limits}")
         posture_gains = (self.posture_stiffness, self.posture_damping)
@@ -71,18 +70,12 @@ class ImpedanceGains:
             )
         if self.bound is not None and not isinstance(self.bound, WrenchBound):
             raise InputError(f"an impedance's bound must be a WrenchBound or None, not {brief(self.bound)}")
-        posture = _frozen(as_numbers(self.posture, "the posture of an impedance"))
+        posture = as_numbers(self.posture, "the posture of an impedance")
         if not np.isfinite(posture).all():
             raise InputError(f"an impedance's posture must be finite joint positions, not {self.posture}")
         for name, array in (("stiffness", K), ("wrench_limits", limits), ("posture", posture)):
+            array.flags.writeable = False  # a copy: writing must not change a running controller
             object.__setattr__(self, name, array)
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    """Return a copy that can't be written to."""
-    copy = array.copy()
-    copy.flags.writeable = False
-    return copy
 
 
 class CartesianImpedanceController(LeafSystem):

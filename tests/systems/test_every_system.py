@@ -12,7 +12,6 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,10 +29,6 @@ from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
-from guiderail_hardware.models.joint_status import StatusLimits
-from guiderail_lerobot.chunk_guard import ChunkGuard
-from guiderail_mujoco.station import MujocoStation
-from oracles.franka import FRANKA_LIMITS
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent
@@ -68,10 +63,8 @@ def system_by_name():
     template, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
     gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
-    safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
     condition = systems.TerminationTerm("success", {"u": 2}, lambda u: False)
     term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
-    browser = SimpleNamespace(AddSlider=lambda *arguments: None)
     instances = [
         systems.ActiveConstraintProjector(template, frames, PERIOD),
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_center, gains, period=PERIOD),
@@ -83,37 +76,18 @@ def system_by_name():
         systems.CenterOfPressure(0.5),
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
-        systems.HeartbeatMonitor(period=PERIOD, timeout=0.5),
-        systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),
-        systems.PosePublisher(lambda pose, time: None, lambda: None, RigidTransform(), period=PERIOD),
-        systems.PoseRateLimiter(period=PERIOD),
         systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),
         systems.PhaseWrenchLimit(np.ones((2, 8)), np.ones(8), period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
-        systems.GripperCommand(np.zeros(2), np.ones(2), np.zeros(2), period=PERIOD),
         systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),
         systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ImpedanceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
-        systems.ChunkReference(
-            lambda observation: observation,
-            2,
-            primitive(0).reference,
-            horizon=1,
-            replan_steps=1,
-            covariance_floor=1.0,
-            period=PERIOD,
-        ),
-        systems.ChunkSafetyLimiter(
-            ChunkGuard(BOX, np.ones(2), np.ones(2), period=PERIOD, start=np.zeros(2)), 4, 2, PERIOD
-        ),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
-        systems.MeshcatDevice(browser, [(0, 1.0)], [("KeyA", "KeyD")], PERIOD),
-        MujocoStation(BncWorkcell()).gantry,
         systems.PolicySystem(lambda observation: observation, 2, 2, PERIOD),
         systems.PoseWrench(),
         systems.ProgressClock(StateProgress((1.0, 1.0), 3), 2, PERIOD),
@@ -126,9 +100,6 @@ def system_by_name():
         systems.SctInputMapping(template, frames, PERIOD),
         systems.SctStateMachine(template, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1, configuration_size=2),
-        systems.StatusWatchdog(plant, StatusLimits((1.0,) * 7), (1.0,) * 7, period=PERIOD),
-        systems.TorqueSafetyLimiter(plant, safety, period=PERIOD),
-        systems.TorquePublisher(lambda torque, time: None, 7, period=PERIOD, hold=lambda: None),
         systems.WrenchSensor(plant, arm.wrist, arm.tool, arm.tool_center, RotationMatrix(), PERIOD, 0.0),
         systems.WrenchTare(PERIOD, 3, 5),
     ]
