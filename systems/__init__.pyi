@@ -1,6 +1,7 @@
 from .active_constraint_projector import ActiveConstraintProjector as ActiveConstraintProjector
 from .cartesian_impedance_controller import CartesianImpedanceController as CartesianImpedanceController
 from .cartesian_impedance_controller import ImpedanceGains as ImpedanceGains
+from .cartesian_impedance_controller import Payload as Payload
 from .cartesian_position_controller import CartesianPositionController as CartesianPositionController
 from .cartesian_position_controller import SpeedLimits as SpeedLimits
 from .center_of_pressure import CenterOfPressure as CenterOfPressure

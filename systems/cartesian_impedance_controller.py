@@ -1,13 +1,13 @@
 """Cartesian impedance control of a torque-controlled arm."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
-from guiderail.models.common.arrays import as_numbers
+from guiderail.models.common.arrays import as_number, as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
@@ -78,6 +78,29 @@ class ImpedanceGains:
             object.__setattr__(self, name, array)
 
 
+@dataclass(frozen=True)
+class Payload:
+    """Point mass at the tool that a controller compensates, in addition to its plant.
+
+    Args:
+        mass: Mass [kg], not negative, finite.
+        center: Center of mass in the frame of the tool center, (3,) [m].
+
+    Raises:
+        InputError: If an argument is out of range or of another shape.
+    """
+
+    mass: float = 0.0
+    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        center = as_numbers(self.center, "the center of a payload")
+        if not 0.0 <= as_number(self.mass, "the mass of a payload") < np.inf or not np.isfinite(center).all():
+            raise InputError(f"a payload has a finite mass of at least 0 and a finite center, not {self}")
+        if center.shape != (3,):
+            raise InputError(f"the center of a payload is three numbers, not {self.center}")
+
+
 class CartesianImpedanceController(LeafSystem):
     """Impedance controller: the tool center P of an arm acts as a spring and damper around a desired pose.
 
@@ -87,6 +110,9 @@ class CartesianImpedanceController(LeafSystem):
     `impedance_torques`. The axes of K are those of `stiffness_frame`. The orientation error is computed from
     quaternions, so no orientation is singular. The damping D is computed from K and the arm's inertia in its present
     posture. While no valid command is available, the last valid command is followed (`LastValidPose`).
+
+    Gains and payload are numeric parameters of the context: `set_gains` and `set_payload` change them between two steps
+    of a simulation, and a context that is copied or restored has them.
 
     .. pydrake_system::
 
@@ -154,6 +180,10 @@ class CartesianImpedanceController(LeafSystem):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
         self._stiffness_frame = stiffness_frame
+        self._parameters = [
+            self.DeclareNumericParameter(BasicVector(numbers)) for numbers in (*_to_numbers(gains), np.zeros(4))
+        ]
+        self._tuning = declare.cache(self, "gains_and_payload", self._calc_tuning, [self.all_parameters_ticket()])
         self._compensate_gravity = compensate_gravity
         self._torque_limits = effort_limits(plant)
 
@@ -170,8 +200,13 @@ class CartesianImpedanceController(LeafSystem):
         )
         bound = gains.bound or WrenchBound(gains.wrench_limits, np.inf, np.inf)
         self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
-        sources = [*self._followed_pose.sources, self._estimated_state_port, *self._requested_bound.sources]
-        self._law = declare.cache(self, "law", self._calc_law, sources)
+        sources = [
+            *self._followed_pose.sources,
+            self._estimated_state_port,
+            *self._requested_bound.sources,
+            self._tuning,
+        ]
+        self._law = declare.cache(self, "law", self._calc_law, [*sources, self._tuning])
         declare.part_output(self, "generalized_force", self._law, lambda law: law.torque, num_joints)
         declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
         declare.part_output(self, "impedance_wrench", self._law, lambda law: law.wrench, 6)
@@ -188,11 +223,54 @@ class CartesianImpedanceController(LeafSystem):
     get_saturation_output_port = output_getter("saturation", "flag that the wrench or a motor is at its limit, (1,)")
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
+    def gains(self, context: Context) -> ImpedanceGains:
+        """Return the gains; `context` is the context of the system."""
+        gains, _ = self._tuning.Eval(context)
+        return gains
+
+    def set_gains(self, context: Context, gains: ImpedanceGains) -> None:
+        """Set the gains in the context of the system.
+
+        Raises:
+            InputError: If the posture has another number of joints, or the bound is not the one of the constructor;
+                lower a bound at ``max_wrench``.
+        """
+        if np.shape(gains.posture) != np.shape(self._gains.posture):
+            raise InputError(f"an impedance's posture must have {len(self._gains.posture)} joints, as in this plant")
+        if gains.bound is not self._gains.bound:
+            raise InputError("the bound of an impedance is constant: keep it, and lower it at the port max_wrench")
+        for index, numbers in zip(self._parameters, _to_numbers(gains), strict=False):
+            context.get_mutable_numeric_parameter(index).SetFromVector(numbers)
+
+    def set_payload(self, context: Context, payload: Payload) -> None:
+        """Set the payload that is compensated, in the context of the system."""
+        numbers = np.array([payload.mass, *payload.center])
+        context.get_mutable_numeric_parameter(self._parameters[-1]).SetFromVector(numbers)
+
+    def _calc_tuning(self, context: Context) -> tuple[ImpedanceGains, Payload]:
+        """Return gains and payload of the context; the gains of the constructor are not converted back."""
+        numbers = [np.array(context.get_numeric_parameter(index).CopyToVector()) for index in self._parameters]
+        *gains, payload = numbers
+        mass, x, y, z = payload.tolist()
+        if all(map(np.array_equal, gains, _to_numbers(self._gains))):
+            return self._gains, Payload(mass, (x, y, z))
+        stiffness, limits, posture, (ratio, posture_stiffness, posture_damping) = gains
+        changed = replace(
+            self._gains,
+            stiffness=stiffness.reshape(6, 6),
+            wrench_limits=limits,
+            posture=posture,
+            damping_ratio=float(ratio),
+            posture_stiffness=float(posture_stiffness),
+            posture_damping=float(posture_damping),
+        )
+        return changed, Payload(mass, (x, y, z))
+
     def _pose(self, context: Context) -> np.ndarray:
         return transform_to_pose(self._tool_center.CalcPose(self._plant_context.Eval(context), self._target))
 
     def _calc_law(self, context: Context) -> JointTorques:
-        plant, gains = self._plant, self._gains
+        plant, (gains, payload) = self._plant, self._tuning.Eval(context)
         plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
         X_TP = self._tool_center.CalcPose(plant_context, self._target)
@@ -208,6 +286,15 @@ class CartesianImpedanceController(LeafSystem):
         gravity_torque = np.zeros_like(v)
         if self._compensate_gravity:
             gravity_torque = -plant.CalcGravityGeneralizedForces(plant_context)
+        if payload.mass > 0.0:
+            world = plant.world_frame()
+            J_center = plant.CalcJacobianTranslationalVelocity(
+                plant_context, JacobianWrtVariable.kV, self._tool_center, np.array(payload.center), world, world
+            )
+            M = M + payload.mass * J_center.T @ J_center
+            if self._compensate_gravity:
+                weight = payload.mass * plant.gravity_field().gravity_vector()
+                gravity_torque = gravity_torque - J_center.T @ weight
         return impedance_torques(
             K=gains.stiffness,
             damping_ratio=gains.damping_ratio,
@@ -227,3 +314,10 @@ class CartesianImpedanceController(LeafSystem):
 
     def _bound(self, context: Context) -> WrenchBound | None:
         return self._requested_bound.eval(context) if self._max_wrench_port.HasValue(context) else self._gains.bound
+
+
+def _to_numbers(gains: ImpedanceGains) -> list[np.ndarray]:
+    """Return the numeric parameters of gains: stiffness (36,), limits (6,), posture (n,), ratio and posture's gains."""
+    scalars = [gains.damping_ratio, gains.posture_stiffness, gains.posture_damping]
+    arrays = (gains.stiffness, gains.wrench_limits, gains.posture, scalars)
+    return [np.asarray(numbers, dtype=float).ravel() for numbers in arrays]

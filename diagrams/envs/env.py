@@ -256,7 +256,7 @@ class DiagramEnv(DrakeGymEnv):
         )
 
     def restore(self, state: EpisodeState) -> np.ndarray:
-        """Continue from a saved state of this environment's diagram; return the observation of that moment.
+        """Continue from a saved state of this environment's diagram; return the observation then, (n,) or (h, w, 3).
 
         Equal actions then give equal observations, rewards and `info`, bit for bit. Later resets without a seed are
         equal as well, because the state includes the random generator.

@@ -30,7 +30,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import damping_matrix, impedance_torques, spring_wrench
 from guiderail.models.control.wrench import WrenchBound
-from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
+from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains, Payload
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
 
 STIFFNESS = np.diag([1500.0, 1000.0, 800.0, 40.0, 30.0, 30.0])
@@ -538,3 +538,64 @@ def _axis_angle(axis, angle):
 
 def _random_rotation(rng):
     return Rotation.random(random_state=rng.integers(1 << 30)).as_matrix()
+
+
+def test_gains_are_parameters_of_the_context():
+    law = Law(seed=1)
+    law.check()
+    pristine = law.context.Clone()
+    posture = law.gains.posture + 0.05
+    turned = np.diag([900.0, 1200.0, 700.0, 20.0, 25.0, 30.0])
+    turned[0, 1] = turned[1, 0] = 100.0
+    gains = ImpedanceGains(turned, np.full(6, 900.0), posture, 0.7, 4.0, 2.0)
+    law.system.set_gains(law.context, gains)
+    changed = {
+        "K": turned,
+        "damping_ratio": 0.7,
+        "wrench_limits": np.full(6, 900.0),
+        "posture_torque": 4.0 * (posture - law.q) - 2.0 * (law.arguments["M"] @ law.v),
+    }
+    law.check(**changed)
+    np.testing.assert_array_equal(law.system.gains(law.context).stiffness, turned)
+    law.context.SetTimeStateAndParametersFrom(pristine)
+    law.check()
+    assert law.system.gains(law.context) is law.gains
+
+
+def test_changed_gains_are_refused_when_they_do_not_fit():
+    law = Law()
+    with pytest.raises(InputError, match="must have 7 joints"):
+        law.system.set_gains(law.context, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(6)))
+    bound = WrenchBound(np.full(6, 3.0), 4.0, 2.0)
+    with pytest.raises(InputError, match="bound of an impedance is constant"):
+        law.system.set_gains(law.context, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7), bound=bound))
+
+
+def test_payload_is_compensated():
+    """A payload of 2 kg at the tool center does not displace the tool if the controller has it as a parameter."""
+    displacements = []
+    for is_known in (True, False):
+        arm = FreeArm(POSTURES[0])
+        if is_known:
+            arm.controller.set_payload(arm.controller_context, Payload(2.0))
+        before = arm.pose()
+        arm.push([0.0, 0.0, -2.0 * 9.81])
+        arm.advance(1.0)
+        displacements.append(displacement(before, arm.pose()))
+    known, unknown = (np.abs(each).max() for each in displacements)
+    assert known < 1e-4
+    assert unknown > 0.01
+
+
+def test_center_of_a_payload_is_relative_to_the_tool_center():
+    law = Law()
+    law.system.set_payload(law.context, Payload(1.5, (0.1, 0.0, 0.0)))
+    first = law["generalized_force"].copy()
+    law.system.set_payload(law.context, Payload(1.5, (0.0, 0.1, 0.0)))
+    assert not np.allclose(law["generalized_force"], first, atol=0.1)
+
+
+@pytest.mark.parametrize("arguments", [(-1.0,), (np.inf,), (1.0, (0.0, 0.0)), (1.0, (np.nan, 0.0, 0.0)), ("a",)])
+def test_payload_is_refused_when_out_of_range(arguments):
+    with pytest.raises(InputError, match="payload"):
+        Payload(*arguments)
