@@ -6,11 +6,14 @@ import hashlib
 import inspect
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
+import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.spaces import Box
 
 from guiderail.diagrams.envs.options import (
     KERNEL_OPTIONS,
@@ -112,6 +115,8 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
             raise InputError(f"{task} has no option {brief(name)}: {did_you_mean(name, options)}")
         if not _is_like(value, options[name]):
             raise InputError(f"{task}'s {name} cannot be {brief(value)}: give a value such as {options[name]!r}")
+    if task in gymnasium.registry:  # of another package, whose defaults may be any objects
+        return dict(arguments)
     values = {name: arguments.get(name, default) for name, default in options.items()}
     return {name: value for name, value in values.items() if value is not inspect.Parameter.empty}
 
@@ -281,7 +286,84 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
         InputError: If the task or an argument is unknown, or options are incompatible.
     """
     arguments = check_environment(task, arguments)
-    return gymnasium.make(environment_id(task), disable_env_checker=True, render_mode=render_mode, **arguments)
+    if render_mode is not None:
+        arguments = {**arguments, "render_mode": render_mode}
+    return gymnasium.make(environment_id(task), disable_env_checker=True, **arguments)
+
+
+class _KeptOpen(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Environment of the caller, which stays open."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def register_environment(env: gymnasium.Env) -> str:
+    """Register an environment that is given as an object with Gymnasium, for this process; return its id."""
+    kind = re.sub(r"\W", "", type(env.unwrapped).__name__) or "Environment"
+    name = f"given/{kind}-v{sum(known.startswith(f'given/{kind}-v') for known in gymnasium.registry)}"
+    entry_point: Any = lambda: _KeptOpen(env)
+    gymnasium.register(name, entry_point=entry_point, disable_env_checker=True, order_enforce=False)
+    return name
+
+
+@dataclass(frozen=True)
+class OtherTask:
+    """What training needs to know about an environment of another package."""
+
+    observation_space: gymnasium.Space[Any]  # observations
+    num_steps: int  # largest number of actions in an episode
+    symmetry: None = None  # no symmetry is known
+    near_symmetry: None = None
+
+
+def trained_task(env: gymnasium.Env, name: str) -> Any:
+    """Return the task of an environment, or an `OtherTask` for an environment of another package.
+
+    Raises:
+        InputError: If an environment of another package has no limit of steps, or its observations or actions are not
+            those that a learner takes.
+    """
+    task = getattr(env.unwrapped, "task", None)
+    if hasattr(env.unwrapped, "trace") and task is not None:
+        return task
+    actions, observations = env.action_space, env.observation_space
+    is_bounded = (
+        isinstance(actions, Box) and len(actions.shape) == 1 and np.isfinite([*actions.low, *actions.high]).all()
+    )
+    if not is_bounded:
+        raise InputError(
+            f"{name} has the actions {brief(actions)}, and a learner needs a Box of shape (A,) with finite bounds: "
+            "wrap the environment"
+        )
+    if not isinstance(observations, Box) or len(observations.shape) != 1:
+        raise InputError(
+            f"{name} has the observations {brief(observations)}, and a learner needs a Box of shape (n,): wrap the "
+            "environment in gymnasium.wrappers.FlattenObservation"
+        )
+    num_steps = _step_limit(env)
+    if num_steps is None:
+        raise InputError(
+            f"{name} has no limit of steps, so that an episode might never end: wrap it in "
+            "gymnasium.wrappers.TimeLimit, or register it with max_episode_steps"
+        )
+    return OtherTask(observations, num_steps)
+
+
+def _step_limit(env: Any) -> int | None:
+    """Return the largest number of actions in an episode; None if no wrapper limits it."""
+    from guiderail.tools.guided.env import GuidedEnv
+
+    repeat, limits = 1, []
+    while isinstance(env, gymnasium.Wrapper):
+        if isinstance(env, gymnasium.wrappers.TimeLimit):
+            limits.append(-(-env._max_episode_steps // repeat))
+        if isinstance(env, GuidedEnv):
+            if (steps := getattr(env.guide, "num_steps", None)) is not None:
+                limits.append(-(-steps // (repeat * env.action_repeat)))
+            repeat *= env.action_repeat
+        env = env.env
+    return min(limits, default=None)
 
 
 def task_of(env: gymnasium.Env, name: str) -> Any:

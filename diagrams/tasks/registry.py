@@ -65,7 +65,7 @@ def check_task_name(name: object) -> None:
     Raises:
         InputError: If there is no such task.
     """
-    if name not in known_tasks():
+    if name not in known_tasks() and name not in gymnasium.registry:
         if str(name).startswith((".", "/", "~")):
             raise InputError(f"there is no task.yaml in {name}: name a folder that guiderail create-task made")
         raise InputError(f"there is no task {brief(name)}: {did_you_mean(name, known_tasks(), IMPORT_HINT)}")
@@ -144,7 +144,9 @@ def register_task_folder(folder: str | Path) -> str:
 
 
 def environment_id(name: str) -> str:
-    """Return the id of a task's environment for `gymnasium.make`."""
+    """Return the id of a task's environment for `gymnasium.make`; an id of another package is returned unchanged."""
+    if name not in TASKS.names() and name in gymnasium.registry:
+        return name
     return f"{name if '/' in name else f'guiderail/{name}'}-v0"
 
 

@@ -12,13 +12,14 @@ from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import pandas as pd
 
 from guiderail.diagrams.tasks.registry import is_task_folder
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import check_environment, task_named
+from guiderail.tools.environments import check_environment, register_environment, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
@@ -102,7 +103,7 @@ def _names_code(config: Mapping[str, Any]) -> bool:
 
 
 def train(
-    task: str | None = None,
+    task: str | gymnasium.Env | None = None,
     guidance: str | None = None,
     *,
     out: Path | str,
@@ -120,7 +121,10 @@ def train(
     """Train a policy and write its run folder.
 
     Args:
-        task: Name of the task, or the path of a task folder; with `resume` it may be left out.
+        task: Name of the task, or the path of a task folder; with `resume` it may be left out. An environment of
+            another package: its id, or an environment such as a `GuidedEnv`, with a limit of steps. Its observations
+            and actions are vectors (Box). The run of an environment that is given as an object can be evaluated and
+            resumed in this process only.
         guidance: Name of the guidance; None for the task's default.
         out: Folder of the run; with `resume`, the folder of the run to continue.
         episodes: Total number of episodes; None for 60.
@@ -144,10 +148,12 @@ def train(
         InputError: If a name is unknown, a value is out of range, the folder is not empty, an argument contradicts the
             run to resume, an episode fails, or learning diverges.
     """
+    if isinstance(task, gymnasium.Env):
+        task = register_environment(task)
     if not (isinstance(task, str | PathLike) or (task is None and resume)):
         raise InputError(
-            f"training needs the name of a task or its folder, not {brief(task)}: register an environment of your own "
-            "with gymnasium.register as guiderail/NAME-v0, and give NAME"
+            f"training needs the name of a task or its folder, an environment, or the id of an environment registered "
+            f"with Gymnasium, not {brief(task)}"
         )
     if not isinstance(out, str | PathLike):
         raise InputError(f"out is the path of the run's folder, not {brief(out)}")
@@ -259,7 +265,10 @@ def draw_pictures(out: Path) -> dict[str, str]:
     from guiderail.tools.visualization.curves import plot_run
     from guiderail.tools.visualization.replay import default_page, write_page
 
-    curve = str(plot_run(out))
+    try:
+        curve = str(plot_run(out))
+    except InputError as error:
+        curve = f"none: {error}"
     try:
         write_page(page := default_page(out, {}), EpisodeSpec.of_policy(out))
         return {"curve": curve, "replay": str(page)}

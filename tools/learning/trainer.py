@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
+from dataclasses import replace
 from numbers import Number
 from typing import TYPE_CHECKING, Any, cast
 
@@ -16,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import make_environment, task_of
+from guiderail.tools.environments import OtherTask, make_environment, trained_task
 from guiderail.tools.evaluation.episode import Callback, PolicyFn
 from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.policies import is_compatible
@@ -108,7 +109,8 @@ def run_training(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
             )
-        arguments = learner_arguments(config, task_of(env, config.task))
+        task = trained_task(env, config.task)
+        arguments = learner_arguments(config, task)
         kind = LEARNERS.get(config.learner.algorithm)
         with _naming_failures(config, f"constructing the learner {getattr(kind, '__name__', brief(kind))}"):
             try:
@@ -149,6 +151,8 @@ def run_training(
                 callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
             )  # fmt: skip
         learner.records_metrics = bool(log)
+        if isinstance(task, OtherTask):
+            config = replace(config, step_log=False)  # only an environment of this package has a trace
         if not resume:
             folder.create(config)
         try:

@@ -20,7 +20,7 @@ from pydrake.systems.framework import Context, EventStatus
 
 from guiderail.diagrams.envs.scene import NEWTONS_PER_METER, Scene, contact_forces, in_plane
 from guiderail.diagrams.guidance.registry import is_demonstrated
-from guiderail.diagrams.tasks.registry import is_task_folder
+from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.primitives import LinearConstraints
@@ -205,6 +205,8 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     Raises:
         InputError: If the task has no animation, or an argument is invalid.
     """
+    if environment_id(episode.task) == episode.task:
+        raise InputError(f"{episode.task} is an environment of another package, which has no animation of guiderail")
     episodes = EPISODES if episodes is None else episodes
     if episodes < 1:
         raise InputError(f"a page shows at least one episode, not {episodes}")

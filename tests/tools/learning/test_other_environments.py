@@ -1,0 +1,92 @@
+"""Training in environments of other packages: registered ids, and environments that are given as objects."""
+
+import numpy as np
+import point_env
+import pytest
+from gymnasium import spaces
+from gymnasium.wrappers import FlattenObservation, TimeLimit
+from point_env import PointEnv
+from spaces_only_env import SpacesOnlyEnv
+
+import guiderail
+from guiderail import GuidedEnv
+from guiderail.models.common.errors import InputError
+from guiderail.tools.cli.main import main
+
+
+def guided(env, **more):
+    keywords = {"pose": point_env.pose, "to_action": point_env.to_action, "period": point_env.PERIOD}
+    frame = lambda env, observation: env.unwrapped.target  # noqa: E731
+    return GuidedEnv(env, demonstrations=point_env.demonstrations(), frame=frame, **keywords | more)
+
+
+@pytest.mark.parametrize("algorithm", ["tqc", "sac", "ppo"])
+@pytest.mark.parametrize("make", [lambda: guided(PointEnv()), lambda: TimeLimit(PointEnv(), 10), lambda: "Pendulum-v1"])
+def test_environment_of_another_package_is_trained(make, algorithm, tmp_path):
+    env = make()
+    run = guiderail.train(env, out=tmp_path / "run", episodes=2, algorithm=algorithm)
+    assert len(run.episodes) == 2
+    assert run.summary["curve"].startswith("none: ") or run.summary["curve"].endswith(".png")
+    result = guiderail.evaluate(run, episodes=2, baselines=())
+    assert result["episodes"] == 2
+    if not isinstance(env, str):
+        env.reset(seed=0)  # training did not close it
+        assert guiderail.evaluate(run.policy, env, 2, baselines=())["mean_return"] == result["mean_return"]
+
+
+def test_resumed_run_is_the_same(tmp_path):
+    for episodes, resume in ((2, False), (4, True)):
+        run = guiderail.train(None if resume else "Pendulum-v1", out=tmp_path / "a", episodes=episodes, resume=resume)
+    other = guiderail.train("Pendulum-v1", out=tmp_path / "b", episodes=4)
+    assert run.episodes["return"].tolist() == other.episodes["return"].tolist()
+
+
+class Endless(PointEnv):
+    """Environment that never ends by itself."""
+
+
+BOX = spaces.Box(-1, 1, (2,))
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Endless(), "has no limit of steps.*TimeLimit"),
+        (FlattenObservation(Endless()), "has no limit of steps.*TimeLimit"),
+        (TimeLimit(SpacesOnlyEnv(BOX, spaces.Discrete(2)), 5), "has the actions Discrete"),
+        (TimeLimit(SpacesOnlyEnv(BOX, spaces.Box(-np.inf, np.inf, (2,))), 5), "with finite bounds"),
+        (TimeLimit(SpacesOnlyEnv(BOX, spaces.Box(-1, 1, (2, 2))), 5), r"a Box of shape \(A,\)"),
+        (TimeLimit(SpacesOnlyEnv(spaces.Dict({"p": BOX}), BOX), 5), "FlattenObservation"),
+        ("CartPole-v1", "has the actions Discrete"),
+    ],
+)
+def test_environment_that_cannot_be_trained_is_refused(env, message, tmp_path):
+    with pytest.raises(InputError, match=message):
+        guiderail.train(env, out=tmp_path / "run", episodes=2)
+    assert not (tmp_path / "run").exists()
+
+
+def test_command_trains_a_registered_environment(tmp_path, capsys):
+    out = tmp_path / "run"
+    with pytest.raises(SystemExit) as end:
+        main(["train", "Pendulum-v1", "--episodes", "1", "--out", str(out), "--algorithm", "sac"])
+    assert end.value.code == 0, capsys.readouterr().err
+    with pytest.raises(SystemExit) as end:
+        main(["evaluate", str(out), "--episodes", "2"])
+    assert end.value.code == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("repeat", [1, 4])
+@pytest.mark.parametrize("limit", [None, 7, 100])
+def test_limit_of_a_guided_environment_counts_actions(repeat, limit):
+    from guiderail.tools.environments import trained_task
+
+    inner = PointEnv() if limit is None else TimeLimit(PointEnv(), limit)
+    env = guided(inner, action_repeat=repeat)
+    bound, count = trained_task(env, "env").num_steps, 0
+    env.reset(seed=0)
+    is_over = False
+    while not is_over:
+        _, _, terminated, truncated, _ = env.step(np.ones(3))
+        count, is_over = count + 1, terminated or truncated
+    assert count <= bound
