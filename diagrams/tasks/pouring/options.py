@@ -18,20 +18,31 @@ from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]
 FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
+NO_FUNNEL = 0.24  # height of a funnel that has no effect, that of the template's ceiling [m]
 # Default input_speed of "sct" with the sparse reward, at which random inputs sometimes succeed.
 SPARSE_INPUT_SPEED = 1.7
 
 
 def make_template(
-    config: PouringConfig, input_speed: float = 1.0, *, shield: bool = False, **aiming: float
+    config: PouringConfig,
+    input_speed: float = 1.0,
+    *,
+    shield: bool = False,
+    pour_distance: float | None = None,
+    funnel: bool = True,
+    **aiming: float,
 ) -> SharedControlTemplate:
     """Return the template for the vessels of `config`, with all speeds multiplied by `input_speed`.
 
     `aiming` is empty, or `aim_speed` and `pour_speed`, fractions of the full speeds. If they are given, inputs can aim
-    the tip: in the state Pour, or with `shield` in a state before it.
+    the tip: in the state Pour, or with `shield` in a state before it. `pour_distance` (at which the state Pour begins,
+    [m]) and `funnel` are those of the template without aiming.
     """
+    changes = {} if pour_distance is None else {"near_m": pour_distance - config.mug.outer_radius}
+    changes |= {} if funnel else {"funnel_m": NO_FUNNEL}
     return load_template(
         ("pouring_shielded" if shield else "pouring_aimed") if aiming else "pouring",
+        **({} if aiming else changes),
         full_speed_m_per_s=input_speed * FULL_SPEED,
         full_tilt_rad_per_s=input_speed * FULL_TILT,
         mug_radius_m=config.mug.outer_radius,
@@ -69,9 +80,10 @@ HARD: Mapping[str, Any] = {
 }
 """Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed."""
 
-THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0}
-"""Options of difficulty="thesis": the pace of the thesis, whose 65 episodes had 149 actions each on average.
+THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0, "pour_distance": 0.1, "funnel": False}
+"""Options of difficulty="thesis": the pace of the thesis, and a template that does not lead to where pouring succeeds.
 
+The 65 episodes of the thesis had 149 actions each on average.
 At the standard speed, the scripted policy pours within 28 actions; at this speed within about 90. Uncorrelated random
 inputs then move the thermos four times less, and a success needs four times as many actions in the right direction.
 """
@@ -117,6 +129,10 @@ class PouringOptions(Options):
     aim_speed: Number = Field(1.0, ge=0.1, le=1.0, description="fraction of the inputs' full speed while aiming")
     pour_speed: Number = Field(0.3, ge=0.1, le=1.0, description="fraction of the full tilting speed in Pour, with aim")
 
+    pour_distance: Number | None = Field(
+        None, ge=0.06, le=0.2, description="distance of the tips at which the template pours, without aim [m]"
+    )
+    funnel: bool = Field(True, description="lead the tip down to the mug's rim by a funnel, without aim")
     shield: bool = Field(False, description="allow to tilt only where the balls fall into the observed mug; needs aim")
 
     @property

@@ -112,6 +112,11 @@ OVER_THE_RIM = (0.045, 0.055)  # [m] goal of the tip: distance from the mug's ax
 POURING_DISTANCE = 0.078  # [m] distance from the mug's opening below which the inputs are only horizontal
 SOFTNESS = 0.03  # [m] distance from the goal below which the inputs are proportional to this distance
 
+ABOVE_THE_RIM = (0.050, 0.12)  # [m] goal of the tip before it is lowered: distance from the mug's axis, height
+ABOVE_TOLERANCE = 0.004  # [m] distance from this goal's radius within which the tip is lowered
+HIGHEST_POUR = 0.0755  # [m] height of the tip below which the state Pour can begin
+DESCENT = -0.6  # vertical input that lowers the tip
+
 # [m] goal of the tip until the state Pour begins: distance from the axis of the estimated mug, height above its rim
 AIM_OVER_THE_RIM = (0.03, 0.045)
 AIM_SOFTNESS = 0.02  # [m] distance from the aim below which the inputs are proportional to this distance
@@ -128,6 +133,23 @@ def scripted_pour(observation: np.ndarray) -> np.ndarray:
         return np.array([*to_axis, 0.0])
     distance, height = OVER_THE_RIM
     return np.clip((np.array([*(-distance * to_axis), height]) - p_MP) / SOFTNESS, -1.0, 1.0)
+
+
+def scripted_pour_from_above(observation: np.ndarray) -> np.ndarray:
+    """Return inputs (3,) that move the tip over the mug, lower it until the state Pour begins, and then tilt.
+
+    With difficulty="thesis", the state Pour begins so early that both balls only fall into the mug from above.
+    """
+    p_MP = observation[:3] / POSITION_SCALE
+    horizontal = float(np.hypot(p_MP[0], p_MP[1]))
+    to_axis = -p_MP[:2] / max(horizontal, 1e-9)
+    distance, height = ABOVE_THE_RIM
+    if np.linalg.norm(p_MP) < THESIS["pour_distance"] and p_MP[2] < HIGHEST_POUR:
+        return np.array([*to_axis, 0.0])
+    if horizontal > distance + ABOVE_TOLERANCE:
+        along = (horizontal - distance) / SOFTNESS
+        return np.clip([*(min(along, 1.0) * to_axis), (height - p_MP[2]) / SOFTNESS], -1.0, 1.0)
+    return np.array([0.0, 0.0, DESCENT])
 
 
 def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
@@ -165,7 +187,7 @@ class Pouring(Task):
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
     "hand_shaped" follows 3.8 to 3.10. With the standard template, a constant action pours the balls into the mug. With
     difficulty="hard", the mug is not at the position that the template assumes. With difficulty="thesis", the
-    template's inputs are as slow as in the thesis.
+    template's inputs are as slow as in the thesis, and its state Pour begins so early that a constant action spills.
     """
 
     workcell_kind = "pouring"
@@ -196,7 +218,12 @@ class Pouring(Task):
         speed = self.options.input_speed or (SPARSE_INPUT_SPEED if is_sparse_sct else 1.0)
         aiming = {"aim_speed": self.options.aim_speed, "pour_speed": self.options.pour_speed}
         self._template = make_template(
-            self._scene_config, speed, shield=self.options.shield, **(aiming if self.options.aim else {})
+            self._scene_config,
+            speed,
+            shield=self.options.shield,
+            pour_distance=self.options.pour_distance,
+            funnel=self.options.funnel,
+            **(aiming if self.options.aim else {}),
         )
 
     def workcell(self) -> PouringConfig:
@@ -344,8 +371,9 @@ class Pouring(Task):
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policies by name; the first one is the default for `difficulty`."""
-        default = scripted_pour_aimed if difficulty == "hard" else scripted_pour
-        policies = (default, scripted_pour, scripted_pour_aimed, scripted_pour_blind)
+        defaults = {"hard": scripted_pour_aimed, "thesis": scripted_pour_from_above}
+        default = defaults.get(difficulty, scripted_pour)
+        policies = (default, scripted_pour, scripted_pour_from_above, scripted_pour_aimed, scripted_pour_blind)
         return {policy.__name__: policy for policy in policies}
 
     def camera(self) -> Camera:

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR, POUR_LINE, THESIS, frames_of, make_template
-from guiderail.diagrams.tasks.pouring.task import scripted_pour, scripted_pour_aimed
+from guiderail.diagrams.tasks.pouring.task import scripted_pour, scripted_pour_aimed, scripted_pour_from_above
 from guiderail.models.common.errors import InputError
 
 AIM_SPEEDS = {"aim_speed": 1.0, "pour_speed": 0.3}
@@ -56,17 +56,21 @@ def test_pour_line_is_at_the_observed_mug(template):
 
 
 @pytest.mark.parametrize(
-    ("options", "policy"),
-    [({"difficulty": "hard", "shield": True}, scripted_pour_aimed), ({"difficulty": "thesis"}, scripted_pour)],
+    ("options", "policy", "ending"),
+    [
+        ({"difficulty": "hard", "shield": True}, scripted_pour_aimed, "success"),
+        ({"difficulty": "thesis"}, scripted_pour_from_above, "success"),
+        ({"difficulty": "thesis"}, scripted_pour, "spill"),
+    ],
 )
-def test_scripted_policy_pours(options, policy):
+def test_scripted_policy_pours_or_spills(options, policy, ending):
     env = make_env("Pouring", guidance="sct", reward="shaped", **options)
     observation, _ = env.reset(seed=5)
     is_over = False
     while not is_over:
         observation, _, terminated, truncated, info = env.step(policy(observation).astype(np.float32))
         is_over = terminated or truncated
-    assert info["termination"] == "success"
+    assert info["termination"] == ending
 
 
 def test_thesis_difficulty_slows_the_inputs():
