@@ -77,7 +77,7 @@ def run_panel(panel: Panel, size: tuple[int, int], every: int | None) -> None:
     env = make_environment(task, panel.environment, render_mode=None if every is None else "rgb_array")
     base: Any = env.unwrapped
     env.reset(seed=0)
-    act, period = panel.act(env), base.task.control_period
+    act, period = panel.act(env), base.diagram.control_period
     images: dict[int, Image.Image] = {}
 
     def look(context: Context) -> EventStatus:

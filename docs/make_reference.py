@@ -699,7 +699,7 @@ def wiring() -> str:
     reference = ReferenceTrajectory(times, np.column_stack([times, times]), np.tile(0.01 * np.eye(2), (20, 1, 1)))
     walls = KeepOut([[5.0, 5.0]], [[6.0, 6.0]], box, margin=0.0)
     skill = PrimitiveConfig(reference, box, period, horizon=4, keep_out=walls)
-    demonstrated = PriorKnowledge(period, demonstrations=skill, pose_size=2)
+    demonstrated = PriorKnowledge(period, primitive=skill, pose_size=2)
     template = PriorKnowledge(period, template=PlacedTemplate(load_template("grid_clamp"), {"hole": RigidTransform()}))
     page = (
         "# Guidance diagrams\n\nConnections in the diagrams of `build_guidance`, here with planar demonstrations "

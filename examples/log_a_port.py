@@ -5,7 +5,7 @@ import numpy as np
 from guiderail import make_env
 
 env = make_env("GridClamp", guidance="sct", action_repeat=5)
-diagram, simulator = env.task.diagram, env.simulator
+diagram, simulator = env.diagram.diagram, env.simulator
 print("systems:", ", ".join(system.get_name() for system in diagram.GetSystems()))
 
 guidance = diagram.GetSubsystemByName("guidance")

@@ -56,7 +56,7 @@ class TaskSpaceTransitions(Callback):
     """
 
     def __init__(self, env: Any, student: OffPolicyLearner, options: Mapping[str, Any]):
-        config = make_prior_knowledge(TASK, **options).demonstrations
+        config = make_prior_knowledge(TASK, **options).primitive
         if config is None:
             raise InputError(f"{TASK} has no demonstrations")
         primitive, self._dims = config.primitive(history=False, constrained=False), list(config.explored_outputs)
@@ -84,7 +84,7 @@ class TaskSpaceTransitions(Callback):
 def make_learner(config: RunConfig, env: Any) -> OffPolicyLearner:
     """Return a learner for the environment of a run's configuration."""
     learner: Any = config.learner
-    return TqcLearner(learner, env, **learner_arguments(config, env.unwrapped.task))
+    return TqcLearner(learner, env, **learner_arguments(config, env.unwrapped.diagram))
 
 
 def train_both(out: Path, episodes: int, refinement: int, seed: int) -> None:
@@ -133,7 +133,7 @@ def times_per_action(out: Path) -> dict[str, float]:
 
     The student's time includes its network, the sum with the motion, and the projection onto the constraints.
     """
-    repeat, prior = configure(TASK, TEACHER).action_repeat, make_prior_knowledge(TASK, **STUDENT).demonstrations
+    repeat, prior = configure(TASK, TEACHER).action_repeat, make_prior_knowledge(TASK, **STUDENT).primitive
     act_as_teacher, observations, _ = teacher_actions(TASK, TEACHER, repeat, Policy.load(out / "teacher"))
     assert prior is not None
     assert prior.keep_out is not None

@@ -114,7 +114,7 @@ def teacher_actions(
         The function of the index of an observation, the random observations (n, …), and the number of outputs O of a
         command.
     """
-    prior = make_prior_knowledge(task, **options).demonstrations
+    prior = make_prior_knowledge(task, **options).primitive
     if prior is None:
         raise InputError(f"{task} has no demonstrations")
     primitive = prior.primitive(history=False)

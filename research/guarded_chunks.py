@@ -73,8 +73,8 @@ def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd
     limits = {} if guard == "none" else {"max_speed": MAX_SPEED, "max_jerk": MAX_JERK}
     env: Any = make_environment(TASK, {**options, "horizon": 15, **limits})
     try:
-        bound = env.unwrapped.task.declaration.options.bound
-        size, period = env.action_space.shape, env.unwrapped.task.control_period
+        bound = env.unwrapped.diagram.task.options.bound
+        size, period = env.action_space.shape, env.unwrapped.diagram.control_period
         limits = [np.repeat(pair, 3) for pair in (MAX_SPEED, MAX_JERK)]
         upper = np.array([bound, bound, np.inf, np.inf, np.inf, np.inf])
 

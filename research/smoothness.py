@@ -232,7 +232,7 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
         return {}
     # The prior knowledge of the same environment, but with an action scale of 1.
     histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
-    config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).demonstrations
+    config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).primitive
     assert config is not None
     indices = np.array(action_dims)
     if method.guidance == "residual":  # positions share one gain, and so do angles, although their deviations differ

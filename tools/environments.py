@@ -302,7 +302,10 @@ def register_environment(env: gymnasium.Env) -> str:
     """Register an environment that is given as an object with Gymnasium, for this process; return its id."""
     kind = re.sub(r"\W", "", type(env.unwrapped).__name__) or "Environment"
     name = f"given/{kind}-v{sum(known.startswith(f'given/{kind}-v') for known in gymnasium.registry)}"
-    entry_point: Any = lambda: _KeptOpen(env)
+
+    def entry_point(**arguments: Any) -> gymnasium.Env[Any, Any]:
+        return _KeptOpen(env)
+
     gymnasium.register(name, entry_point=entry_point, disable_env_checker=True, order_enforce=False)
     return name
 
@@ -324,7 +327,7 @@ def trained_task(env: gymnasium.Env, name: str) -> Any:
         InputError: If an environment of another package has no limit of steps, or its observations or actions are not
             those that a learner takes.
     """
-    task = getattr(env.unwrapped, "task", None)
+    task = getattr(env.unwrapped, "diagram", None)
     if hasattr(env.unwrapped, "trace") and task is not None:
         return task
     actions, observations = env.action_space, env.observation_space
@@ -372,7 +375,7 @@ def task_of(env: gymnasium.Env, name: str) -> Any:
     Raises:
         InputError: If the environment has no task of guiderail.
     """
-    task = getattr(env.unwrapped, "task", None)
+    task = getattr(env.unwrapped, "diagram", None)
     if task is None:
         raise InputError(f"{name} has no task of guiderail, so it can only be evaluated: register a task for it")
     return task

@@ -82,7 +82,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
         )
     return PriorKnowledge(
         period=station.control_period,
-        demonstrations=primitive,
+        primitive=primitive,
         template=call_checked(task, "template") if "template" in provides else None,
         approach=call_checked(task, "approach") if "approach" in provides else None,
         options=task.config.part("guidance"),
@@ -379,7 +379,7 @@ def build_task_diagram(
         contact_results=contact_results_of(station),
         symmetry=task.symmetry() if displaces else None,
         near_symmetry=task.near_symmetry() if displaces else None,
-        declaration=task,
+        task=task,
     )
 
 

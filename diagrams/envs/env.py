@@ -136,7 +136,7 @@ class DiagramEnv(DrakeGymEnv):
             if render_mode != "human" or task.query is None
             else View(task.query, contact_results=task.contact_results)
         )
-        self.task = task = replace(task, view=view)
+        self.diagram = task = replace(task, view=view)
         self.action_repeat = int(action_repeat)
         self.metadata = {}  # the parent class would write its render modes into the class attribute
         super().__init__(
@@ -195,7 +195,7 @@ class DiagramEnv(DrakeGymEnv):
         """Close the environment and its view; the trace stays readable."""
         self._running, self._closed = False, True
         self.simulator.clear_monitor()
-        self.task = replace(self.task, view=None)
+        self.diagram = replace(self.diagram, view=None)
         self._release()
 
     def __reduce_ex__(self, protocol: Any) -> Any:
@@ -229,7 +229,7 @@ class DiagramEnv(DrakeGymEnv):
         self._action_value.GetMutableData().set_value(self._neutral)
         self.sampled, self._failure = {}, None
         with self._record_failure():
-            self.sampled = self.task.randomize(context, self.np_random, dict(options or {}))
+            self.sampled = self.diagram.randomize(context, self.np_random, dict(options or {}))
             self.simulator.Initialize()
         return self._begin_episode()
 
@@ -247,7 +247,7 @@ class DiagramEnv(DrakeGymEnv):
         context = self._pristine.Clone()  # without the values in the caches, which are computed again
         context.SetTimeStateAndParametersFrom(self.simulator.get_context())
         return EpisodeState(
-            diagram=self.task.diagram,
+            diagram=self.diagram.diagram,
             context=context,
             action=self.action_port.Eval(self.simulator.get_context()).copy(),
             rng=self.np_random.bit_generator.state,
@@ -268,7 +268,7 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError("the environment is closed: make another one")
         if not isinstance(state, EpisodeState):
             raise InputError(f"an episode is restored from what save() returned, not from {brief(state)}")
-        if state.diagram is not self.task.diagram:
+        if state.diagram is not self.diagram.diagram:
             raise InputError("this state was saved by an environment with another diagram: save it in this one")
         self.simulator.get_mutable_context().SetTimeStateAndParametersFrom(state.context)
         self._action_value.GetMutableData().set_value(state.action)
@@ -299,7 +299,7 @@ class DiagramEnv(DrakeGymEnv):
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
         info = self._info(
-            0, *self._violations, self._forces(0.0, 0.0), False, dict.fromkeys(self.task.reward_terms, 0.0)
+            0, *self._violations, self._forces(0.0, 0.0), False, dict.fromkeys(self.diagram.reward_terms, 0.0)
         )
         return self._observation, info | self.sampled
 
@@ -320,7 +320,7 @@ class DiagramEnv(DrakeGymEnv):
     def _check_start(self, pose: np.ndarray) -> None:
         """Raise an `InputError` if a coordinate of the first start position (3,) exceeds `MAX_POSITION`."""
         if np.abs(pose[:3]).max() > MAX_POSITION:
-            of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
+            of = "" if self.diagram.task is None else f" of {self.diagram.task.name}"
             raise InputError(
                 f"reset{of} puts the robot at {pose[:3]} m, and at most {MAX_POSITION:g} m are allowed: give poses in "
                 "meters"
@@ -353,9 +353,12 @@ class DiagramEnv(DrakeGymEnv):
 
         total = peak_force = peak_contact_force = 0.0
         commanded_violation = measured_violation = -np.inf
-        terms = dict.fromkeys(self.task.reward_terms, 0.0)
+        terms = dict.fromkeys(self.diagram.reward_terms, 0.0)
         termination, fallback = 0, False
-        first_step, last_step = self._control_steps, min(self._control_steps + self.action_repeat, self.task.num_steps)
+        first_step, last_step = (
+            self._control_steps,
+            min(self._control_steps + self.action_repeat, self.diagram.num_steps),
+        )
         while self._failure is None and not termination and self._control_steps < last_step:
             with self._record_failure():
                 self._advance()
@@ -387,7 +390,7 @@ class DiagramEnv(DrakeGymEnv):
         if not math.isfinite(total):
             raise InputError(f"the reward of {self._control_steps - first_step} control steps overflows: scale it down")
         terminated = termination != 0
-        truncated = not terminated and (self._failure is not None or self._control_steps >= self.task.num_steps)
+        truncated = not terminated and (self._failure is not None or self._control_steps >= self.diagram.num_steps)
         if truncated and self._failure is None:
             termination = Termination.TIME_LIMIT.index
         if self._control_steps == first_step:
@@ -401,7 +404,7 @@ class DiagramEnv(DrakeGymEnv):
 
     def _advance(self) -> None:
         """Advance to the end of the next control step, at a multiple of the period: a sum of periods would drift."""
-        end, time = (self._control_steps + 1) * self.task.control_period, self.simulator.get_context().get_time()
+        end, time = (self._control_steps + 1) * self.diagram.control_period, self.simulator.get_context().get_time()
         if time > end:  # Drake would end the process
             raise InputError(f"the simulator was advanced by hand to {time:g} s: advance it by step() only")
         self.simulator.AdvanceTo(end)
@@ -413,8 +416,8 @@ class DiagramEnv(DrakeGymEnv):
             return None
         if self.render_mode == "rgb_array":
             return self.render_rgb_port.Eval(self.simulator.get_context()).data[:, :, :3].copy()
-        if self.task.view is not None:
-            self.task.view.publish(self.simulator.get_context())
+        if self.diagram.view is not None:
+            self.diagram.view.publish(self.simulator.get_context())
         return None
 
     def push(self, displacement: np.ndarray) -> None:
@@ -426,12 +429,12 @@ class DiagramEnv(DrakeGymEnv):
         Raises:
             InputError: If the task's robot cannot be pushed, or `displacement` is not O finite numbers.
         """
-        if self.task.push is None:
+        if self.diagram.push is None:
             raise InputError("this task has no robot that can be pushed")
         displacement = as_numbers(displacement, "a push")
         if displacement.shape != (self._pose_port.size(),) or not np.isfinite(displacement).all():
             raise InputError(f"a push is {self._pose_port.size()} finite numbers, not {displacement}")
-        self.task.push(self.simulator.get_mutable_context(), displacement)
+        self.diagram.push(self.simulator.get_mutable_context(), displacement)
 
     def _check_action(self, action: Any) -> np.ndarray:
         try:
@@ -454,7 +457,7 @@ class DiagramEnv(DrakeGymEnv):
         observation = self.observation_port.Eval(context).astype(self.observation_space.dtype)
         # Without this check a learner would diverge several episodes later.
         if not np.isfinite(observation).all():
-            of = "" if self.task.declaration is None else f" of {self.task.declaration.name}"
+            of = "" if self.diagram.task is None else f" of {self.diagram.task.name}"
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 

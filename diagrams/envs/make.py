@@ -130,7 +130,7 @@ def make_env(
 
     Args:
         task: Configuration, or name of the task, or path of a task folder.
-        render_mode: None, "human" (browser view at `env.unwrapped.task.meshcat.web_url()`) or "rgb_array".
+        render_mode: None, "human" (browser view at `env.unwrapped.diagram.meshcat.web_url()`) or "rgb_array".
         before_build: Function that is called with the builder of the environment's diagram before it is built, and may
             add systems to it: loggers, visualizers, publishers. Its subsystems "station" and "guidance" have the ports.
         options: Options of the environment, if `task` is not a configuration; `guiderail list TASK` lists them.
@@ -152,10 +152,10 @@ def make_env(
     built = _POOL.acquire(key, lambda: _build(new_task, exported, before_build))
     # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
     # task that built the diagram. The hidden values of a run belong to the new task alone.
-    assert built.diagram.declaration is not None
-    new_task.episode_constants = built.diagram.declaration.episode_constants
+    assert built.diagram.task is not None
+    new_task.episode_constants = built.diagram.task.episode_constants
     randomize = make_randomize(new_task, built.station, built.guidance)
-    diagram = replace(built.diagram, randomize=randomize, declaration=new_task)
+    diagram = replace(built.diagram, randomize=randomize, task=new_task)
     release = partial(_POOL.release, key, built)
     try:
         return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)

@@ -120,7 +120,7 @@ class TaskDiagram:
         view: Browser view of an environment made with `render_mode="human"`.
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
         near_symmetry: `symmetry`, extended by symmetries that hold only for most of an episode.
-        declaration: `Task` that the diagram was built from, if there is one.
+        task: `Task` that the diagram was built from, if there is one.
 
     Raises:
         InputError: If the diagram lacks a port, the size of the observation does not match its space,
@@ -140,7 +140,7 @@ class TaskDiagram:
     view: View | None = None
     symmetry: Symmetry | None = None
     near_symmetry: Symmetry | None = None
-    declaration: Any = None
+    task: Any = None
 
     @property
     def meshcat(self) -> Meshcat | None:

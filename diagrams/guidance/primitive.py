@@ -19,8 +19,8 @@ from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
     """Return the configuration of the prior's primitive; the prior must have demonstrations."""
-    assert prior.demonstrations is not None
-    return prior.demonstrations
+    assert prior.primitive is not None
+    return prior.primitive
 
 
 def refuse_limits(config: PrimitiveConfig) -> None:

@@ -234,7 +234,8 @@ class PriorKnowledge:
 
     Attributes:
         period: Control period [s].
-        demonstrations: Demonstrations with constraints, keep-out walls, and the range of a policy's action.
+        primitive: Movement primitive of demonstrations with constraints, keep-out walls, and the range of a policy's
+            action.
         template: Shared control template and the poses of its objects.
         approach: Scripted approach.
         options: Options of the guidance by name; empty if it declares none.
@@ -246,7 +247,7 @@ class PriorKnowledge:
     """
 
     period: float
-    demonstrations: PrimitiveConfig | None = None
+    primitive: PrimitiveConfig | None = None
     template: PlacedTemplate | None = None
     approach: ScriptedApproach | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -260,11 +261,11 @@ class PriorKnowledge:
     @property
     def constraints(self) -> LinearConstraints:
         """Linear constraints on a commanded pose (O,); no rows without demonstrations."""
-        config = self.demonstrations
+        config = self.primitive
         return LinearConstraints.none(self.pose_size) if config is None else config.constraints
 
     def has(self, requirement: str) -> bool:
         """Return True if the task provides a requirement: "demonstrations", "keep_out", "template" or "approach"."""
         if requirement == "keep_out":
-            return self.demonstrations is not None and self.demonstrations.keep_out is not None
-        return getattr(self, requirement) is not None
+            return self.primitive is not None and self.primitive.keep_out is not None
+        return getattr(self, "primitive" if requirement == "demonstrations" else requirement) is not None

@@ -119,7 +119,7 @@ class ResidualGuidance(PrimitiveGuidance):
 )
 def residual(prior: PriorKnowledge) -> Diagram:
     """Build residual RL with demonstrations, or with a scripted approach and active constraints."""
-    return ResidualGuidance(prior) if prior.demonstrations is not None else ResidualDescent(prior)
+    return ResidualGuidance(prior) if prior.primitive is not None else ResidualDescent(prior)
 
 
 @register_guidance(

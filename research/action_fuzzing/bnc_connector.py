@@ -99,7 +99,7 @@ class Penetration(EnvCallback):
     def on_episode_start(self) -> None:
         """Clear the recorded depths."""
         self._context = self.base.simulator.get_context()
-        self._plant = self.base.task.diagram.GetSubsystemByName("station").plant
+        self._plant = self.base.diagram.diagram.GetSubsystemByName("station").plant
         self._depths: list[tuple[float, float]] = []
 
     def on_step(self, transition: Transition) -> None:

@@ -84,7 +84,7 @@ class RecomputedViolation(EnvCallback):
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `recomputed_violation`."""
-        task: Task | None = getattr(self.base.task, "declaration", None)
+        task: Task | None = getattr(self.base.diagram, "task", None)
         if task is None or not len(self.base.trace):
             return {"recomputed_violation": -np.inf}
         return {"recomputed_violation": float(self._violations(task).max())}

@@ -83,7 +83,7 @@ def _policy(observations: int, actions: int) -> Policy:
 def _parts() -> list[Row]:
     number = round(SECONDS / PERIOD)
     policy, observation = _policy(13, 2), np.zeros(13, np.float32)
-    config = make_prior_knowledge(TASK, guidance="skgrl").demonstrations
+    config = make_prior_knowledge(TASK, guidance="skgrl").primitive
     assert config is not None
     rows = [_row("policy", ACTION_REPEAT * CONTROL_PERIOD, _timed(lambda index: policy(observation), number))]
     rng = np.random.default_rng(0)

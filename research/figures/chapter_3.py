@@ -53,7 +53,7 @@ def figure_3_4(out: Path) -> dict[str, Any]:
     """Render the scene with the frames of the tips of thermos and mug."""
     env: Any = make_environment("Pouring", {"guidance": "sct"}, render_mode="rgb_array")
     env.reset(seed=0)
-    diagram, task = env.unwrapped.task.diagram, env.unwrapped.task.declaration
+    diagram, task = env.unwrapped.diagram.diagram, env.unwrapped.diagram.task
     X_WT = PouringConfig().X_WT
     pose = diagram.GetOutputPort("pose").Eval(env.unwrapped.simulator.get_context())
     frames = {"mug tip": X_WT, "thermos tip": X_WT @ pose_to_transform(pose)}

@@ -48,7 +48,7 @@ PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10
 
 def primitive_of(kind: str, variance: float = THESIS_VARIANCE) -> LcNsKmp:
     """Return the primitive of the narrow passage, with a history for sKGRL."""
-    config = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).demonstrations
+    config = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).primitive
     assert config is not None
     return config.primitive(history=kind == "skgrl")
 

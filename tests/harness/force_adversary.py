@@ -46,7 +46,7 @@ def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
         rng = np.random.default_rng([SEED, episode])
         act = attack(ATTACKS[episode % len(ATTACKS)], rng, env.action_space.shape[0])
         *_, info = env.reset(seed=SEED + episode, options={"new_run": True})
-        limit = info.get("force_limit", env.task.declaration.collision.above)
+        limit = info.get("force_limit", env.diagram.task.collision.above)
         terminated = truncated = False
         unfiltered = watch_contact(env)
         while not (terminated or truncated):
@@ -72,7 +72,7 @@ def run_case(task: str, steps: int, **options: object) -> dict[str, object]:
 
 def watch_contact(env: object) -> list[float]:
     """Return a list to which every step of Drake's plant adds the norm of the contact forces [N]; [0] in MuJoCo."""
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     contact, forces = plant.get_contact_results_output_port(), [0.0]
 
     def add(root: Context) -> EventStatus:
@@ -91,7 +91,7 @@ def watch_contact(env: object) -> list[float]:
 
 def tank_content(env: object) -> float:
     """Return the energy in the station's tank [J], infinite without a tank."""
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     if not station.HasSubsystemNamed("tank"):
         return np.inf
     tank = station.GetSubsystemByName("tank")

@@ -23,7 +23,7 @@ PROGRESS = {
 
 def set_held(env: object, is_held: bool) -> None:
     """Lock or unlock all joints of the gantry."""
-    diagram = env.task.diagram
+    diagram = env.diagram.diagram
     plant = diagram.GetSubsystemByName("station").plant
     context = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context())
     plant.SetVelocities(context, np.zeros(plant.num_velocities()))
@@ -42,7 +42,7 @@ def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> 
         begin: Time at which the robot is locked [s]; None: never.
         seconds: Time for which the robot is locked [s].
     """
-    period = env.task.control_period
+    period = env.diagram.control_period
     first = None if begin is None else round(begin / period)
     last = None if begin is None else round((begin + seconds) / period)
     observation, info = env.reset(seed=seed, options={"held_out": True})
@@ -52,7 +52,7 @@ def run_episode(env: object, seed: int, begin: float | None, seconds: float) -> 
         if step in (first, last):
             set_held(env, step == first)
         observation, _, terminated, truncated, info = env.step(scripted_center_of_pressure(observation))
-    port = env.task.diagram.GetOutputPort("motion_time")
+    port = env.diagram.diagram.GetOutputPort("motion_time")
     delay = round_period(period) * info["control_steps"] - float(port.Eval(env.simulator.get_context())[0])
     return {**info, "delay": delay}
 

@@ -92,7 +92,7 @@ def pushing_action(
 def attack(steps: int, seed: int = 0) -> dict[str, Result]:
     """Execute at least `steps` steps; return the result for each kind of constraints."""
     rng, results, rounds = np.random.default_rng(seed), {kind: Result() for kind in KINDS}, 0
-    config = make_prior_knowledge("NarrowPassage").demonstrations
+    config = make_prior_knowledge("NarrowPassage").primitive
     while sum(result.steps for result in results.values()) < steps:
         kind, radius = KINDS[rounds % len(KINDS)], float(rng.choice([0.01, 0.03, 0.08]))
         rounds += 1

@@ -31,7 +31,7 @@ def registration():
 
 def primitive(**options):
     """Return the movement primitive of the narrow passage under KGRL with environment options."""
-    return make_prior_knowledge("NarrowPassage", guidance="kgrl", **options).demonstrations.primitive(history=False)
+    return make_prior_knowledge("NarrowPassage", guidance="kgrl", **options).primitive.primitive(history=False)
 
 
 def test_environment_uses_a_registered_kernel():

@@ -310,7 +310,7 @@ def test_observation_is_centered_and_scaled_by_entry():
     declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
     env = make_env("lab/Own", guidance="kmp")
     observation, _ = env.reset(seed=0)
-    x, y = env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
+    x, y = env.diagram.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
     np.testing.assert_allclose(observation, [-(y - 0.5), (x - 0.5) / 2.0], rtol=1e-6)
 
 

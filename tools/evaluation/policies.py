@@ -471,7 +471,7 @@ def _describe_mismatch(
             return f"{raised}, for observations of shape {env.observation_space.shape}"
     takes = "cannot take these observations" if observation_shape is None else f"takes observations {observation_shape}"
     returns = "" if action_shape is None else f" and returns actions {action_shape}"
-    declaration = getattr(getattr(env.unwrapped, "task", None), "declaration", None)
+    declaration = getattr(getattr(env.unwrapped, "diagram", None), "task", None)
     config = getattr(declaration, "config", None)  # None for an environment of another origin
     task, options = ("", {}) if config is None else (config.task, config.options)
     changed = [

@@ -78,7 +78,7 @@ def rollout(
         callbacks = (act, *callbacks)
     for callback in callbacks:
         callback.on_episode_start()
-    total, terms = 0.0, dict.fromkeys(base.task.reward_terms if is_own else (), 0.0)
+    total, terms = 0.0, dict.fromkeys(base.diagram.reward_terms if is_own else (), 0.0)
     infos: list[Mapping[str, Any]] = []  # `info` of each step, for an environment without a trace
     is_over = False
     while not is_over:

@@ -56,7 +56,7 @@ class Frames(EnvCallback):
             return
         if len(self.frames) == self._max_frames:
             self.frames, self._stride = self.frames[::2], 2 * self._stride
-        time = len(self.base.trace) * self.base.task.control_period
+        time = len(self.base.trace) * self.base.diagram.control_period
         self.frames.append((time, float(self.base.trace.force[-1]), self.env.render()))
 
     def select(self, number: int) -> list[Any]:
@@ -136,7 +136,7 @@ def path_in_picture(base: Any) -> np.ndarray:
 
     The result is empty if the task has no camera.
     """
-    task = base.task.declaration
+    task = base.diagram.task
     camera = None if task is None else task.camera()
     return np.empty((0, 2)) if camera is None else camera.project(task.scene().to_world(base.trace.measured))
 

@@ -52,10 +52,10 @@ class MotionRecorder(EnvCallback):
     def __init__(self, env: Any):
         """Construct the callback of an environment that was made with `render_mode="human"` and was reset."""
         super().__init__(env)
-        self._query = self.base.task.query
+        self._query = self.base.diagram.query
         self._system = self._query.get_system()
-        self._period = self.base.task.control_period
-        self._contact_results = self.base.task.contact_results
+        self._period = self.base.diagram.control_period
+        self._contact_results = self.base.diagram.contact_results
         self._poses: list[np.ndarray] = []
         self._contacts: list[np.ndarray] = []  # points and forces, (CONTACTS, 6) each
         self._actions: list[np.ndarray] = []
@@ -108,7 +108,7 @@ class MotionRecorder(EnvCallback):
             "commanded": largest(signals["commanded_violation"]),
             "measured": largest(signals["measured_violation"]),
             "action": [_with_first(values) for values in np.array(self._actions)[ends].T] if len(ends) else [],
-            "time": [0.0, *(round(float(100 * (n + 1) / self.base.task.num_steps), 2) for n in ends)],
+            "time": [0.0, *(round(float(100 * (n + 1) / self.base.diagram.num_steps), 2) for n in ends)],
         }
         if "state" in signals and len(ends):
             data["state"] = _with_first(signals["state"].ravel()[ends])
@@ -219,7 +219,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     base.simulator.set_target_realtime_rate(0.0)
     env.reset(seed=episode.run_seed)
 
-    task = base.task.declaration
+    task = base.diagram.task
     scene = Scene(to_world=in_plane) if task is None else task.scene()
     constraints = None if task is None else task.constraints()
     is_demonstration = is_demonstrated(episode.environment.get("guidance"))

@@ -243,7 +243,7 @@ def test_episode_ends_when_the_engine_lacks_contact_memory(warning, monkeypatch)
 def test_engine_bodies_have_the_offsets_of_the_reset():
     env = make_env("BncConnector", station="mujoco", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=2)
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))
     model = station.gantry.model
     X_TT = RigidTransform([*info["jack_offset"], 0.0])

@@ -114,7 +114,7 @@ def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty,
         env.reset(seed=seed, options={"held_out": True})
         while not any(env.step(np.zeros(2))[2:4]):
             pass
-        y, period = env.trace.commanded, env.task.control_period
+        y, period = env.trace.commanded, env.diagram.control_period
         for regime in ("free", "budgeted"):
             bounds = {name: np.array(certificate[regime][name])[: len(y)] for name in ("lower", "upper", "speed")}
             assert (y >= bounds["lower"] - 1e-7).all()
@@ -143,12 +143,12 @@ def test_declared_start_adds_pose_bias_and_start_offset():
 def test_history_begins_within_the_declared_offset(options):
     env = make_env("BncConnector", guidance="skgrl", **options)
     within = declared_start("BncConnector", **options)
-    declared = env.task.declaration
+    declared = env.diagram.task
     start = declared.constraints().nearest(declared.reference().means[0])
     farthest = np.zeros(6)
     for seed in range(20):
         env.reset(seed=seed, options={"held_out": True})
-        history = env.task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("history")
+        history = env.diagram.diagram.GetSubsystemByName("guidance").GetSubsystemByName("history")
         context = history.GetMyContextFromRoot(env.simulator.get_context())
         offset = history.get_history_output_port().Eval(context).reshape(-1, 6) - start
         farthest = np.maximum(farthest, np.abs(offset).max(axis=0))

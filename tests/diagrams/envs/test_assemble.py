@@ -47,7 +47,7 @@ def test_prior_is_refused_when_the_control_period_differs(period):
 
 def test_prior_is_accepted_when_clock_factor_changes_the_period():
     env = make_env("BncConnector", clock_factor=0.5)
-    assert env.unwrapped.task.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
+    assert env.unwrapped.diagram.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
 
 
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])

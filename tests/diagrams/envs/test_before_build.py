@@ -23,7 +23,7 @@ def test_logger_added_before_build_records_an_episode():
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(3))
-    log = env.task.diagram.GetSubsystemByName("log")
+    log = env.diagram.diagram.GetSubsystemByName("log")
     assert isinstance(log, VectorLogSink)
     data = log.FindLog(env.simulator.get_context()).data()
     np.testing.assert_array_equal(data[:, 1:].T, env.trace.measured)
@@ -33,7 +33,7 @@ def test_logger_added_before_build_records_an_episode():
 def test_diagram_with_additional_systems_is_not_shared():
     first = make_env("GridClamp", guidance="sct", before_build=log_pose)
     first.close()
-    assert not make_env("GridClamp", guidance="sct").task.diagram.HasSubsystemNamed("log")
+    assert not make_env("GridClamp", guidance="sct").diagram.diagram.HasSubsystemNamed("log")
 
 
 def test_skill_takes_additional_systems():
@@ -55,7 +55,7 @@ def test_station_exports_contact_results(task, options):
     env = make_env(task, **options)
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape))
-    port = env.task.contact_results
+    port = env.diagram.contact_results
     results = port.Eval(port.get_system().GetMyContextFromRoot(env.simulator.get_context()))
     assert isinstance(results, ContactResults)
 
@@ -72,7 +72,7 @@ def press(env, on_step):
 
 def test_contact_forces_are_sorted_and_plausible():
     env = make_env("GridClamp", guidance="sct", action_repeat=5)
-    port, largest = env.task.contact_results, []
+    port, largest = env.diagram.contact_results, []
 
     def measure(context):
         found = contact_forces(port.Eval(port.get_system().GetMyContextFromRoot(context)))
@@ -88,7 +88,7 @@ def test_contact_forces_are_sorted_and_plausible():
 def test_view_draws_contacts(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")
     env = make_env("GridClamp", guidance="sct", action_repeat=5)
-    view = View(env.task.query, contact_results=env.task.contact_results)
+    view = View(env.diagram.query, contact_results=env.diagram.contact_results)
     press(env, view.publish)
     assert view.meshcat.HasPath("/drake/contact_forces/hydroelastic")
 

@@ -53,10 +53,10 @@ def test_step_and_reference_have_the_given_control_period():
     env.reset(seed=0)
     for number in range(3):
         env.step(np.array([1.0, -1.0]))
-        assert env.simulator.get_context().get_time() == (number + 1) * env.task.control_period
-    primitive = make_prior_knowledge("NarrowPassage", control_period=0.1).demonstrations
+        assert env.simulator.get_context().get_time() == (number + 1) * env.diagram.control_period
+    primitive = make_prior_knowledge("NarrowPassage", control_period=0.1).primitive
     np.testing.assert_allclose(np.diff(primitive.reference.times), primitive.control_period, rtol=1e-9)
-    assert primitive.control_period == env.task.control_period == 50 * env.task.declaration.time_unit
+    assert primitive.control_period == env.diagram.control_period == 50 * env.diagram.task.time_unit
 
 
 @pytest.mark.parametrize(
@@ -76,7 +76,7 @@ def test_control_period_is_refused_when_out_of_range(task, options, message):
 
 
 def test_period_is_accepted_when_a_multiple_of_the_plants():
-    assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).task.control_period == 3 * PLANT_PERIOD
+    assert make_env("GridClamp", control_period=3 * PLANT_PERIOD).diagram.control_period == 3 * PLANT_PERIOD
 
 
 def test_hardware_period_is_a_multiple_of_the_drivers():
@@ -95,10 +95,10 @@ def test_hardware_period_is_a_multiple_of_the_drivers():
 def test_plant_has_equal_numbers_of_steps_in_all_control_periods(station, milliseconds):
     env = make_env("GridClamp", guidance="sct", station=station, time_step=1e-3 * milliseconds, action_repeat=1)
     env.reset(seed=0)
-    inner = env.task.diagram.GetSubsystemByName("station")
+    inner = env.diagram.diagram.GetSubsystemByName("station")
     count, times = round(20 / milliseconds), []
     env.simulator.set_monitor(lambda context: times.append(context.get_time()))
-    assert env.task.control_period == count * inner.plant.time_step() == pytest.approx(0.02, abs=1e-9)
+    assert env.diagram.control_period == count * inner.plant.time_step() == pytest.approx(0.02, abs=1e-9)
     for _ in range(7):
         env.step(np.zeros(3))
     assert times == [index * inner.plant.time_step() for index in range(1, 7 * count + 1)]
@@ -109,7 +109,7 @@ def test_control_period_is_a_multiple_of_any_time_step(control_period, time_step
     env = make_env("BncConnector", guidance="kgrl", control_period=control_period, time_step=time_step)
     env.reset(seed=0)
     env.step(np.zeros(env.action_space.shape))
-    assert env.simulator.get_context().get_time() == env.action_repeat * env.task.control_period
+    assert env.simulator.get_context().get_time() == env.action_repeat * env.diagram.control_period
 
 
 @pytest.mark.parametrize(
@@ -176,7 +176,7 @@ def test_own_task_has_the_given_control_period(own_tasks, period):
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(2))
-    assert env.task.declaration.control_period == env.task.control_period == pytest.approx(period or 0.02, rel=1e-9)
+    assert env.diagram.task.control_period == env.diagram.control_period == pytest.approx(period or 0.02, rel=1e-9)
     # The demonstrated speed is 0.5 m/s at every control period.
     assert env.trace.commanded[4, 1] - env.trace.commanded[3, 1] == pytest.approx(0.5 * (period or 0.02), rel=0.1)
 

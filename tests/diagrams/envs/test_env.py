@@ -139,7 +139,7 @@ def test_reset_sets_the_held_action_to_zero():
     env.reset(options={"start": 0.0})
     env.simulator.AdvanceTo(PERIOD)
     assert env.trace.measured.size == 0
-    assert env.task.diagram.GetOutputPort("pose").Eval(env.simulator.get_context()) == [0.0]
+    assert env.diagram.diagram.GetOutputPort("pose").Eval(env.simulator.get_context()) == [0.0]
 
 
 def test_starts_repeat_only_when_the_seed_is_equal():
@@ -388,7 +388,7 @@ def test_info_keys_match_the_declared_keys():
     env.reset()
     env.step([0.0])
     keys |= set(env.step([0.0])[4])
-    assert keys - set(env.task.reward_terms) == set(INFO_KEYS)
+    assert keys - set(env.diagram.reward_terms) == set(INFO_KEYS)
 
 
 def test_step_is_refused_before_a_reset_and_after_the_end():

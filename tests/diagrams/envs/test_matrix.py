@@ -50,7 +50,7 @@ def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
 def test_station_and_guidance_have_the_declared_ports(task):
     for name in TASKS.get(task).stations():
         if STATIONS.get(name).is_simulated:
-            diagram = make_env(task, station=name).task.diagram
+            diagram = make_env(task, station=name).diagram.diagram
         else:
             with pytest.raises(InputError, match="guiderail deploy"):
                 make_env(task, station=name)

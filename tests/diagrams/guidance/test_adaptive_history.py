@@ -25,7 +25,7 @@ def skill():
 
 def rollout(skill, actions, forces, kind="skgrl"):
     """Return commands and history lengths of every control step; the measured pose is the commanded pose."""
-    guidance = build_guidance(kind, PriorKnowledge(PERIOD, demonstrations=skill))
+    guidance = build_guidance(kind, PriorKnowledge(PERIOD, primitive=skill))
     simulator = Simulator(guidance)
     context = simulator.get_mutable_context()
     action = guidance.GetInputPort("action").FixValue(context, [0.0, 0.0])

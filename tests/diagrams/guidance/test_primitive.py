@@ -41,7 +41,7 @@ def skill():
 
 
 def build(kind, skill, task="this task"):
-    return build_guidance(kind, PriorKnowledge(skill.control_period, demonstrations=skill), task)
+    return build_guidance(kind, PriorKnowledge(skill.control_period, primitive=skill), task)
 
 
 def rollout(guidance, actions, pose=START, track=True):

@@ -21,7 +21,7 @@ def test_symmetry_is_absent_when_actions_do_not_displace(size, monkeypatch):
 
     env = make_env("BncConnector", guidance="own")
     assert env.action_space.shape == (size,)
-    assert env.task.symmetry is env.task.near_symmetry is None
+    assert env.diagram.symmetry is env.diagram.near_symmetry is None
     env.reset(seed=0)
     env.step(np.zeros(size))
 
@@ -39,8 +39,8 @@ def test_symmetry_is_present_when_actions_displace_outputs():
         "residual_tangent",
     }
     env = make_env("BncConnector", guidance="kgrl")
-    np.testing.assert_array_equal(env.task.symmetry.actions, [-np.eye(2)])
-    assert len(env.task.near_symmetry.actions) > 1
+    np.testing.assert_array_equal(env.diagram.symmetry.actions, [-np.eye(2)])
+    assert len(env.diagram.near_symmetry.actions) > 1
 
 
 def test_guidance_without_a_port_is_refused_by_its_name(monkeypatch):

@@ -162,7 +162,7 @@ def test_arm_has_two_input_ports_and_set_pose_is_exact(robot):
 
 def test_environment_selects_robot_by_name():
     env = make_env("GridClamp", station="arm", robot="ur5e")
-    assert env.task.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
+    assert env.diagram.diagram.GetSubsystemByName("station").plant.HasBodyNamed("ur5e_forearm")
     with pytest.raises(InputError, match="did you mean ur5e"):
         make_env("GridClamp", station="arm", robot="ur5")
     with pytest.raises(InputError, match="no option 'robot' here: it is an option of station='arm'"):

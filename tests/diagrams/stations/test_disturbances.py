@@ -35,7 +35,7 @@ def undisturbed():
 
 def test_station_is_undisturbed_by_default(undisturbed):
     env, _, info = undisturbed
-    assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
+    assert not isinstance(env.diagram.diagram.GetSubsystemByName("station"), DisturbedStation)
     assert "friction_factor" not in info
     assert not EnvConfig.resolve("GridClamp", {}).parts["disturbances"].is_active
     assert not Disturbances.model_validate({}).is_active
@@ -60,7 +60,7 @@ def test_contact_factors_are_applied_at_every_reset():
 
     def surfaces():
         """Return the proximity properties of the surfaces of clamp and table by name."""
-        station = env.task.diagram.GetSubsystemByName("station")
+        station = env.diagram.diagram.GetSubsystemByName("station")
         query = station.scene_graph.get_query_output_port().Eval(
             station.scene_graph.GetMyContextFromRoot(env.simulator.get_context())
         )
@@ -84,15 +84,15 @@ def test_smaller_stiffness_leads_to_a_smaller_force(undisturbed):
 
 def test_clock_factor_scales_the_control_period():
     env, _, _ = descend(1, clock_factor=1.5)
-    assert env.task.control_period == pytest.approx(3 * PLANT_PERIOD)
-    assert env.task.control_period != CONTROL_PERIOD
+    assert env.diagram.control_period == pytest.approx(3 * PLANT_PERIOD)
+    assert env.diagram.control_period != CONTROL_PERIOD
 
 
 def test_disturbed_period_is_a_multiple_of_the_plant_step():
     # The plant's time step is a quarter of the control period.
     fine = {"impedance_control": "cartesian", "bounded_force": False}
     env = make_env("GridClamp", clock_factor=1.25, **fine)
-    assert env.task.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
+    assert env.diagram.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
     for factor, options in ((1.3, fine), (1.5, {"time_step": CONTROL_PERIOD})):
         with pytest.raises(InputError, match="whole multiple of the plant's"):
             make_env("GridClamp", clock_factor=factor, **options)
@@ -117,7 +117,7 @@ def test_late_commands_delay_the_tool(undisturbed):
 
 def test_lost_commands_are_independent_of_the_noise():
     env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, action_repeat=1)
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
     env.reset(seed=1)
     root = env.simulator.get_context()
@@ -136,7 +136,7 @@ def test_lost_commands_are_independent_of_the_noise():
 def test_payload_is_added_to_the_tool_mass_of_an_arm():
     env = make_env("GridClamp", station="arm", payload=0.3)
     env.reset(seed=0)
-    arm = env.task.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
+    arm = env.diagram.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
     tool = arm.arm.tool[0]
     mass = tool.get_mass(arm.plant.GetMyContextFromRoot(env.simulator.get_context()))
     assert mass == pytest.approx(tool.default_mass() + 0.3)

@@ -97,7 +97,7 @@ def test_station_raises_when_the_time_step_is_unstable(impedance, monkeypatch):
 
 def test_environment_selects_the_impedance_control():
     env = make_env("BncConnector", impedance_control="cartesian")
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     assert station.HasSubsystemNamed("controller")
     assert station.plant.time_step() == PLANT_PERIOD / 2
     with pytest.raises(InputError, match="did you mean cartesian"):

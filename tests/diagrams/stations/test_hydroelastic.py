@@ -26,7 +26,7 @@ def test_insertion_has_no_point_contact(case):
     task, options, action, reset_options = CASES[case]
     env = make_env(task, **options)
     env.reset(seed=0, options=reset_options)
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
     surfaces, points, has_ended = 0, 0, False
     while not has_ended:

@@ -17,7 +17,7 @@ TARE_STEPS = TARE_SKIPPED + TARE_AVERAGED
 def free_motion(env, steps=45, seed=3):
     """Return measured and exact wrenches (steps, 6) [N, Nm] without contact, and the reset's info."""
     _, info = env.reset(seed=seed)
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     exact = []
     for _ in range(steps):
         env.step(np.zeros(env.action_space.shape))
@@ -72,7 +72,7 @@ def test_calibration_error_displaces_tool_from_measurement():
     _, info = env.reset(seed=1)
     for _ in range(30):
         env.step(np.zeros(2))
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     inner = station.GetSubsystemByName("station")
     true_pose = inner.get_pose_output_port().Eval(inner.GetMyContextFromRoot(env.simulator.get_context()))
     np.testing.assert_allclose(env.trace.measured[-1] - true_pose, info["calibration_error"], atol=1e-9)
@@ -136,7 +136,7 @@ def test_hardware_station_is_tared_and_adds_no_errors(sensing, is_tared):
 
 def test_exact_setting_adds_no_disturbances():
     env = make_env("BncConnector", sensing="exact", **HARD)
-    assert not isinstance(env.task.diagram.GetSubsystemByName("station"), DisturbedStation)
+    assert not isinstance(env.diagram.diagram.GetSubsystemByName("station"), DisturbedStation)
 
 
 @pytest.mark.parametrize(

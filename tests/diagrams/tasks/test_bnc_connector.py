@@ -108,7 +108,7 @@ def observe_on_rim(kmp):
 
 
 def test_contact_on_the_rim_is_invariant_under_a_half_turn(kmp, observe_on_rim):
-    signs = np.diag(kmp.task.symmetry.observations[0])
+    signs = np.diag(kmp.diagram.symmetry.observations[0])
     is_reversed = signs < 0
     direct, turned = observe_on_rim(1.0, 0.5), signs * observe_on_rim(-1.0, -0.5)
     torques = slice(10, 12)
@@ -163,9 +163,9 @@ def test_single_demonstration_requires_prior_std(tmp_path):
         make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=(1.7, *PRIOR_STD[1:]))
     single = Demonstrations.load(shipped_demonstrations.PATH).first(1)
     single.save(tmp_path / "single.npz")
-    shipped = make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR_STD).demonstrations.reference
+    shipped = make_prior_knowledge("BncConnector", num_demonstrations=1, prior_std=PRIOR_STD).primitive.reference
     file = str(tmp_path / "single.npz")
-    stored = make_prior_knowledge("BncConnector", demonstrations=file, prior_std=PRIOR_STD).demonstrations.reference
+    stored = make_prior_knowledge("BncConnector", demonstrations=file, prior_std=PRIOR_STD).primitive.reference
     np.testing.assert_allclose(stored.means, shipped.means, atol=1e-6)
     np.testing.assert_allclose(shipped.means[:, 2], single.outputs[0][:, 2], atol=2.5 * MM)
     assert (shipped.standard_deviations[:, :2] >= 1.73 * MM).all()
@@ -182,13 +182,13 @@ def test_gap_scale_narrows_the_covariance_in_a_gap(tmp_path):
     Demonstrations(times, outputs).save(tmp_path / "gap.npz")
     options = {"demonstrations": str(tmp_path / "gap.npz"), "reference_model": "promp"}
     plain, scaled = (
-        make_prior_knowledge("BncConnector", **options | change).demonstrations.reference
+        make_prior_knowledge("BncConnector", **options | change).primitive.reference
         for change in ({}, {"gap_scale": 0.1})
     )
     ratio = (scaled.standard_deviations / plain.standard_deviations)[:, :3]
     np.testing.assert_allclose(ratio[[10, 350]], 1.0, atol=0.05)
     np.testing.assert_allclose(ratio[175], 0.1, atol=0.02)
-    gmr = make_prior_knowledge("BncConnector", **options | {"reference_model": "gmr"}).demonstrations.reference
+    gmr = make_prior_knowledge("BncConnector", **options | {"reference_model": "gmr"}).primitive.reference
     assert np.abs(gmr.means - plain.means).max() > 1e-4
 
 
@@ -312,7 +312,7 @@ def test_option_is_refused_when_invalid(wrong):
 
 def test_contact_on_the_rim_is_similar_after_a_quarter_turn(kmp, observe_on_rim):
     """The contact is not equal, because the demonstrations search along the rim in one direction of rotation."""
-    near = kmp.task.near_symmetry
+    near = kmp.diagram.near_symmetry
     assert len(near.actions) == 7
     quarter = near.observations[0]
     direct, turned = observe_on_rim(1.0, 0.5), observe_on_rim(-0.5, 1.0)
@@ -322,7 +322,7 @@ def test_contact_on_the_rim_is_similar_after_a_quarter_turn(kmp, observe_on_rim)
 
 
 def test_near_symmetry_contains_the_exact_symmetry(kmp):
-    exact, near = kmp.task.symmetry, kmp.task.near_symmetry
+    exact, near = kmp.diagram.symmetry, kmp.diagram.near_symmetry
     sides = [k for k in range(7) if np.array_equal(near.actions[k], exact.actions[0])]
     assert any(np.array_equal(near.observations[k], exact.observations[0]) for k in sides)
 
@@ -335,7 +335,7 @@ def test_wrist_image_changes_with_the_offset_of_the_jack(station):
         for offset in ((0.0, 0.0), (0.0015, 0.0), (0.0, 0.0015)):
             images[name, offset] = env.reset(seed=0, options={"offset": offset})[0]
             assert env.observation_space.contains(images[name, offset])
-        assert env.task.symmetry is env.task.near_symmetry is None
+        assert env.diagram.symmetry is env.diagram.near_symmetry is None
     image, both = images["image", (0.0, 0.0)], images["image_and_state", (0.0, 0.0)]
     np.testing.assert_allclose(both[:-13], np.moveaxis(image, -1, 0).ravel() / 255, atol=1e-6)
     for offset in ((0.0015, 0.0), (0.0, 0.0015)):

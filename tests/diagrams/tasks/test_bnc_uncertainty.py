@@ -45,7 +45,7 @@ def test_grasp_angle_is_refused_when_out_of_range(angle):
 def test_plug_is_tilted_in_the_tool():
     env = make_env("BncConnector", guidance="kmp", fixture_offset="per_episode", grasp_angle=1.0)
     _, info = env.reset(seed=0)
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
     tool, plug = plant.GetBodyByName("tool_center"), plant.GetBodyByName("plug")
     tilt = plug.body_frame().CalcRotationMatrix(context, tool.body_frame()).ToAngleAxis().angle()

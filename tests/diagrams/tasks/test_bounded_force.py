@@ -34,7 +34,7 @@ def push(task, **options):
         over = terminated or truncated
     force = env.trace.force.max()
     env.close()
-    return info["termination"], force, env.task.declaration.options.force_limit
+    return info["termination"], force, env.diagram.task.options.force_limit
 
 
 @pytest.mark.parametrize(("task", "options", "station"), PUSHES)
@@ -92,7 +92,7 @@ def test_sampled_limit_is_observed_and_bounds_the_force(station):
 def test_symmetry_leaves_the_observed_force_limit_unchanged():
     env = make_env("BncConnector", difficulty="hard", guidance="kgrl", force_limit_range=(8.0, 25.0))
     size = env.observation_space.shape[0]
-    for symmetry in (env.task.symmetry, env.task.near_symmetry):
+    for symmetry in (env.diagram.symmetry, env.diagram.near_symmetry):
         for matrix in symmetry.observations:
             np.testing.assert_array_equal(matrix[-1], np.eye(size)[-1])
             np.testing.assert_array_equal(matrix[:, -1], np.eye(size)[-1])

@@ -103,7 +103,7 @@ def test_option_is_refused_when_out_of_range(task, options, words):
 
 
 def test_hard_connector_has_its_dimensions_and_offsets(connector):
-    declared = connector.unwrapped.task.declaration
+    declared = connector.unwrapped.diagram.task
     assert declared.workcell().dimensions.mouth_chamfer == 0.1 * MM
     assert declared.collision.above == 20.0
     radii = []
@@ -112,13 +112,13 @@ def test_hard_connector_has_its_dimensions_and_offsets(connector):
         radii.append(np.linalg.norm(info["jack_offset"]))
     assert 2.6 * MM <= min(radii) < max(radii) <= 3.0 * MM
     assert connector.observation_space.shape == (17,)
-    assert connector.unwrapped.task.symmetry.observations.shape == (1, 17, 17)
+    assert connector.unwrapped.diagram.symmetry.observations.shape == (1, 17, 17)
 
 
 def test_jack_turns_within_its_range():
     env = make_env("BncConnector", jack_turn=5.0, fixture_offset="per_episode")
     _, info = env.reset(seed=1)
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
     turn = plant.GetFrameByName("jack").CalcPoseInWorld(context).rotation().ToAngleAxis()
     assert 0.0 < abs(info["jack_offset"][2]) <= np.deg2rad(5.0)

@@ -32,7 +32,7 @@ def play(env, policy, *, seed=None, options=None):
     """Run an episode; return the last info, the return, and the sum of each reward term."""
     observation, _ = env.reset(seed=seed, options=options)
     total, finished, info = 0.0, False, {}
-    terms = dict.fromkeys(env.task.reward_terms, 0.0)
+    terms = dict.fromkeys(env.diagram.reward_terms, 0.0)
     while not finished:
         observation, reward, terminated, truncated, info = env.step(policy(observation))
         total += reward

@@ -103,7 +103,7 @@ def test_zero_action_succeeds_and_crosses_the_obstacle(guidance):
     assert infos[-1]["is_success"]
     assert env.trace.statistics()["collisions"] == 0
     assert sum(info["obstacle_cost"] for info in infos) < -50
-    total = sum(info[name] for info in infos for name in env.task.reward_terms)
+    total = sum(info[name] for info in infos for name in env.diagram.reward_terms)
     assert rewards.sum() == pytest.approx(total)
     assert infos[-1]["terminal_reward"] == 200
 
@@ -127,7 +127,7 @@ def test_null_space_guidance_withstands_adversaries(guidance, action_repeat, fir
 @pytest.mark.parametrize("guidance", NULL_SPACE)
 def test_no_action_sequence_reaches_the_walls(guidance):
     """The sum of absolute impulse responses bounds the reach of all sequences with an action per control step."""
-    lc_ns_kmp = make(guidance).task.diagram.GetSubsystemByName("guidance").GetSubsystemByName("lc_ns_kmp")
+    lc_ns_kmp = make(guidance).diagram.diagram.GetSubsystemByName("guidance").GetSubsystemByName("lc_ns_kmp")
     primitive, gain = lc_ns_kmp.primitive, lc_ns_kmp.gain
     steps, history = primitive.num_steps, primitive.history
     response = np.zeros((history + steps, 2, steps, 2))  # [step n, output, step k, action]
@@ -195,8 +195,8 @@ def test_episode_has_the_length_of_the_thesis():
     _, observations, _ = play(env, zero_action)
     assert observations[0] == -1.0
     assert (np.diff(observations[:, 0]) > 0).all()
-    assert env.task.num_steps == 400
-    assert env.task.control_period == pytest.approx(0.02, rel=1e-9)
+    assert env.diagram.num_steps == 400
+    assert env.diagram.control_period == pytest.approx(0.02, rel=1e-9)
 
 
 def test_shaped_reward_adds_progress_towards_the_goal():
@@ -266,7 +266,7 @@ def test_nan_in_the_plant_truncates_the_episode():
     env = make("kmp")
     env.reset()
     observation, *_ = env.step(zero_action(0))
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     state = plant.GetMyMutableContextFromRoot(env.simulator.get_mutable_context()).get_mutable_discrete_state_vector()
     state.SetAtIndex(0, np.nan)
     last, _, terminated, truncated, info = env.step(zero_action(0))
@@ -333,11 +333,11 @@ def test_browser_view_has_a_local_address(monkeypatch):
     monkeypatch.setenv("DRAKE_ALLOW_NETWORK", "meshcat")
     monkeypatch.setattr("guiderail.diagrams.envs.env.Simulator.set_target_realtime_rate", lambda *_: None)
     env = make("kmp", render_mode="human")
-    assert "localhost" in env.task.meshcat.web_url()
+    assert "localhost" in env.diagram.meshcat.web_url()
     env.reset()
     env.step(zero_action(0))
     env.render()
-    assert env.task.meshcat.HasPath("/drake/visualizer/robot/ball")
+    assert env.diagram.meshcat.HasPath("/drake/visualizer/robot/ball")
 
 
 def test_missing_display_library_is_named(monkeypatch):
@@ -394,14 +394,14 @@ def test_commands_avoid_an_obstacle_that_is_a_constraint(guidance):
     distances = np.linalg.norm(commands - WORLD.obstacle, axis=1) - 0.06
     assert 0.0 <= distances.min() < 1e-3
     assert max(info["constraint_violation"] for info in infos[1:]) <= 1e-9
-    displacements = np.diff(commands, axis=0) / env.task.control_period
+    displacements = np.diff(commands, axis=0) / env.diagram.control_period
     assert np.abs(displacements).max() <= 0.5 * (1 + 1e-9)
 
 
 def test_unconstrained_guidance_reports_obstacle_violation():
     env = make("residual_covariance", obstacles_constrain=True, obstacle_radius=0.06, action_repeat=1)
     env.reset(seed=0)
-    guidance, worst = env.task.diagram.GetSubsystemByName("guidance"), -np.inf
+    guidance, worst = env.diagram.diagram.GetSubsystemByName("guidance"), -np.inf
     done = False
     while not done:
         *_, terminated, truncated, _ = env.step(np.array([0.5, 0.0]))
@@ -427,14 +427,14 @@ def test_motion_constraints_are_refused_when_invalid(options, match):
 def test_observed_phase_stops_while_the_motion_waits():
     env = make("kgrl", progress="state", progress_tolerance=(1e-9, 0.1), max_lag=0.5, action_repeat=5)
     clock, times = make("kgrl", action_repeat=5), []
-    assert env.task.num_steps == clock.task.num_steps + round(0.5 / env.task.control_period)
-    duration = clock.task.num_steps * env.task.control_period
+    assert env.diagram.num_steps == clock.diagram.num_steps + round(0.5 / env.diagram.control_period)
+    duration = clock.diagram.num_steps * env.diagram.control_period
     env.reset(seed=0)
     for _ in range(12):
         observation, *_ = env.step(np.zeros(2))
-        times.append(env.task.diagram.GetOutputPort("motion_time").Eval(env.simulator.get_context())[0])
+        times.append(env.diagram.diagram.GetOutputPort("motion_time").Eval(env.simulator.get_context())[0])
         assert observation[0] == pytest.approx(2.0 * times[-1] / duration - 1.0, abs=1e-6)
-    late = 60 * env.task.control_period - np.array(times[-1])
-    assert 0.3 < late <= 0.5 + 2 * env.task.control_period  # the position error is almost always above 1 nm
+    late = 60 * env.diagram.control_period - np.array(times[-1])
+    assert 0.3 < late <= 0.5 + 2 * env.diagram.control_period  # the position error is almost always above 1 nm
     with pytest.raises(InputError, match="progress_tolerance"):
         make("kgrl", progress="state", progress_tolerance=(0.0, 0.1))

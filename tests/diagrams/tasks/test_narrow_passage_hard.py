@@ -62,7 +62,7 @@ def test_held_out_start_differs_from_training_start(options):
 
 def test_plant_has_the_obstacles_at_their_sampled_positions(env):
     _, info = env.reset(seed=2)
-    plant = env.task.diagram.GetSubsystemByName("station").plant
+    plant = env.diagram.diagram.GetSubsystemByName("station").plant
     context = plant.GetMyContextFromRoot(env.simulator.get_context())
     for number, obstacle in enumerate(info["obstacles"]):
         X_WO = plant.GetBodyByName(f"obstacle_{number}").EvalPoseInWorld(context)
@@ -74,7 +74,7 @@ def test_standard_has_the_default_geometry_and_start():
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
     _, info = standard.reset(seed=3)
-    np.testing.assert_array_equal(info["start"], standard.task.declaration.reference().means[0])
+    np.testing.assert_array_equal(info["start"], standard.diagram.task.reference().means[0])
 
 
 @pytest.mark.parametrize(

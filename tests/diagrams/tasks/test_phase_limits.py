@@ -62,7 +62,7 @@ def press(env, steps=16, action=(1.0, 1.0, -1.0)):
 
 def phase_limit(env):
     """Return the system that limits force and torque by state, or None."""
-    diagram = env.task.diagram
+    diagram = env.diagram.diagram
     return diagram.GetSubsystemByName("phase_wrench_limit") if diagram.HasSubsystemNamed("phase_wrench_limit") else None
 
 
@@ -94,8 +94,8 @@ def test_limit_changes_with_the_state_at_bounded_rate():
     changes = np.abs(np.diff(bounds, axis=0))
     assert states[0] == 0.0
     assert states[-1] == 1.0
-    assert (changes <= WRENCH_RATE * env.task.control_period + 1e-12).all()
-    np.testing.assert_array_equal(bounds[0], GridClamp.impedance(env.task.declaration).bound.numbers)
+    assert (changes <= WRENCH_RATE * env.diagram.control_period + 1e-12).all()
+    np.testing.assert_array_equal(bounds[0], GridClamp.impedance(env.diagram.task).bound.numbers)
     np.testing.assert_array_equal(bounds[-1], np.minimum(bounds[0], max_wrench(6.0)))
     assert env.trace.force[-1] < 6.0
 
@@ -104,7 +104,7 @@ def test_command_satisfies_the_speed_limit_of_the_state():
     def speeds(template):
         env = make_clamp(template, action_repeat=1)
         press(env, 20, (0.3, 0.0, -1.0))
-        return np.linalg.norm(np.diff(env.trace.commanded[:, :3], axis=0), axis=1) / env.task.control_period
+        return np.linalg.norm(np.diff(env.trace.commanded[:, :3], axis=0), axis=1) / env.diagram.control_period
 
     assert speeds(with_limits()).max() > 0.03
     slow = speeds(with_limits(max_speed_m_per_s=0.01))
@@ -115,8 +115,8 @@ def test_phase_limit_is_absent_without_force_limits():
     env = make_clamp(with_limits(max_speed_m_per_s=0.01))
     assert phase_limit(env) is None
     assert phase_limit(make_clamp(with_limits(max_torque_nm=1.0))) is not None
-    names = [system.get_name() for system in env.task.diagram.GetSystems()]
-    assert names == [system.get_name() for system in make_clamp(with_limits()).task.diagram.GetSystems()]
+    names = [system.get_name() for system in env.diagram.diagram.GetSystems()]
+    assert names == [system.get_name() for system in make_clamp(with_limits()).diagram.diagram.GetSystems()]
 
 
 def test_force_limit_of_a_state_requires_bounded_force():

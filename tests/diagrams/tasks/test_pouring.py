@@ -71,8 +71,8 @@ def test_adversary_neither_collides_nor_violates_constraints(env, adversary):
 
     def on_step(env, info):
         context = env.simulator.get_context()
-        state = env.task.diagram.GetOutputPort("state").Eval(context)[0]
-        turn = env.task.diagram.GetOutputPort("observation").Eval(context)[3:]
+        state = env.diagram.diagram.GetOutputPort("state").Eval(context)[0]
+        turn = env.diagram.diagram.GetOutputPort("observation").Eval(context)[3:]
         tilts.append((state, np.hypot(turn[0], turn[1])))
         violations.append(info["constraint_violation"])
 
@@ -155,7 +155,7 @@ def test_episode_repeats_bit_for_bit_when_the_seed_is_equal(env):
 
 def test_balls_rest_in_the_thermos_when_the_action_is_zero(env):
     env.reset(seed=0)
-    station = env.task.diagram.GetSubsystemByName("station")
+    station = env.diagram.diagram.GetSubsystemByName("station")
     for _ in range(10):
         env.step(np.zeros(3))
     context = station.GetMyContextFromRoot(env.simulator.get_context())

@@ -54,7 +54,7 @@ def command_states(template, frames, actions, X_TP):
 @pytest.mark.parametrize("name", ["uniform_random", "random_hold", "bang_bang", "random_corner"])
 def test_commands_satisfy_the_constraints_in_all_states(env, name):
     """The template without the simulated arm, for hundreds of control steps in all three states."""
-    template = make_template(env.task.declaration.workcell(), aim_speed=1.0, pour_speed=0.3)
+    template = make_template(env.diagram.task.workcell(), aim_speed=1.0, pour_speed=0.3)
     frames = frames_of(template, RigidTransform([0.02, -0.01, 0.0]))
     start = template.project(template.initial_state, RigidTransform([0.02, -0.27, 0.12]), frames)
     worst, reached = 0.0, set()
@@ -73,10 +73,10 @@ def test_commands_satisfy_the_constraints_in_all_states(env, name):
 def test_commands_on_the_arm_satisfy_the_constraints():
     """The violation is computed from the command of every control step, without the diagram's own output."""
     stepwise = make_env("Pouring", difficulty="hard", action_repeat=1)
-    diagram, context = stepwise.task.diagram, stepwise.simulator.get_context()
+    diagram, context = stepwise.diagram.diagram, stepwise.simulator.get_context()
     corners = BaselinePolicy(BASELINES["bang_bang"], stepwise)
     corners.on_episode_start()
-    task = stepwise.task.declaration
+    task = stepwise.diagram.task
     template = make_template(task.workcell(), aim_speed=1.0, pour_speed=0.3)
     _, info = stepwise.reset(seed=3)
     frames = frames_of(template, RigidTransform([*(info["mug_position"] + info["mug_error"]), 0.0]))
@@ -102,7 +102,7 @@ def test_mug_error_is_sampled_in_its_range_and_observed(env):
 def test_standard_has_its_observation_and_start():
     standard = make_env("Pouring")
     assert standard.observation_space.shape == (6,)
-    assert standard.task.num_steps == 1500
+    assert standard.diagram.num_steps == 1500
     _, info = standard.reset(seed=3)
     assert "mug_error" not in info
     np.testing.assert_array_equal(info["start"], START_OF_SEED_3)

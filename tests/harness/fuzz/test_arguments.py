@@ -137,7 +137,7 @@ def env(request):
 
 @given(st.data())
 def test_reset_accepts_or_refuses_any_option(env, data):
-    task = env.task.declaration.name
+    task = env.diagram.task.name
     names = st.sampled_from(RESETS[task]) | st.sampled_from(RESETS[task]) | st.text(max_size=3)
     options = data.draw(st.dictionaries(names, VALUES | st.floats(-0.1, 0.1).map(lambda x: [x, -x]), max_size=2))
     seed = data.draw(st.integers(0, 99))

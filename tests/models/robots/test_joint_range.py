@@ -128,5 +128,5 @@ def test_min_singular_value_requires_a_joint_margin():
 def test_joint_margin_requires_an_arm():
     with pytest.raises(InputError, match="station=arm"):
         make_prior_knowledge("BncConnector", guidance="kgrl", joint_margin=0.1)
-    config = make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", joint_margin=0.1).demonstrations
+    config = make_prior_knowledge("BncConnector", guidance="kgrl", station="arm", joint_margin=0.1).primitive
     assert config.motion.violation(config.reference.means[0]) < 0.0

@@ -163,7 +163,9 @@ def test_restore_refuses_the_state_of_another_network(config):
 def test_learner_starts_from_another_run(bead_config, bead_run):
     config = replace(bead_config.learner, init_from=str(bead_run))
     with contextlib.closing(make_environment("Bead", {})) as env:
-        learner = LEARNERS.get("tqc")(config, env, **learner_arguments(bead_config, env.unwrapped.task) | {"seed": 8})
+        learner = LEARNERS.get("tqc")(
+            config, env, **learner_arguments(bead_config, env.unwrapped.diagram) | {"seed": 8}
+        )
     arrays, values = load_checkpoint(bead_run / "checkpoint" / "state.safetensors")
     initial, state = learner.state()
     learned = [key for key in arrays if not key.startswith(("random/", "selection/"))]
@@ -181,7 +183,7 @@ def test_learner_starts_from_a_run_with_several_processes(setting, part, bead_co
     arrays, values = load_checkpoint(RunFolder(tmp_path).checkpoint)
     config = replace(bead_config.learner, init_from=str(tmp_path))
     with contextlib.closing(make_environment("Bead", {})) as env:
-        learner = LEARNERS.get("tqc")(config, env, **learner_arguments(bead_config, env.unwrapped.task))
+        learner = LEARNERS.get("tqc")(config, env, **learner_arguments(bead_config, env.unwrapped.diagram))
     expected = (values["learner"][part]["transitions"], bead_config.episodes)
     assert (learner.transitions, learner.episodes) == expected
     initial = learner.state()[0]

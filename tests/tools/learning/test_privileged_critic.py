@@ -158,7 +158,7 @@ def test_symmetry_of_the_connector_applies_to_hidden_values():
     """A quarter turn of the jack offset transforms the privileged observation by the declared matrix."""
     env = make_env("BncConnector", difficulty="hard", guidance="kgrl", reward="aligned", time_step=0.01)
     env.observes_privileged = True
-    symmetry = env.task.near_symmetry
+    symmetry = env.diagram.near_symmetry
     offset, hidden = np.array([2.8e-3, 0.4e-3]), []
     for turned in (offset, [-offset[1], offset[0]]):
         env.reset(seed=0, options={"offset": tuple(turned)})

@@ -263,7 +263,7 @@ def test_force_limit_remains_between_episodes(monkeypatch):
     env.preflight.repeat()
     np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
     env.reset()
-    env.task.declaration.episode_constants["max_wrench"].set(env._root_context, max_wrench(11.0))
+    env.diagram.task.episode_constants["max_wrench"].set(env._root_context, max_wrench(11.0))
     for _ in range(2):
         env.idle()
         assert env._station is env._transfer_station
@@ -422,7 +422,7 @@ def test_arm_moved_by_hand_returns_slowly_to_its_path(monkeypatch):
 
     monkeypatch.setattr(env, "_advance", advance_and_record)
     env.reset()
-    speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1) / env.task.control_period
+    speeds = np.linalg.norm(np.diff(positions, axis=0), axis=1) / env.diagram.control_period
     assert speeds.max() < 2.0 * SPEED
     assert np.linalg.norm((env.pose - env.begin)[:3]) < 3e-3
 

@@ -57,7 +57,7 @@ class EnvServer:
 
     def __init__(self, env: DiagramEnv):
         self._env = env
-        self._station = env.task.diagram.GetSubsystemByName("station")
+        self._station = env.diagram.diagram.GetSubsystemByName("station")
         self._is_done, self._info = False, {"is_success": False, "termination": ""}
         # A reset with a seed begins a new run, so that the seed determines the values that are hidden for a whole run.
         self._seed_options: dict[str, Any] = {"new_run": True}

@@ -215,7 +215,7 @@ def _read_key(key: Path | None) -> bytes | None:
 
 def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
     """Build the feedback loop of an environment's primitive; raise an InputError if an option cannot be certified."""
-    demonstrated = make_prior_knowledge(config).demonstrations
+    demonstrated = make_prior_knowledge(config).primitive
     assert demonstrated is not None  # all of `GUIDANCE` require demonstrations
     if demonstrated.motion is not None or demonstrated.progress is not None:
         raise InputError(

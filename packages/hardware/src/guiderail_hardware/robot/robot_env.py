@@ -108,7 +108,7 @@ class RobotEnv(DiagramEnv):
             InputError: If no robot answers.
         """
         super().__init__(task, action_repeat=action_repeat)
-        declared: InsertionTask = task.declaration
+        declared: InsertionTask = task.task
         self._start, self._randomize_parts = declared.start_pose(np.random.default_rng(0)), randomize_parts
         self._task_station, self._transfer_station, self._clock = station, station.clone(declared.workcell()), clock
         self._keys, self._confirm_resume, self._free_workpiece, self._log = keys, confirm_resume, free_workpiece, log
@@ -188,7 +188,7 @@ class RobotEnv(DiagramEnv):
         self._running = False
         self._return_to_start()
         sampled = {} if self._randomize_parts is None else self._randomize_parts(self.np_random, options or {})
-        simulator = Simulator(self.task.diagram)
+        simulator = Simulator(self.diagram.diagram)
         self._action_value = self.action_port.FixValue(simulator.get_mutable_context(), self._neutral)
         self._switch_station(simulator, self._task_station)
         self.fault, self.sampled, self._failure = Fault.NONE, sampled, None
@@ -203,7 +203,7 @@ class RobotEnv(DiagramEnv):
             self._extend_return_path()
             self._running, self.fault = False, stop.fault
             self._come_to_rest()
-            terms = dict.fromkeys(self.task.reward_terms, 0.0)
+            terms = dict.fromkeys(self.diagram.reward_terms, 0.0)
             info = self._info(0, *self._statistics(first), terms)
             info |= {"termination": Termination.STOPPED.value, "stopped": str(stop)}
             return self._observation, 0.0, False, True, info
@@ -217,7 +217,7 @@ class RobotEnv(DiagramEnv):
 
     def _extend_return_path(self) -> None:
         """Extend the return path by the motion back along the measured poses of the episode."""
-        self._return_path.extend(retrace(self.trace.measured, self.task.control_period)[::-1])
+        self._return_path.extend(retrace(self.trace.measured, self.diagram.control_period)[::-1])
 
     def _statistics(self, first: int) -> tuple[float, float, tuple[float, float], bool]:
         """Return statistics of the control steps from `first` on.
@@ -356,10 +356,10 @@ class RobotEnv(DiagramEnv):
             f"the arm was moved; it returns slowly to its path: {distance / MM:.0f} mm and "
             f"{np.rad2deg(angle):.0f} degrees"
         )
-        self._return_path.extend(slow_approach(pose, target, self.task.control_period)[::-1])
+        self._return_path.extend(slow_approach(pose, target, self.diagram.control_period)[::-1])
 
     def _approach_start(self) -> None:
-        for pose in slow_approach(self.pose, self._start, self.task.control_period):
+        for pose in slow_approach(self.pose, self._start, self.diagram.control_period):
             self._command(pose)
 
     def _take_control(self) -> None:
@@ -370,7 +370,7 @@ class RobotEnv(DiagramEnv):
         elapsed = 0.0
         while self._arm_state != ArmState.RUNNING:
             self._command(NO_POSE)  # not the measured pose: a single status may be wrong
-            elapsed += self.task.control_period
+            elapsed += self.diagram.control_period
             if elapsed > RESUME_TIMEOUT:
                 reason = describe_stop(self._active_fault, self._station.driver)
                 raise InputError(f"the arm can't be taken over: {reason}")
@@ -419,7 +419,7 @@ class RobotEnv(DiagramEnv):
             self._transfer_station.get_desired_pose_input_port().FixValue(
                 self._transfer_simulator.get_mutable_context(), NO_POSE
             )
-        for _ in range(round(RESUME_TIMEOUT / self.task.control_period)):
+        for _ in range(round(RESUME_TIMEOUT / self.diagram.control_period)):
             if self._keys.is_stop_requested():
                 raise RobotStoppedError(Fault.USER_STOP)
             try:

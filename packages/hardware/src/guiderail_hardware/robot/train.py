@@ -123,7 +123,7 @@ def _train(
     report: Callable[[dict[str, Any]], None],
 ) -> list[dict[str, Any]]:
     """Run all episodes; after any exception, bring the arm to rest, and save recorded episodes and learned weights."""
-    arguments = learner_arguments(config, env.task)
+    arguments = learner_arguments(config, env.diagram)
     acting: Any = LEARNERS.get(config.learner.algorithm)(config.learner, env, **arguments)
     learner = PipelinedLearner(
         acting,

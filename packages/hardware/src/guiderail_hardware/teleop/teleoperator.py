@@ -149,10 +149,10 @@ class MeshcatSupervisor(Supervisor):
         """
         base = cast(Any, env.unwrapped)
         self._add_sliders(base)
-        if base.task.query is not None:
-            view = View(base.task.query, self.panel.meshcat)
-            if not self._has_camera and base.task.declaration is not None:
-                set_camera(self.panel.meshcat, base.task.declaration)
+        if base.diagram.query is not None:
+            view = View(base.diagram.query, self.panel.meshcat)
+            if not self._has_camera and base.diagram.task is not None:
+                set_camera(self.panel.meshcat, base.diagram.task)
                 self._has_camera = True  # set once, because the supervisor may move the camera
             base.simulator.set_monitor(view.follow)
             base.simulator.set_target_realtime_rate(1.0)
