@@ -16,9 +16,9 @@ settings.load_profile("quick")
 
 # Test files in which a simulator calls Python handlers of LCM messages, which ends the process in some Drake versions.
 WITH_HANDLERS = (
-    "hardware/test_station.py", "hardware/test_injections.py", "hardware/test_clock.py",
-    "hardware/test_sim_driver.py", "hardware/test_connection.py", "hardware/test_executor.py",
-    "hardware/test_train.py", "benchmarks/test_loop.py",
+    "drivers/test_station.py", "drivers/test_injections.py", "drivers/test_clock.py",
+    "robot/test_sim_driver.py", "robot/test_connection.py", "robot/test_executor.py",
+    "robot/test_train.py", "benchmarks/test_loop.py",
 )  # fmt: skip
 
 

@@ -25,8 +25,9 @@ from pydrake.systems.framework import Context, EventStatus
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_named
 from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, uniform_random, zero_policy
+from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import PolicyFn, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.train import start_or_resume
 from guiderail.tools.visualization.camera import path_in_picture
 from guiderail.tools.visualization.curves import draw_passage

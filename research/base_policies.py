@@ -16,7 +16,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
 )
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.common.transforms import MM
-from guiderail.models.policy import register_base_policy
+from guiderail_lerobot.base_policy import register_base_policy
 
 CHUNK_STEPS = 40  # number K of commands in a chunk
 STEP = 0.28 * MM  # displacement towards the center of pressure per chunk; the scripted policy takes 0.5 mm

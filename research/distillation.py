@@ -17,13 +17,14 @@ import pandas as pd
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy, chunk_samples, find_base_policy
+from guiderail.models.policy import Policy
 from guiderail.tools.environments import beyond_defaults, make_environment
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.evaluation import load_or_compute, policy_digest
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import write_table
+from guiderail_lerobot.base_policy import chunk_samples, find_base_policy
 from research.command import Parser, print_rows, run_program
 
 BLOCK = 10  # number of episodes in a stored file

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import signal
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import PolicyFn
+from guiderail.tools.evaluation.episode import PolicyFn
 
 RMS = 1.0 / np.sqrt(3.0)
 FEATURES = 64  # features of gSDE, as many as the last layer of a small policy has

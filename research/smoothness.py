@@ -24,9 +24,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.gains import deviation, exploration_rms, rms_gains
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
+from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.evaluation.metrics import jerk, summary
-from guiderail.tools.evaluation.rollout import PolicyFn, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.tables import write_table
 from guiderail.tools.visualization.style import color, new_figure, save_figure
 from research.command import Parser, print_result, run_program

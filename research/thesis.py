@@ -337,3 +337,10 @@ def _format_any(values: tuple[Any, ...]) -> str:
     """Format alternatives; among several, None is left out."""
     named = [value for value in values if value is not None] if len(values) > 1 else values
     return " or ".join(map(_format, named))
+
+
+if __name__ == "__main__":
+    from research.command import run_program
+    from research.reproduction.command import main
+
+    run_program(main)

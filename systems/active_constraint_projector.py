@@ -85,13 +85,15 @@ class ActiveConstraintProjector(LeafSystem):
         self.frames = TemplateFrames(self, template, frames)
 
         # [last command (6,), pose (6,) measured at the same instant]
-        self._last = self.DeclareDiscreteState(12)
+        self._last = declare.unset_state(self, 12)
         constraints = [self._state_port, self.frames.ticket]
         self._command = declare.cache(
             self, "command", self._calc_command, [*constraints, self._last, self._requested_pose_port]
         )
         declare.part_output(self, "desired_pose", self._command, lambda command: command[:6], 6)
-        declare.part_output(self, "last_desired_pose", self._last, lambda last: last[:6], 6)
+        declare.output(
+            self, "last_desired_pose", 6, lambda context: declare.initialized(self, context, self._last)[:6], [self._last]
+        )
         declare.part_output(self, "fallback", self._command, lambda command: command[6])
         declare.scalar_output(self, "commanded_violation", self._commanded_violation, [self._command, *constraints])
         declare.scalar_output(self, "measured_violation", self._measured_violation, [*constraints, self._pose_port])
@@ -119,7 +121,7 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the command and the fallback flag, (7,)."""
-        value = context.get_discrete_state().value(self._last)
+        value = declare.initialized(self, context, self._last)
         last, measured = value[:6], value[6:]
         requested = self._requested_pose_port.Eval(context)
         state = self._state(context)

@@ -70,8 +70,12 @@ class ImpedanceGains:
             )
         if self.bound is not None and not isinstance(self.bound, WrenchBound):
             raise InputError(f"an impedance's bound must be a WrenchBound or None, not {brief(self.bound)}")
-        if not np.isfinite(self.posture).all():
+        posture = as_numbers(self.posture, "the posture of an impedance")
+        if not np.isfinite(posture).all():
             raise InputError(f"an impedance's posture must be finite joint positions, not {self.posture}")
+        for name, array in (("stiffness", K), ("wrench_limits", limits), ("posture", posture)):
+            array.flags.writeable = False  # a copy: writing must not change a running controller
+            object.__setattr__(self, name, array)
 
 
 @dataclass(frozen=True)

@@ -138,11 +138,11 @@ class CartesianPositionController(LeafSystem):
         self._validity = CommandValidity(
             self._desired_pose_port, self._command_time_port, period=period, timeout=timeout
         )
-        self._command = self.DeclareDiscreteState(num_joints)
+        self._command = declare.unset_state(self, num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
         self._has_timed_out = self.DeclareDiscreteState(1)
         self._plant_context = declare.plant_context(self, plant, self._joint_command, [self._command])
-        self.DeclareStateOutputPort("joint_positions", self._command)
+        declare.output(self, "joint_positions", num_joints, self._joint_command, [self._command])
         declare.output(self, "pose", 6, lambda context: transform_to_pose(self._X_TP(context)), [self._plant_context])
         self.DeclareStateOutputPort("stuck", self._is_stuck)
         self.DeclareStateOutputPort("command_timed_out", self._has_timed_out)
@@ -157,7 +157,7 @@ class CartesianPositionController(LeafSystem):
     get_command_timed_out_output_port = output_getter("command_timed_out", "flag that no command is valid, (1,)")
 
     def _joint_command(self, context: Context) -> np.ndarray:
-        return context.get_discrete_state().value(self._command)
+        return declare.initialized(self, context, self._command)
 
     def _X_TP(self, context: Context) -> RigidTransform:
         return self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)

@@ -47,8 +47,8 @@ class CommandDisturbance(LeafSystem):
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
         self._count = self.DeclareDiscreteState(1)
         self._is_lost = self.DeclareDiscreteState(1)
-        self._last_delivered = self.DeclareDiscreteState(size)
-        self._delay_line = self.DeclareDiscreteState(delay * size) if delay else None  # oldest command first
+        self._last_delivered = declare.unset_state(self, size)
+        self._delay_line = declare.unset_state(self, delay * size) if delay else None  # oldest command first
         self._command_port = self.DeclareVectorInputPort("command", size)
         self._pose_port = self.DeclareVectorInputPort("pose", size)
         source = self._command_port if self._delay_line is None else self._delay_line
@@ -93,7 +93,7 @@ class CommandDisturbance(LeafSystem):
             discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
 
     def _delivered(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state().value(self._last_delivered)
+        last = declare.initialized(self, context, self._last_delivered)
         if context.get_discrete_state().value(self._is_lost).item():
             return last
         if self._delay_line is None:

@@ -46,7 +46,7 @@ class CommandFilter(LeafSystem):
         size = len(law.start(np.zeros(outputs)))
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
-        self._last = self.DeclareDiscreteState(size)  # state of the law, which begins with the last command
+        self._last = declare.unset_state(self, size)  # state of the law, which begins with the last command
         self._command = declare.cache(self, "command", self._calc_command, [self._desired_pose_port, self._last])
         declare.part_output(self, "safe_pose", self._command, lambda command: command[:outputs], outputs)
         declare.part_output(self, "intervention", self._command, lambda command: command[-1])
@@ -65,7 +65,7 @@ class CommandFilter(LeafSystem):
 
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the next state, which begins with the safe command, and the intervention flag."""
-        last = context.get_discrete_state().value(self._last)
+        last = declare.initialized(self, context, self._last)
         state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
         if not is_finite(state):  # NaN would remain in the state
             state, is_changed = last, True

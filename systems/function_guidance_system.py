@@ -59,10 +59,16 @@ class FunctionGuidanceSystem(LeafSystem):
         self._action_port = self.DeclareVectorInputPort("action", action_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
-        self._desired_pose = self.DeclareDiscreteState(pose_size)
+        self._desired_pose = declare.unset_state(self, pose_size)
         self._held_action = self.DeclareDiscreteState(action_size)
         self._fallback = self.DeclareDiscreteState(1)
-        self._desired_pose_port = self.DeclareStateOutputPort("desired_pose", self._desired_pose)
+        self._desired_pose_port = declare.output(
+            self,
+            "desired_pose",
+            pose_size,
+            lambda context: declare.initialized(self, context, self._desired_pose),
+            [self._desired_pose],
+        )
         self.DeclareStateOutputPort("held_action", self._held_action)
         self.DeclareStateOutputPort("fallback", self._fallback)
         declare.update(self, period, self._step, self._reset)

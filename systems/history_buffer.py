@@ -52,8 +52,14 @@ class HistoryBuffer(LeafSystem):
 
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)
         self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
-        self._state = self.DeclareDiscreteState(length * num_outputs)
-        self.DeclareStateOutputPort("history", self._state)
+        self._state = declare.unset_state(self, length * num_outputs)
+        declare.output(
+            self,
+            "history",
+            length * num_outputs,
+            lambda context: declare.initialized(self, context, self._state),
+            [self._state],
+        )
         declare.update_after_start(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
@@ -68,5 +74,5 @@ class HistoryBuffer(LeafSystem):
         discrete_state.set_value(self._state, np.tile(initial, self._shape[0]))
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        remaining = context.get_discrete_state().value(self._state)[self._shape[1] :]
+        remaining = declare.initialized(self, context, self._state)[self._shape[1] :]
         discrete_state.set_value(self._state, np.concatenate([remaining, self._output_port.Eval(context)]))

@@ -47,7 +47,7 @@ class LcNsKmpSystem(LeafSystem):
     length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so that its
     command starts at the end of the previous command. ``reference_window`` is ((H+1)(O + O²),) for the horizon H of
     `primitive`: means and covariances, the current step first. If this port is connected, they replace those of the
-    reference trajectory (`ChunkReference`), and all primitives must have the horizon H. ``command`` is (O,).
+    reference trajectory, and all primitives must have the horizon H. ``command`` is (O,).
     ``constraint_violation`` (1,) is max(c − G y) of the command y: negative if all constraints are slack, and
     `ConstraintViolation.UNCONSTRAINED` if there is no constraint. ``fallback`` (1,) is 1 if no window within the
     constraints was found. The command is then the point within the constraints of the current step that is nearest to

@@ -16,6 +16,16 @@ MAY_IMPORT = {
     "diagrams": {"models", "systems", "diagrams"},
     "tools": {"models", "systems", "diagrams", "tools"},
 }
+# Siblings, and the other siblings that each of them imports where they are installed (`require_sibling`, extras).
+REQUIRED = {
+    "guiderail_data": ("guiderail_parts",),
+    "guiderail_hardware": ("guiderail_mujoco",),
+    "guiderail_lerobot": (),
+    "guiderail_mujoco": (),
+    "guiderail_parts": (),
+    "guiderail_studies": (),
+    "lerobot_robot_guiderail": ("guiderail_lerobot",),
+}
 LEARNERS = ("stable_baselines3", "sb3_contrib", "torch")
 
 
@@ -61,32 +71,42 @@ def test_systems_and_diagrams_name_no_robot():
 
 
 def module_paths():
-    """Return the path of every module of the package, by name."""
+    """Return the path of every module of the core and of the siblings, by name."""
     result = {}
-    for folder in MAY_IMPORT:
-        for path in (ROOT / folder).rglob("*.py"):
-            parts = ["guiderail", *path.relative_to(ROOT).with_suffix("").parts]
+    for source in (ROOT / "src", *sorted((ROOT / "packages").glob("*/src"))):
+        folders = [source / "guiderail" / folder for folder in MAY_IMPORT] if source == ROOT / "src" else [source]
+        for path in (path for folder in folders for path in folder.rglob("*.py")):
+            parts = path.relative_to(source).with_suffix("").parts
             result[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
     return result
 
 
-def test_modules_have_no_import_cycle():
-    """Imports inside functions are ignored: they are executed after both modules are loaded."""
-    known = module_paths()
-    graph = {}
+def import_graph():
+    """Return the imported modules of every module, with those of functions and of `if TYPE_CHECKING`."""
+    known, graph = module_paths(), {}
     for module, path in known.items():
-        top_level = [
-            statement
-            for node in ast.parse(path.read_text(encoding="utf-8")).body
-            for statement in ([node] if not isinstance(node, ast.If) else [])
-        ]
-        targets = set()
-        for name in imports(path, top_level):
-            target = name if name in known else name.rpartition(".")[0]
-            if target in known and target != module:
-                targets.add(target)
-        graph[module] = targets
+        targets = {name if name in known else name.rpartition(".")[0] for name in imports(path)}
+        graph[module] = (targets & known.keys()) - {module}
+    return graph
+
+
+def test_modules_have_no_import_cycle():
     try:
-        TopologicalSorter(graph).prepare()
+        TopologicalSorter(import_graph()).prepare()
     except CycleError as error:
         pytest.fail(f"import cycle: {' → '.join(error.args[1])}")
+
+
+def test_core_imports_no_sibling_and_siblings_import_only_what_they_require():
+    graph = import_graph()
+    assert {top_level(module) for module in graph} == {"guiderail", *REQUIRED}
+    for module, targets in graph.items():
+        allowed = {top_level(module), "guiderail", *REQUIRED.get(top_level(module), ())}
+        if top_level(module) == "guiderail":
+            allowed = {"guiderail"}
+        for target in targets:
+            assert top_level(target) in allowed, f"{module} imports {target}"
+
+
+def top_level(module):
+    return module.partition(".")[0]

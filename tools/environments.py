@@ -45,17 +45,11 @@ def task_named(name_or_folder: str) -> tuple[str, tuple[str, ...]]:
     An unknown name is returned unchanged.
 
     Raises:
-        InputError: If the folder's task is not valid, or its learner is unknown.
+        InputError: If the folder's task is not valid.
     """
     if name_or_folder in TASKS.names() or not is_task_folder(name_or_folder):
         return name_or_folder, ()
     name = register_task_folder(name_or_folder)
-    from guiderail.tools.learning.config import resolve_preset  # config imports this module
-
-    try:
-        resolve_preset(**{"preset": None, **TASKS.get(name).learner})
-    except InputError as error:
-        raise InputError(f"recommended.learner in {Path(name_or_folder) / 'task.yaml'} is invalid: {error}") from None
     return name, (str(Path(name_or_folder).resolve()),)
 
 
@@ -63,8 +57,8 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     """Return a digest of the files that a task consists of; "" if all of them belong to installed packages.
 
     The digest covers the task folder and the imported files. It also covers the files that an option of the environment
-    names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names, such
-    as a base policy. Relative paths are skipped; `import_modules` returns absolute ones.
+    names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names.
+    Relative paths are skipped; `import_modules` returns absolute ones.
 
     Raises:
         InputError: If the task folder no longer exists, or a file cannot be read.
@@ -103,7 +97,7 @@ def task_options(task: str) -> dict[str, Any]:
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a task's environment with all defaults filled in; register its base policy, if any.
+    """Return the arguments of a task's environment with all defaults filled in.
 
     Raises:
         InputError: If the task or an argument is unknown, or a value is invalid.
@@ -111,10 +105,6 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
-        if isinstance(source := arguments.get("base_policy"), str) and source:
-            from guiderail.tools.evaluation.policies import add_base_policy
-
-            arguments = {**arguments, "base_policy": add_base_policy(source)}
         return EnvConfig.resolve(task, arguments).options
     options = task_options(task)
     for name, value in arguments.items():

@@ -252,7 +252,7 @@ class Loop:
             InputError: If the observation is an image.
         """
         if self.observation.get_data_type() != PortDataType.kVectorValued or task.observation_camera() is not None:
-            raise InputError(f"a base policy of {task.name} takes no images: choose another observation")
+            raise InputError(f"the guidance of {task.name} takes no images: choose another observation")
         guidance: Any = self.guidance
         reference = guidance.make_reference(self.observation.size())
         add_system(self.builder, "reference", reference, observation=self.observation)

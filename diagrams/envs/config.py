@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from guiderail.diagrams.envs.options import (
@@ -16,36 +15,23 @@ from guiderail.diagrams.envs.options import (
     check_choice,
     validate_options,
 )
+from guiderail.diagrams.envs.settings import EnvSettings
 from guiderail.diagrams.guidance.registry import (
     GUIDANCE,
-    GuidanceKind,
     check_guidance,
     default_guidance,
     possible_guidance,
 )
 from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, StationKind
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, is_task_folder, register_task_folder
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 
 
-@dataclass(frozen=True)
-class EnvConfig:
+class EnvConfig(EnvSettings):
     """Validated configuration of an environment, without missing options."""
-
-    task: str  # name of the task
-    guidance: str  # name of the guidance
-    station: str  # name of the station
-    reward: str  # name of the reward
-    observation: str  # name of the observation
-    difficulty: str  # name of the difficulty
-    action_repeat: int  # control steps per action
-    control_period: float | None  # time between commands [s]; None: that of the task's station
-    # All other options by the part that they configure: "task", "station", "primitive", "template", "guidance" and
-    # "disturbances".
-    parts: Mapping[str, Options] = field(hash=False)
 
     @classmethod
     def resolve(cls, task: str, options: Mapping[str, Any] | None = None) -> EnvConfig:
@@ -74,27 +60,6 @@ class EnvConfig:
             entry = (config, config.guidance_kind, config.station_kind)
             _RESOLVED[key] = _RESOLVED[_cache_key(task_class, config.options)] = entry
         return config
-
-    @property
-    def options(self) -> dict[str, Any]:
-        """All options by name, as `gymnasium.make` takes them."""
-        common = {name: getattr(self, name) for name in CommonOptions.model_fields}
-        return common | {name: value for part in self.parts for name, value in self.part(part).items()}
-
-    def part(self, name: str) -> dict[str, Any]:
-        """Return the options of a part, a key of `parts`, as a dictionary from name to value."""
-        model = self.parts[name]
-        return {option: getattr(model, option) for option in type(model).model_fields}
-
-    @property
-    def guidance_kind(self) -> GuidanceKind:
-        """Registered kind of the guidance."""
-        return GUIDANCE.get(self.guidance)
-
-    @property
-    def station_kind(self) -> StationKind:
-        """Registered kind of the station."""
-        return STATIONS.get(self.station)
 
     def make_task(self) -> Task:
         """Return a new instance of the task; its hidden offsets are not yet sampled."""

@@ -34,7 +34,6 @@ from guiderail.diagrams.tasks.registry import check_num_steps
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.plugins import is_sibling_module
-from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
 
@@ -232,11 +231,12 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
     if is_own_robot or not all(map(_is_packaged, builders)):
         return None
     try:
-        kinds = config.guidance_kind, config.station_kind, _base_policy_key(options.get("base_policy"))
+        declared = config.guidance_kind.options
+        key = None if declared is None else declared.diagram_key(options)
         files = task.folder_digest(), *map(_digest, options.values())
-        return type(task), *kinds, render_mode, freeze(options), files
+        return type(task), config.guidance_kind, config.station_kind, key, render_mode, freeze(options), files
     except (TypeError, OSError, InputError):
-        return None  # an option is not comparable, or a file of the base policy or the task folder cannot be read
+        return None  # an option is not comparable, or a file that an option names or of the task folder cannot be read
 
 
 def _is_packaged(definition: Any) -> bool:
@@ -250,13 +250,3 @@ def _digest(option: Any) -> bytes | None:
         return None
     with Path(option).open("rb") as file:
         return hashlib.file_digest(file, "sha256").digest()
-
-
-def _base_policy_key(source: str | None) -> Hashable:
-    """Return a key that changes if another policy replaces the base policy `source`; None without a base policy."""
-    if not source:
-        return None
-    if source in BASE_POLICIES.names():
-        return id(BASE_POLICIES.get(source))  # unique, because a diagram with this policy is never freed
-    file = (Path(source) / "policy.safetensors").stat()
-    return file.st_ino, file.st_mtime_ns, file.st_size

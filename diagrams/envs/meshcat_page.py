@@ -17,12 +17,34 @@ import sys
 import weakref
 from collections.abc import Sequence
 from contextlib import suppress
+from importlib.util import find_spec
 from pathlib import Path
 
 from pydrake.common import FindResourceOrThrow
 from pydrake.geometry import Meshcat, MeshcatParams
 
 END_TIMEOUT = 5.0  # longest wait for the gateway to exit before it is killed [s]
+
+
+GATEWAY_MODULES = ("msgpack", "websockets")  # modules outside of the standard library that the gateway imports
+# Program that runs the gateway. Python's option -I excludes the current folder, PYTHONPATH and the user's packages, so
+# the folders of the gateway's modules are appended to the path.
+_START = "import runpy, sys; sys.path += sys.argv[2:]; runpy.run_path(sys.argv[1], run_name='__main__')"
+
+
+def _folders(modules: Sequence[str]) -> list[str]:
+    """Return the absolute paths of the folders from which this process imports modules.
+
+    Raises:
+        RuntimeError: If a module is not installed.
+    """
+    folders = []
+    for module in modules:
+        spec = find_spec(module)
+        if spec is None or spec.origin is None:
+            raise RuntimeError(f"the module {module} is missing, install it with pip install {module}")
+        folders.append(str(Path(spec.origin).resolve().parent.parent))
+    return list(dict.fromkeys(folders))
 
 
 class MeshcatPage(Meshcat):
@@ -36,8 +58,8 @@ class MeshcatPage(Meshcat):
         is_served: True if browsers may connect; if False, the page can only be exported with `StaticHtml`.
 
     Raises:
-        RuntimeError: If `DRAKE_ALLOW_NETWORK` forbids Meshcat, the gateway ends at its start, or Meshcat's own port
-            cannot be closed.
+        RuntimeError: If `DRAKE_ALLOW_NETWORK` forbids Meshcat, a module of the gateway is missing, the gateway ends at
+            its start, or Meshcat's own port cannot be closed.
     """
 
     def __init__(self, *, is_served: bool = True):
@@ -87,7 +109,8 @@ class _Gateway:
     def __init__(self, meshcat_port: int):
         """Start the gateway, wait until it is connected to Meshcat's server, and close the port of that server."""
         self.token, self._num_browsers, self._rest = secrets.token_urlsafe(24), 0, b""
-        program = [sys.executable, "-I", str(Path(__file__).with_name("page_gateway.py"))]
+        gateway = str(Path(__file__).with_name("page_gateway.py"))
+        program = [sys.executable, "-I", "-c", _START, gateway, *_folders(GATEWAY_MODULES)]
         self._process = subprocess.Popen(program, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
         assert self._process.stdin is not None
         assert self._process.stdout is not None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Hashable, Mapping
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
@@ -22,7 +21,6 @@ from pydantic.fields import FieldInfo
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.policy import BASE_POLICIES, find_base_policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, DEFAULT_LENGTH_SCALE, Kernel, make_kernel
 
 STANDARD = "standard"
@@ -39,6 +37,14 @@ class Options(BaseModel):
     """Base class of option models: immutable; refuses undeclared names, NaN and infinite numbers."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+
+    @classmethod
+    def diagram_key(cls, options: Mapping[str, Any]) -> Hashable:
+        """Return a key that is equal for equal diagrams; a guidance extends it if values name entries that may change.
+
+        Files that an option names are part of the key of every diagram.
+        """
+        return None
 
 
 def _split_list(value: Any) -> Any:
@@ -188,44 +194,6 @@ class TemplateOptions(Options):
         None,
         description="keep commands inside the template's active constraints; default: true, but false with guidance "
         "none",
-    )
-
-
-class BasePolicyOptions(Options):
-    """Options of guidance around a base policy."""
-
-    base_policy: str = Field(
-        "",
-        description="base policy: folder of a run of the learner chunk, or a registered name; default: none, and the "
-        "guidance is built from the demonstrations",
-    )
-    replan_steps: Integer = Field(5, ge=1, le=1000, description="control steps between two predictions of a chunk")
-    covariance_floor: Number = Field(
-        1.0, gt=0, description="multiple of the demonstrations' covariance that is added to the chunks' variance"
-    )
-
-    @field_validator("base_policy")
-    @classmethod
-    def _check_source(cls, value: str) -> str:
-        if not value:
-            return value
-        find_base_policy(value)
-        # A relative path would be wrong if the run is resumed from another folder.
-        return value if value in BASE_POLICIES.names() else str(Path(value).resolve())
-
-
-class GuardOptions(BasePolicyOptions):
-    """Options of the guidance `base_policy`, which executes a base policy's chunks."""
-
-    guard: Literal["none", "projection", "slowdown"] = Field(
-        "projection",
-        description="filter that keeps chunks within the bounds, max_speed and max_jerk: projection to the nearest "
-        "chunk, slowdown on the same path, or none",
-    )
-    max_jerk: PositiveNumbers = Field(
-        (),
-        description="largest jerk of a command behind the guard, in the form of max_speed; if max_jerk or max_speed "
-        "is not given: twice the largest value in the demonstrations",
     )
 
 

@@ -237,9 +237,9 @@ def open_meshcat(meshcat: Meshcat | None = None) -> tuple[Meshcat, MeshcatVisual
     try:
         meshcat = meshcat or MeshcatPage()
     except RuntimeError as error:
-        raise InputError(
-            f"the browser view can't be opened ({error}): set DRAKE_ALLOW_NETWORK=meshcat, or leave render_mode out"
-        ) from error
+        is_missing = "is missing" in str(error)
+        hint = "install it" if is_missing else "set DRAKE_ALLOW_NETWORK=meshcat"
+        raise InputError(f"the browser view can't be opened ({error}): {hint}, or leave render_mode out") from error
     parameters = MeshcatVisualizerParams(role=Role.kIllustration, publish_period=PUBLISH_PERIOD)
     return meshcat, MeshcatVisualizer(meshcat, parameters)
 

@@ -18,7 +18,8 @@ output                  size   meaning
 ======================  =====  =====================================================================================
 
 Guidance may export further output ports, such as a template's `progress`; a task's reward can name them. Guidance
-around a base policy also has the input `reference_window`, which a system from `Guidance.make_reference` computes.
+whose reference depends on the observation also has the input `reference_window`, which a system from
+`Guidance.make_reference` computes.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
 
 if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
+    from guiderail.diagrams.envs.settings import EnvSettings
 
 
 ScriptedPolicy = Callable[[np.ndarray], np.ndarray]
@@ -145,7 +145,7 @@ class Task(ABC):
     time_unit: float
     default_control_period: float
 
-    def __init__(self, config: EnvConfig):
+    def __init__(self, config: EnvSettings):
         """Construct the task; a subclass may refuse incompatible options.
 
         Args:

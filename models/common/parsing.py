@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from xml.etree import ElementTree
 
-from pydrake.multibody.parsing import ModelDirective, ModelDirectives, Parser, ProcessModelDirectives
+from pydrake.multibody.parsing import ModelDirective, ModelDirectives, PackageMap, Parser, ProcessModelDirectives
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 
@@ -15,12 +15,14 @@ from guiderail.models.common.errors import InputError
 
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
 _DIRECTIVES = (".yaml", ".yml")
+_PACKAGE = "package.xml"  # file of a ROS package
 
 
 def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
     """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.dmd.yaml), to a plant.
 
-    Directives may refer to packages (folders with a `package.xml`) in the folder of their file.
+    Directives may refer to packages (folders with a `package.xml`) in the folder of their file. `package://` in a model
+    refers to packages above its file, packages next to these, and packages in the folders of ROS_PACKAGE_PATH.
 
     Raises:
         InputError: If the file is of another type, or the file or one of its meshes cannot be read.
@@ -30,11 +32,45 @@ def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceInd
         _refuse_crossed_limits(Path(path))
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
+        else:
+            _add_packages(parser.package_map(), Path(path))
         try:
             return parser.AddModels(str(path))
         except (RuntimeError, SystemExit) as error:  # a failed assertion of Drake is a SystemExit
             words = " ".join(str(error).split())
             raise InputError(f"the model {path}, or a mesh in it, can't be read: {words}") from error
+
+
+def _add_packages(packages: PackageMap, path: Path) -> None:
+    """Add the packages that a model may name by `package://`; the nearest package of a name is used."""
+    try:
+        if b"package://" not in path.read_bytes():
+            return
+    except OSError:
+        return  # a file that Drake's parser refuses
+    above = [folder for folder in path.resolve().parents if (folder / _PACKAGE).is_file()]
+    for xml in (*(folder / _PACKAGE for folder in above), *(xml for folder in above for xml in _siblings(folder))):
+        if (name := _package_name(xml)) and not packages.Contains(name):
+            packages.Add(name, str(xml.parent))
+    if os.environ.get("ROS_PACKAGE_PATH"):
+        others = PackageMap.MakeEmpty()
+        others.PopulateFromRosPackagePath()
+        for name in others.GetPackageNames():
+            if not packages.Contains(name):
+                packages.Add(name, others.GetPath(name))
+
+
+def _siblings(package: Path) -> list[Path]:
+    """Return the `package.xml` of the packages next to a package, in the order of their names."""
+    return sorted(package.parent.glob(f"*/{_PACKAGE}"))
+
+
+def _package_name(xml: Path) -> str:
+    """Return the name of a package; empty if its `package.xml` cannot be read."""
+    try:
+        return (ElementTree.parse(xml).findtext("name") or "").strip()
+    except (ElementTree.ParseError, OSError, ValueError):
+        return ""
 
 
 def _refuse_crossed_limits(path: Path) -> None:

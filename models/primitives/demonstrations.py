@@ -29,7 +29,7 @@ class Demonstrations:
     Raises:
         InputError: If there is no demonstration, a demonstration has fewer than two samples or no output, shapes or
             numbers of outputs do not match, a number is not finite or above `MAX_MAGNITUDE`, time does not increase
-            strictly, or `names` are not O different short printable texts.
+            strictly, `names` are not O different short printable texts, or they name an orientation in degrees.
 
     Attributes:
         times, outputs: M arrays (N_m,) and (N_m, O).

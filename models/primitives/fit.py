@@ -17,7 +17,7 @@ from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
-from guiderail.models.primitives.mixture import information_criteria
+from guiderail.models.primitives.mixture import information_criteria, thinned
 from guiderail.models.primitives.reference import ReferenceTrajectory
 
 MIN_DEMONSTRATIONS = 3
@@ -30,6 +30,10 @@ _LENGTHS = (0.3, 0.2, 0.13, 0.09, 0.06, 0.04, 0.027, 0.018, 0.012, 0.008)
 _REGULARIZATIONS = (1.0, 0.1, 0.01)
 _COMPONENTS = (3, 5, 8, 12, 18, 26, 36, 50)  # numbers of mixture components to try
 _EVALUATED = 40  # number of steps at which candidates are compared
+LONG = 400
+"""Largest number of steps at which a mixture is fitted to all steps."""
+# Number of evenly spaced steps, at least four for each component, to which the mixture of a long motion is fitted.
+_MIXTURE_STEPS = 150
 
 
 @dataclass(frozen=True)
@@ -83,6 +87,7 @@ def fit(
     num_steps: int | None = None,
     floor: float | np.ndarray = 0.0,
     seed: int = 0,
+    log: Callable[[str], object] | None = None,
 ) -> Selection:
     """Select components, kernel and regularization by leave-one-out cross-validation.
 
@@ -103,6 +108,7 @@ def fit(
         num_steps: As in `ReferenceTrajectory.from_demonstrations`.
         floor: As in `ReferenceTrajectory.from_demonstrations`.
         seed: As in `ReferenceTrajectory.from_demonstrations`.
+        log: Function that receives sentences on the progress.
 
     Raises:
         InputError: If there are fewer than three demonstrations, they cannot be fitted, the horizon is not a whole
@@ -120,13 +126,28 @@ def fit(
     times, outputs = resampled.times[0], np.stack(resampled.outputs)
     if len(times) < 4 * _COMPONENTS[0]:
         raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
-    counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(times) // 4]
-    criteria = information_criteria(times, outputs, counts, seed)
+    mixture_steps = None
+    if len(times) > LONG:
+        is_given = components is not None and is_whole(components, 1)
+        mixture_steps = max(_MIXTURE_STEPS, 4 * int(components or 0)) if is_given else _MIXTURE_STEPS
+    at = thinned(len(times), mixture_steps)
+    counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(at) // 4]
+    say = log or (lambda text: None)
+    say(f"fitting mixtures of {', '.join(map(str, counts))} components to {len(at)} of {len(times)} steps")
+    criteria = information_criteria(times[at], outputs[:, at], counts, seed)
     components = min(criteria, key=lambda count: criteria[count])
 
-    reference = ReferenceTrajectory.from_demonstrations(resampled, components, seed, floor=floor)
-    remaining = (Demonstrations(times, np.delete(outputs, m, axis=0)) for m in range(len(outputs)))
-    folds = [ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor) for fold in remaining]
+    reference = ReferenceTrajectory.from_demonstrations(
+        resampled, components, seed, floor=floor, mixture_steps=mixture_steps
+    )
+    folds = []
+    for m in range(len(outputs)):
+        say(f"leaving out demonstration {m + 1} of {len(outputs)}, with {components} components")
+        fold = Demonstrations(times, np.delete(outputs, m, axis=0))
+        folds.append(
+            ReferenceTrajectory.from_demonstrations(fold, components, seed, floor=floor, mixture_steps=mixture_steps)
+        )
+    say("comparing kernels and regularizations")
     make = partial(make_kernel, kernel, parameters=kernel_parameters)
     candidates = _validate(reference, folds, outputs, horizon, _grid(resampled, length_scale, lambda_), make)
     selected = _select(candidates)
@@ -134,6 +155,9 @@ def fit(
         reference, make(selected.length_scale), selected.lambda_, selected.lambda_, horizon, max_deviation=np.inf
     )
     share = share_within_spread(primitive)
+    thinning = ""
+    if len(at) < len(times):
+        thinning = f" The mixture was fitted to {len(at)} evenly spaced steps of {len(times)}."
     return Selection(
         reference=reference,
         components=components,
@@ -144,7 +168,7 @@ def fit(
         share=share,
         criteria=criteria,
         candidates=candidates,
-        why=_explain(components, criteria, selected, candidates, share, times),
+        why=_explain(components, criteria, selected, candidates, share, times) + thinning,
     )
 
 
@@ -152,8 +176,13 @@ def share_within_spread(primitive: LcNsKmp) -> float:
     """Compute the share of steps at which the motion without actions is within one standard deviation of the mean.
 
     One standard deviation is the ellipsoid of the reference's covariance. If the share is below `MIN_SHARE`, the kernel
-    is too wide for the demonstrations or the regularization is too strong; `fit` selects both.
+    is too wide for the demonstrations or the regularization is too strong; `fit` selects both. Of a long motion without
+    a history, 400 evenly spaced steps are evaluated.
     """
+    if not primitive.history and primitive.reference.num_steps > LONG:
+        steps = thinned(primitive.reference.num_steps, LONG)
+        motion = np.array([primitive.predict(step, None, None).output for step in steps.tolist()])
+        return float(_within(primitive.reference, motion, steps).mean())
     return float(_within(primitive.reference, motion_without_actions(primitive), slice(None)).mean())
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from typing import Literal, cast
 
 import numpy as np
+
+from guiderail.models.common.errors import InputError, brief
 
 Orientation = Literal["euler_zyx", "rotation_vector"]
 
@@ -17,34 +20,55 @@ _ANGLE_NAMES = {
     ("rz", "ry", "rx"): "euler_zyx",
     ("r_x", "r_y", "r_z"): "rotation_vector",
 }
+# Unit at the end of an output's name.
+_DEGREES = re.compile(
+    r"(?:[\[(]\s*(?:deg|degrees?|\u00b0)\s*[\])]|_deg)\s*$", re.IGNORECASE
+)  # unit of an output's name
+_UR_NAMES = ("rx", "ry", "rz")  # names of a rotation vector on a Universal Robots arm
+# Largest absolute value of angles without a unit that may be wrapped [rad]; beyond it they may be in degrees.
+_MAX_WRAPPED = 2 * math.pi + 0.1
 _MAX_ROTATION = 1.0  # largest rotation between two samples at which a change of about a full turn is a jump [rad]
 
 
 def orientation_of_names(names: Sequence[str]) -> Orientation | None:
     """Return the representation of the orientation in six outputs with the given names.
 
-    Names of orientations are those of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
+    An orientation in degrees is refused, because all guidance computes with radians. Names of orientations are those
+    of `poses.POSE_NAMES`, and "Rz [rad]", "Ry [rad]", "Rx [rad]" for Euler angles, as
     `guiderail dataset import` writes them. The result is None for other names and for another number of names.
     """
-    plain = _plain(names)
-    return cast("Orientation | None", _ANGLE_NAMES.get(plain[3:])) if len(plain) == 6 else None
+    plain = _plain([_DEGREES.sub("", name) for name in names])
+    if len(plain) != 6:
+        return None
+    orientation = cast("Orientation | None", _ANGLE_NAMES.get(plain[3:]))
+    if orientation is not None or plain[3:] == _UR_NAMES:
+        for name in names[3:]:
+            if _DEGREES.search(name):
+                raise InputError(
+                    f"the orientation {brief(name)} is in degrees: convert it to radians, and name it with [rad]"
+                )
+    return orientation
 
 
 def without_jumps(outputs: Sequence[np.ndarray], names: Sequence[str]) -> tuple[np.ndarray, ...]:
     """Remove full-turn jumps of angles and rotation vectors between samples, and between the arrays' first samples.
 
     An output is an angle if its name contains the unit "[rad]". The last three of six outputs are Euler angles or a
-    rotation vector if they have such names (`orientation_of_names`, or "rx", "ry", "rz" for a rotation vector). Outputs
-    without a jump are returned unchanged.
+    rotation vector if they have such names (`orientation_of_names`, or "rx", "ry", "rz" for a rotation vector). If the
+    names state no unit and a value exceeds a full turn, the numbers may be degrees and are kept. Outputs without a jump
+    are returned unchanged.
 
     Args:
         outputs: M arrays (N_m, O); their first samples are compared with that of the first array.
         names: Names of the O outputs.
     """
     plain = _plain(names)
-    is_pose = len(plain) == 6
-    has_vector = is_pose and (orientation_of_names(names) == "rotation_vector" or plain[3:] == ("rx", "ry", "rz"))
-    has_angles = orientation_of_names(names) == "euler_zyx"
+    orientation = orientation_of_names(names)
+    has_vector = orientation == "rotation_vector" or (len(plain) == 6 and plain[3:] == _UR_NAMES)
+    has_angles = orientation == "euler_zyx"
+    if (has_vector or has_angles) and not all("[rad]" in name for name in names[3:]):
+        largest = max(float(np.abs(y[:, 3:]).max(initial=0.0)) for y in outputs)
+        has_vector, has_angles = has_vector and largest <= _MAX_WRAPPED, has_angles and largest <= _MAX_WRAPPED
     is_angle = ["[rad]" in name or (has_angles and o > 2) for o, name in enumerate(names)]
     result: list[np.ndarray] = []
     for y in outputs:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -29,8 +29,7 @@ from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
 
 if TYPE_CHECKING:
-    from guiderail.models.control.motion_constraints import MotionConstraintFilter
-    from guiderail.models.primitives.stepper import PrimitiveStepper
+    pass
 
 
 class LcNsKmp:
@@ -174,21 +173,6 @@ class LcNsKmp:
             is_constrained[rows] = violates
         return BatchPrediction(outputs, is_constrained, is_solved)
 
-    def start(
-        self,
-        pose: ArrayLike | None = None,
-        gain: ArrayLike | None = None,
-        history_source: Literal["commanded", "measured"] = "commanded",
-        motion: MotionConstraintFilter | None = None,
-    ) -> PrimitiveStepper:
-        """Start an episode without a diagram, and return the stepper that computes its commands.
-
-        Arguments and errors are those of `PrimitiveStepper`: `pose` is (O,) or (P, O), and `gain` is (O,).
-        """
-        from guiderail.models.primitives.stepper import PrimitiveStepper
-
-        return PrimitiveStepper(self, pose, gain, history_source, motion)
-
     def predict_at(
         self,
         inputs: np.ndarray,
@@ -236,7 +220,7 @@ class LcNsKmp:
         null_space_action: np.ndarray | None = None,
         history: np.ndarray | None = None,
     ) -> Prediction:
-        """Compute the output at a step from a given window, such as that of a base policy; nothing is cached.
+        """Compute the output at a step from a given window, such as that of a reference system; nothing is cached.
 
         Args:
             step: As in `predict`; it selects the constraints and the times of the window.

@@ -90,6 +90,13 @@ def fit_new_mixture(times: np.ndarray, outputs: np.ndarray, components: int | No
     return Mixture(best.weights_, best.means_, best.covariances_, center, scale)
 
 
+def thinned(num_steps: int, most: int | None) -> np.ndarray:
+    """Return the indices of at most `most` of the steps, evenly spaced with the first and the last; all if None."""
+    if most is None or num_steps <= most:
+        return np.arange(num_steps)
+    return np.unique(np.linspace(0, num_steps - 1, most).round().astype(int))
+
+
 def information_criteria(
     times: np.ndarray, outputs: np.ndarray, candidates: Sequence[int], seed: int
 ) -> dict[int, float]:

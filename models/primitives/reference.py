@@ -14,7 +14,7 @@ from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetri
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.kernels import Kernel, check_kernel
-from guiderail.models.primitives.mixture import fit_mixture, regress
+from guiderail.models.primitives.mixture import fit_mixture, regress, thinned
 from guiderail.models.primitives.promp import ProMp
 
 _SINGULAR = 1e-13  # largest eigenvalue of a correlation matrix that is singular in double precision
@@ -73,6 +73,7 @@ class ReferenceTrajectory:
         model: Literal["gmr", "promp"] = "gmr",
         gap_scale: float = 1.0,
         kernel: Kernel | None = None,
+        mixture_steps: int | None = None,
     ) -> ReferenceTrajectory:
         """Fit a Gaussian mixture of (time, output) and regress it on time (equation 2.12 and GMR), or fit a ProMP.
 
@@ -93,6 +94,8 @@ class ReferenceTrajectory:
                 narrower below 1 and wider above 1. At each step the factor is `gap_scale` to the power of
                 `unobserved_share`.
             kernel: Kernel of `unobserved_share`; `SquaredExponential()` by default.
+            mixture_steps: Largest number of steps, evenly chosen, to which the mixture is fitted; all by default. It is
+                regressed on all steps.
 
         Raises:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
@@ -120,7 +123,8 @@ class ReferenceTrajectory:
         if model == "promp":
             means, covariances = ProMp.fit(demonstrations).moments(np.linspace(0.0, 1.0, len(times)))
         else:
-            means, covariances = regress(fit_mixture(times, outputs, components, seed), times)
+            at = thinned(len(times), mixture_steps)
+            means, covariances = regress(fit_mixture(times[at], outputs[:, at], components, seed), times)
         covariances = covariances + np.diag(floor**2)
         if prior_std is not None:
             covariances += np.eye(len(floor)) * (interpolate_prior(prior_std, len(times), len(floor)) ** 2)[:, None]

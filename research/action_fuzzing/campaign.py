@@ -22,8 +22,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.environments import check_environment, make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselineFactory
+from guiderail.tools.evaluation.episode import Callback, EnvCallback, Transition
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import Callback, EnvCallback, Transition, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import read_table, table_text

@@ -13,8 +13,8 @@ from guiderail.diagrams.tasks.pouring.options import MAX_MUG_OFFSET
 from guiderail.diagrams.tasks.pouring.task import scripted_pour
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.evaluation.baselines import BaselineFactory, bang_bang, uniform_random
+from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn
 from research.action_fuzzing.campaign import Campaign, Case
 
 

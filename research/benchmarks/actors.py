@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, with_defaults
 from guiderail.tools.learning.trainer import run_training
 from research.benchmarks import with_progress
 

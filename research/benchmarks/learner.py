@@ -28,7 +28,7 @@ from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
 
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner

@@ -16,8 +16,8 @@ from unittest.mock import patch
 
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.learning import trainer
+from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, with_defaults
 from research.benchmarks import with_progress
 
 TASKS = {"NarrowPassage": 10, "BncConnector": 6}  # number of episodes

@@ -27,8 +27,8 @@ from stable_baselines3.common.buffers import NStepReplayBuffer
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import checkpoint, fast_sb3, off_policy, trainer
+from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, with_defaults
 
 TASK = "BncConnector"
 EPISODES = 6

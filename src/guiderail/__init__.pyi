@@ -40,10 +40,10 @@ from .models.templates import load_template as load_template
 from .systems.episode_monitor import TerminationTerm as TerminationTerm
 from .systems.policy_system import PolicySystem as PolicySystem
 from .systems.reward_system import RewardTerm as RewardTerm
+from .tools.evaluation.episode import Callback as Callback
+from .tools.evaluation.episode import Transition as Transition
 from .tools.evaluation.evaluate import evaluate as evaluate
 from .tools.evaluation.evaluation import Evaluation as Evaluation
-from .tools.evaluation.rollout import Callback as Callback
-from .tools.evaluation.rollout import Transition as Transition
 from .tools.evaluation.rollout import rollout as rollout
 from .tools.guided.env import GuidedEnv as GuidedEnv
 from .tools.guided.env import GuidedVectorEnv as GuidedVectorEnv

@@ -233,6 +233,30 @@ def start_pose(pose: np.ndarray) -> np.ndarray:
     return np.asarray(pose)
 
 
+def unset_state(system: LeafSystem, size: int) -> DiscreteStateIndex:
+    """Declare and return a discrete state (size,) that an initialization sets; until then it is NaN.
+
+    A context that was restored or randomized without an initialization must not command zeros: read the state with
+    `initialized`.
+    """
+    return system.DeclareDiscreteState(np.full(size, np.nan))
+
+
+def initialized(system: LeafSystem, context: Context, state: DiscreteStateIndex) -> np.ndarray:
+    """Return the value of an `unset_state`.
+
+    Raises:
+        InputError: If no initialization has set the state.
+    """
+    value = context.get_discrete_state().value(state)
+    if np.isnan(value).all():
+        raise InputError(
+            f"the {type(system).__name__} '{system.get_name()}' has no start: call Simulator.Initialize() after a "
+            "context was created, randomized or restored from its defaults"
+        )
+    return value
+
+
 def update(
     system: LeafSystem,
     period: float,

@@ -90,9 +90,10 @@ class LastValidPose:
         timeout: float,
         blend_factor: InputPort | None = None,
     ):
-        self._desired_pose, self._measured_pose, self._blend_factor = desired_pose, measured_pose, blend_factor
+        self._system, self._desired_pose, self._blend_factor = system, desired_pose, blend_factor
+        self._measured_pose = measured_pose
         self._validity = CommandValidity(desired_pose, command_time, period=period, timeout=timeout)
-        self._last_pose = system.DeclareDiscreteState(desired_pose.size())
+        self._last_pose = declare.unset_state(system, desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
         declare.update(system, period, self._update, self._reset)
         # Outputs and event share one check of a command.
@@ -103,7 +104,7 @@ class LastValidPose:
         """Return the desired pose to follow, (O,)."""
         if self._valid.Eval(context):
             return self._desired_pose.Eval(context)
-        return context.get_discrete_state().value(self._last_pose)
+        return declare.initialized(self._system, context, self._last_pose)
 
     def declare_timed_out_output(self, system: LeafSystem) -> OutputPort:
         """Declare the output port ``command_timed_out`` (1,), which is 1 if the present command is not valid."""

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.control.shapes import Sphere, linearize
-from guiderail.models.primitives import LcNsKmp
+from guiderail.models.primitives import LcNsKmp, PrimitiveStepper
 from guiderail.models.templates.schema import parse_template
 
 KINDS = ("reference", "command", "command, smooth", "speed", "speed and acceleration", "template")
@@ -124,7 +124,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
     for _ in range(EPISODES):
         style, action = int(rng.integers(5)), np.zeros(2)
         start = reference.means[0] + rng.normal(0.0, 0.02, 2)
-        stepper = primitive.start(start, gain, motion=motion)
+        stepper = PrimitiveStepper(primitive, start, gain, motion=motion)
         commands, outside = [start] if motion else [], -np.inf
         for n in range(reference.num_steps):
             if style == 0:  # action for which the unconstrained primitive commands the center of the obstacle

@@ -9,8 +9,8 @@ from guiderail.diagrams.envs.config import option_models
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.policy import BASE_POLICIES
-from guiderail.tools.learning.train import configure, with_defaults
+from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail_lerobot.base_policy import BASE_POLICIES
 from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
 
 

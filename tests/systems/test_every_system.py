@@ -1,6 +1,6 @@
 """Rules that every LeafSystem of the project satisfies.
 
-A file defines one exported system with the name of the file, and the system has a test file. `oracles.system_rules` has
+A file defines one exported system with the name of the file, and the system has a test file. `oracles.systems` has
 the rules of ports, outputs and errors.
 """
 
@@ -24,7 +24,7 @@ from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
-from oracles.system_rules import RULES, check_source, classes, system_names
+from oracles.systems import RULES, check_source, classes, system_names
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent

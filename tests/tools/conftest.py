@@ -1,2 +1,1 @@
-from bead_runs import _bead_run, bead_config, bead_run  # noqa: F401
-from quick_pictures import simplify_pictures  # noqa: F401
+from bead_runs import _bead_run, bead_config, bead_run, simplify_pictures  # noqa: F401

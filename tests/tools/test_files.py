@@ -9,8 +9,8 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.evaluation.evaluate import evaluate
-from guiderail.tools.evaluation.rollout import check_seed
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.files import (
     LOCK,

@@ -11,12 +11,10 @@ from guiderail.diagrams.stations.registry import STATIONS, register_station
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, register_base_policy
 from guiderail.models.primitives.kernels import KERNELS, register_kernel
 from guiderail.models.robots.robot import register_end_effector, register_robot
 from guiderail.tools.learning.learner import LEARNERS, register_learner
 from guiderail_hardware.drivers.driver import DRIVERS, Driver, register_driver
-from guiderail_studies.engines.engine import ENGINES, make_engine, register_engine
 
 
 class IncompleteDriver(Driver):
@@ -45,8 +43,6 @@ class UnrelatedConfig:
     ("register", "message"),
     [
         (lambda: register_kernel("lab", 3), "'lab' is registered with a function or a class, not with 3"),
-        (lambda: register_base_policy("lab", 3), "registered with a function or a class, not with 3"),
-        (lambda: register_engine("lab")(3), "registered with a function or a class, not with 3"),
         (lambda: register_driver("lab", 3), "registered with a subclass of Driver, not with 3"),
         (lambda: register_driver("lab", IncompleteDriver), "the class IncompleteDriver lacks write"),
         (lambda: register_guidance("lab")(3), "registered with a function or a class, not with 3"),
@@ -75,7 +71,7 @@ class UnrelatedConfig:
 def test_registration_refuses_an_invalid_entry(register, message):
     with pytest.raises(InputError, match=message):
         register()
-    for registry in (KERNELS, BASE_POLICIES, ENGINES, DRIVERS, GUIDANCE, STATIONS, TASKS, LEARNERS):
+    for registry in (KERNELS, DRIVERS, GUIDANCE, STATIONS, TASKS, LEARNERS):
         assert "lab" not in registry.names()
 
 
@@ -83,7 +79,7 @@ def test_registration_refuses_an_invalid_entry(register, message):
 def remove_entries():
     """Remove the entries that a test registers."""
     yield
-    for registry in (STATIONS, ENGINES, GUIDANCE):
+    for registry in (STATIONS, GUIDANCE):
         for name in {"a", "lab"} & set(registry._entries):
             del registry._entries[name], registry._origins[name]
 
@@ -117,13 +113,6 @@ def test_environment_refuses_a_station_that_lacks_a_part(builder, message):
     add_station(builder=builder)
     with pytest.raises(InputError, match=message):
         guiderail.make_env("NarrowPassage", guidance="kgrl", station="lab")
-
-
-@pytest.mark.usefixtures("remove_entries")
-def test_study_refuses_an_engine_that_is_none():
-    register_engine("lab", build)
-    with pytest.raises(InputError, match="the engine 'lab' must be an Engine, not None"):
-        make_engine("lab")
 
 
 @pytest.mark.usefixtures("remove_entries")

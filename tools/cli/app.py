@@ -5,6 +5,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
@@ -53,12 +54,13 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
     if as_json:
         typer.echo(to_json(result))
         return
-    from guiderail.tools.evaluation.metrics import STATISTICS, SYMBOLS
+    from guiderail.tools.evaluation.metrics import STATISTICS, SYMBOLS, VIOLATION
     from guiderail.tools.tables import cell
 
     columns = [*result.get("baselines", ())]
     labels = {key: key if " " in key else key.replace("_", space) for key in result}
     units = {key: STATISTICS[key].unit for key in {*result} & {*STATISTICS}}
+    is_rounding = partial(_is_rounding, {key for key, unit in units.items() if unit == VIOLATION})
     labels |= {key: f"{labels[key]} [{unit}]" for key, unit in units.items() if unit in SYMBOLS}
     width = max(len(label) for label in labels.values())
     if columns:
@@ -67,8 +69,16 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
     for key, value in result.items():
         if key == "baselines" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
             continue
-        cells = [cell(value), *(cell(result[f"{name}_{key}"]) for name in columns if f"{name}_{key}" in result)]
+        values = [value, *(result[f"{name}_{key}"] for name in columns if f"{name}_{key}" in result)]
+        cells = ["none" if is_rounding(key, entry) else cell(entry) for entry in values]
         typer.echo("  ".join([f"{labels[key]:<{width}}", *(f"{text:<{COLUMN}}" for text in cells)]).rstrip())
+
+
+def _is_rounding(violations: set[str], key: str, value: Any) -> bool:
+    """Return True if a value is a constraint violation that is rounding of the primitive's solver."""
+    from guiderail.tools.evaluation.metrics import TOLERANCE
+
+    return key in violations and isinstance(value, float) and abs(value) <= TOLERANCE
 
 
 # Commands import their tools when they are called, because PyTorch and Drake take seconds to import.
@@ -144,16 +154,19 @@ CHOICES: dict[str, Callable[[], list[str]]] = LISTED | {
 class Command(typer.core.TyperCommand):
     """Command whose help text expands `{name}` to the choices that exist when the help is printed.
 
-    An empty argument is refused, because as a path it would be the current folder.
+    An empty argument is refused, because as a path it would be the current folder. An option that takes one value is
+    refused if it is given twice with different values.
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments; raise an `InputError` if an argument is empty."""
+        """Parse the arguments; raise an `InputError` if an argument is empty, or an option is given twice."""
         for before, word in pairwise(["", *args]):
             option = before if word == "" else word.removesuffix("=") if re.fullmatch("--[^=]+=", word) else None
             if option is not None:
                 name = option if option.startswith("--") else "an argument"
                 raise InputError(f"{name} is empty: give a value, or leave it out")
+        for parameter in self.params:
+            _refuse_repetition(parameter, args)
         return super().parse_args(ctx, args)
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
@@ -162,6 +175,25 @@ class Command(typer.core.TyperCommand):
             if text := getattr(parameter, "help", None):
                 parameter.help = expand_choices(text)  # type: ignore[attr-defined]
         super().format_options(ctx, formatter)
+
+
+def _refuse_repetition(parameter: Any, words: Sequence[str]) -> None:
+    """Raise an InputError if an option that takes one value has two values, or a switch is given on and off."""
+    on, off = set(parameter.opts), set(parameter.secondary_opts)
+    if parameter.param_type_name != "option" or parameter.multiple:
+        return
+    words = words[: words.index("--")] if "--" in words else words
+    if parameter.is_flag:
+        if on.intersection(words) and off.intersection(words):
+            raise InputError(f"{parameter.opts[0]} and {parameter.secondary_opts[0]} contradict each other: give one")
+        return
+    values = [
+        word.partition("=")[2] if "=" in word else following
+        for word, following in pairwise([*words, ""])
+        if word.partition("=")[0] in on
+    ]
+    for value in values[1:]:
+        check_same(parameter.opts[0], values[0], value)
 
 
 def expand_choices(text: str) -> str:

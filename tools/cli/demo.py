@@ -14,8 +14,9 @@ from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.metrics import TOLERANCE
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, Paths, check_seed, rollout
+from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.config import check_episodes
 from guiderail.tools.learning.run_folder import RunFolder

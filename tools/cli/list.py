@@ -21,7 +21,8 @@ def list_(
 ) -> None:
     """List tasks, guidance, stations, robots, drivers, kernels, learners, engines and presets.
 
-    With a task it lists the options of its environment and of a reset; with metrics, the definition of every number in
+    With a task it lists the options of its environment and of a reset; with a learner or a preset, its settings; with
+    another name of a list, such as a guidance, its description; with metrics, the definition of every number in
     a table. `guiderail list --json` also prints descriptions, ports, and options with their ranges.
     """
     from guiderail.diagrams.tasks.registry import IMPORT_HINT, TASKS
@@ -57,9 +58,30 @@ def list_(
 
         is_described = as_json and name in TASKS.names()
         print_result(describe_task(name) if is_described else describe_task_options(name), as_json, "_")
+    elif (described := _describe_entry(name)) is not None:
+        print_result(described, as_json, "_")
     else:
-        known = did_you_mean(name, [*cli.CHOICES["listed"](), "metrics"], IMPORT_HINT)
+        known = did_you_mean(
+            name, [*cli.CHOICES["listed"](), *chain(*map(_usable, cli.LISTED)), "metrics"], IMPORT_HINT
+        )
         raise InputError(f"there is no list of {name!r}: {known}")
+
+
+def _describe_entry(name: str) -> dict[str, Any] | None:
+    """Return settings of a learner or a preset, or the description of another entry of a list; None if unknown."""
+    if name in cli.LISTED["presets"]() or name in cli.LISTED["learners"]():
+        from guiderail.tools.learning.config import config_values, resolve_preset
+
+        is_preset = name in cli.LISTED["presets"]()
+        return config_values(resolve_preset(name if is_preset else None, None if is_preset else name, None))
+    if not any(name in _usable(key) for key in cli.LISTED):
+        return None
+    from guiderail.tools.catalog import describe_all
+
+    for key, entries in describe_all().items():
+        if key in cli.LISTED and isinstance(entries, dict) and name in entries:
+            return {"kind": key, **entries[name]}
+    return None
 
 
 def _usable(key: str) -> list[str]:

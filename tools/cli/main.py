@@ -1,6 +1,7 @@
 """Entry point of the `guiderail` command: reports errors as one sentence and an exit code."""
 
 import errno
+import io
 import logging
 import os
 import sys
@@ -25,14 +26,9 @@ COMMANDS = {
 }
 """Names of the commands that each module of this package registers."""
 ENVIRONMENT_OPTIONS = (
-    "--guidance",
-    "--station",
-    "--reward",
-    "--observation",
-    "--action-repeat",
-    "--fixture-offset",
+    "--guidance", "--station", "--difficulty", "--reward", "--observation", "--action-repeat", "--fixture-offset",
     "--robot",
-)
+)  # fmt: skip
 """Options of `train` that other commands take as `--env NAME=VALUE`."""
 INTERRUPTED = 130  # exit code after Ctrl-C
 
@@ -78,7 +74,10 @@ def main(arguments: list[str] | None = None) -> None:
     """
     # Matrices are small here: threads cost more in synchronization than they save, and several runs share a machine.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    arguments = sys.argv[1:] if arguments is None else arguments
+    arguments = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal may lack the characters of a table or a bar
     _show_messages()
     try:
         code = load_commands(*arguments[:1])(args=arguments, prog_name="guiderail", standalone_mode=False)

@@ -38,6 +38,7 @@ def train(
         ),
     ] = None,
     env: cli.Env = None,
+    difficulty: Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")] = None,
     action_repeat: Annotated[int | None, option("Control steps per action.")] = None,
     reward: Annotated[
         str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
@@ -101,6 +102,7 @@ def train(
     environment = cli.parse_environment(
         env,
         guidance=guidance,
+        difficulty=difficulty,
         action_repeat=action_repeat,
         reward=reward,
         observation=observation,

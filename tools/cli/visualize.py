@@ -31,6 +31,9 @@ def visualize(
     task: cli.PolicyTask = None,
     trust_policy: cli.TrustPolicy = False,
     episodes: Annotated[int | None, option("Number of held-out episodes on the page.  [default: 4]")] = None,
+    overwrite: Annotated[
+        bool, option("Replace existing files; those in the run's own folder are always replaced.", "--overwrite")
+    ] = False,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
 ) -> None:
@@ -63,6 +66,10 @@ def visualize(
         check_video(video)
     if html is None and image is None and video is None:
         html = default_page(Path(subject) if episode.run is None else episode.run, environment)
+    own = None if episode.run is None else episode.run.resolve()
+    for path in (html, image, video):
+        if path is not None and path.exists() and not overwrite and path.resolve().parent != own:
+            raise InputError(f"{path} exists already: name another file, or give --overwrite")
     if html is not None:
         write_page(html, episode, episodes=episodes)
         if episode.run is not None:

@@ -15,8 +15,8 @@ from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.common.registry import did_you_mean
+from guiderail.tools.evaluation.episode import Callback, PolicyFn
 from guiderail.tools.evaluation.policies import ENDINGS
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn
 
 HOLD = 10  # number of times that `random_hold` applies each action
 SWITCH_PROBABILITY = 0.1  # probability per action that `bang_bang` samples a corner again

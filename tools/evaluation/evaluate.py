@@ -1,6 +1,7 @@
 """Evaluation of a policy on held-out episodes, together with baseline policies."""
 
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -20,6 +21,7 @@ from guiderail.models.policy import Policy
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED, Callback, PolicyFn, check_seed, has_image
 from guiderail.tools.evaluation.evaluation import (
     BASELINES_FOLDER,
     COLLISIONS,
@@ -36,17 +38,8 @@ from guiderail.tools.evaluation.evaluation import (
 )
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
-from guiderail.tools.evaluation.policies import as_policy
-from guiderail.tools.evaluation.rollout import (
-    HELD_OUT_SEED,
-    Callback,
-    EpisodeProgress,
-    PolicyFn,
-    check_seed,
-    has_image,
-    is_compatible,
-    rollout,
-)
+from guiderail.tools.evaluation.policies import as_policy, is_compatible
+from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.subject import (
     Subject,
     counts_collisions,
@@ -351,7 +344,7 @@ def evaluate(
         }
         for name in stored:
             print(f"{labels[name]}: evaluated before, and used again", file=sys.stderr, flush=True)
-        evaluated, motions = dict(stored), []
+        evaluated, motions, started = dict(stored), [], time.monotonic()
         collect = None if save is None else partial(_successful_motion, signal)
         for name, rows, data in evaluate_policies(
             evaluation_env, policies, labels=labels, processes=processes, collect=collect, **kwargs
@@ -359,6 +352,7 @@ def evaluate(
             evaluated[name] = rows
             if name == POLICY:
                 motions = data
+                _print_first(rows, [*policies][1:], time.monotonic() - started, is_held_out=config is not None)
             if (file := files[name]) is not None:
                 write_atomically(file, table_text(rows).encode())
     rows_of = {name: evaluated[name] for name in (POLICY, *makers) if name in evaluated}
@@ -372,6 +366,15 @@ def evaluate(
     if describe_differences is not None and config is not None:
         result["differences"] = list(describe_differences(replace(config, environment=environment)))
     return Evaluation(result, rows_of, is_held_out=config is not None)
+
+
+def _print_first(rows: pd.DataFrame, baselines: Sequence[str], seconds: float, *, is_held_out: bool) -> None:
+    """Print the policy's result on standard error before baseline policies are evaluated, with their expected time."""
+    if baselines:
+        first = Evaluation(statistics(rows, ""), {POLICY: rows}, is_held_out=is_held_out)
+        duration = f"about {max(1, round(len(baselines) * seconds))} s"
+        names = ", ".join(LABELS.get(name, name) for name in baselines)
+        print(f"{first.sentence}\nbaselines on the same episodes ({duration}): {names}", file=sys.stderr, flush=True)
 
 
 def check_num_episodes(episodes: object) -> int:

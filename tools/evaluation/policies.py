@@ -24,14 +24,15 @@ import numpy as np
 
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.models.common.errors import InputError, brief, require_extra
+from guiderail.models.common.errors import InputError, brief, naming_failures, require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
-from guiderail.models.policy import BASE_POLICIES, MAX_WEIGHTS_SIZE, Policy
+from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
 from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, has_same_shapes, is_compatible
-from guiderail.tools.imports import import_modules, is_trusted, module_name
+from guiderail.tools.evaluation.episode import Callback, PolicyFn, as_action
+from guiderail.tools.imports import import_modules, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
+from guiderail.tools.spaces import describe_space, from_tensors, has_layout, layout, probes, takes_observations
 
 ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
 """Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
@@ -64,7 +65,12 @@ class ForeignPolicy(Callback):
     Attributes:
         observation_shape: Shape of the observation that the policy takes; None if unknown.
         action_shape: Shape of the action that the policy returns; None if unknown.
+        observation_space: Observation space that a model declares, or None.
+        action_space: Action space that a model declares, or None.
     """
+
+    observation_space: Any = None
+    action_space: Any = None
 
     def __init__(
         self,
@@ -88,7 +94,7 @@ class ForeignPolicy(Callback):
             InputError: If the observation has another shape than the policy takes, or the function raised an exception
                 or called `sys.exit`.
         """
-        if self.observation_shape not in (None, np.shape(observation)):
+        if self.observation_shape is not None and self.observation_shape != np.shape(observation):
             raise InputError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
         try:
             return self._converted(self._act(observation))
@@ -98,9 +104,16 @@ class ForeignPolicy(Callback):
             policy = f"the policy {self._name}".rstrip()
             raise InputError(f"{policy} raised {_describe_error(error)}") from error
 
+    def copy(self) -> ForeignPolicy:
+        """Return a policy whose calls do not change the internal state of this one; itself if it has no such state."""
+        return self
+
     def _converted(self, action: Any) -> Any:
+        action = from_tensors(action)
+        if isinstance(action, Mapping | tuple | str):  # of a space that is no array
+            return action
         array = np.asarray(action)
-        return array[0] if array.ndim == 2 and len(array) == 1 else array
+        return array[0] if array.ndim == 2 and len(array) == 1 and array.shape != self.action_shape else array
 
 
 def _describe_error(error: BaseException) -> str:
@@ -109,13 +122,43 @@ def _describe_error(error: BaseException) -> str:
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
+def _reset_state(policy: Any) -> None:
+    """Call the method `reset` of a stateful policy, if it has one without arguments."""
+    reset = getattr(policy, "reset", None)
+    if not callable(reset):
+        return
+    try:
+        inspect.signature(reset).bind()
+    except (TypeError, ValueError):  # it has arguments, or no signature
+        return
+    with naming_failures(f"reset of the policy {type(policy).__name__}"):
+        reset()
+
+
 class FunctionPolicy(ForeignPolicy):
-    """Policy of a function from an observation to an action; the action is returned unchanged."""
+    """Policy of a function from an observation to an action; tensors become arrays.
+
+    The method `reset` of an object that can be called is called at the start of every episode, if it has no arguments.
+    """
 
     def __init__(self, function: Callable[[np.ndarray], Any]):
         """Construct the policy of `function`; error messages contain the name of the function."""
         name = getattr(function, "__name__", type(function).__name__)
         super().__init__(function, name="" if name == "<lambda>" else name)
+
+    def copy(self) -> FunctionPolicy:
+        """Return the policy of a deep copy of an object that can be called, or itself if it cannot be copied."""
+        if inspect.isroutine(self._act):
+            return self
+        try:
+            return FunctionPolicy(deepcopy(self._act))
+        except Exception:  # code of others can raise any exception
+            return self
+
+    def on_episode_start(self) -> None:
+        """Reset the internal state of an object that can be called."""
+        if not inspect.isroutine(self._act):
+            _reset_state(self._act)
 
     def __getattr__(self, name: str) -> Any:
         """Return an attribute of the function, such as `start_episode` of an object that can be called."""
@@ -129,7 +172,7 @@ class FunctionPolicy(ForeignPolicy):
                 f"the policy returned {brief(action)}, and only a predict method returns an action and a state: return "
                 "the action alone"
             )
-        return action
+        return from_tensors(action)
 
 
 def _is_pair(returned: tuple[Any, Any]) -> bool:
@@ -147,21 +190,28 @@ class PredictPolicy(ForeignPolicy):
     """Policy with a `predict` method, such as a model of Stable-Baselines3.
 
     It acts deterministically if `predict` has a parameter `deterministic`. If `predict` has the parameters `state` and
-    `episode_start`, the state is passed from call to call and reset at the start of an episode.
+    `episode_start`, the state is passed from call to call and reset at the start of an episode. Its method `reset` is
+    called at the start of an episode, if it has no arguments.
     """
 
     def __init__(self, model: Any):
         """Construct the policy of `model`, whose `predict` returns an action, or an action and a state."""
-        observation_shape, action_shape = (
-            getattr(getattr(model, f"{kind}_space", None), "shape", None) for kind in ("observation", "action")
+        self.observation_space, self.action_space = (
+            getattr(model, f"{kind}_space", None) for kind in ("observation", "action")
         )
+        observation_shape, action_shape = (
+            getattr(space, "shape", None) for space in (self.observation_space, self.action_space)
+        )
+        if observation_shape is not None and len(observation_shape) == 3:
+            observation_shape = None  # `predict` converts images with the channels last
         name = type(model).__name__
         super().__init__(self._predict, observation_shape=observation_shape, action_shape=action_shape, name=name)
         self.model = model
         parameters = inspect.signature(model.predict).parameters
         self._options = {"deterministic": True} if "deterministic" in parameters else {}
         self._has_state = {"state", "episode_start"} <= parameters.keys()
-        self.on_episode_start()
+        self._state: Any = None
+        self._is_start = True
 
     def copy(self) -> PredictPolicy:
         """Return the policy of a deep copy of the model, or itself if the model cannot be copied."""
@@ -172,8 +222,9 @@ class PredictPolicy(ForeignPolicy):
 
     def on_episode_start(self) -> None:
         """Reset the internal state of a recurrent policy."""
-        self._state: Any = None
+        self._state = None
         self._is_start = True
+        _reset_state(self.model)
 
     def _predict(self, observation: np.ndarray) -> Any:
         if not self._has_state:
@@ -209,7 +260,7 @@ def as_policy(given: Any) -> PolicyFn:
 
 def is_policy_file(source: str | Path) -> bool:
     """Return True if a source has the ending of a policy's file, or is `module:function`."""
-    return Path(source).suffix in ENDINGS or _function_of(str(source)) is not None
+    return Path(source).suffix in ENDINGS or function_of(str(source)) is not None
 
 
 def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
@@ -225,7 +276,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
         InputError: If the file or function is missing, the file is damaged, it can execute code and is not trusted, or
             its package is not installed.
     """
-    if (function := _function_of(str(source))) is not None:
+    if (function := function_of(str(source))) is not None:
         return _load_function(*function)
     path = find_run(source)
     if path.suffix not in ENDINGS:
@@ -240,27 +291,7 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
 
 
-def add_base_policy(source: str) -> str:
-    """Return the name of a base policy; register it first if it is given as a file or `module:function`.
-
-    Another source, such as the folder of a run, is returned unchanged.
-
-    Raises:
-        InputError: If the source can execute code and `trust_imports` is not active, or the policy cannot be loaded.
-    """
-    if source in BASE_POLICIES.names() or not is_policy_file(source):
-        return source
-    module, separator, function = source.rpartition(":") if _function_of(source) is not None else (source, "", "")
-    path = module if separator and not module.endswith(".py") else str(Path(module).resolve())
-    name = path + separator + function
-    if name not in BASE_POLICIES.names():
-        if Path(source).suffix != ".onnx" and not is_trusted():
-            raise InputError(f"the base policy {source} can execute code: give --trust-imports if you trust its origin")
-        BASE_POLICIES.register(name, load_policy(source, trust_policy=True))
-    return name
-
-
-def _function_of(source: str) -> tuple[str, str] | None:
+def function_of(source: str) -> tuple[str, str] | None:
     """Return the module and the function's name of `module:function`; None for another source."""
     module, separator, name = source.rpartition(":")
     is_name = bool(separator) and name.isidentifier() and bool(module) and not source.startswith(PRETRAINED)
@@ -311,20 +342,45 @@ def _load_torchscript(path: Path) -> PolicyFn:
         module = torch.jit.load(path, map_location="cpu")
     except RuntimeError as error:
         raise InputError(f"{path} is no TorchScript file: write it with torch.jit.script(module).save(...)") from error
-    module.eval()
+    return TorchScriptPolicy(module.eval(), path)
 
-    def act(observation: np.ndarray) -> np.ndarray:
+
+class TorchScriptPolicy(ForeignPolicy):
+    """Policy of a TorchScript file; every episode begins with the state of the file.
+
+    The exported method `reset` of the module is called too, if it has no arguments.
+    """
+
+    def __init__(self, module: Any, path: Path):
+        """Construct the policy of a module that `path` contains, which must not have been called."""
+        super().__init__(self._forward, name=path.name)
+        self._stored, self._path = module, path
+        self._module = deepcopy(module)
+
+    def copy(self) -> TorchScriptPolicy:
+        """Return the policy in the state of the file."""
+        return TorchScriptPolicy(self._stored, self._path)
+
+    def on_episode_start(self) -> None:
+        """Restore the buffers and attributes of the file, and call the exported method `reset`."""
+        self._module = deepcopy(self._stored)
+        reset = getattr(self._module, "reset", None)
+        if callable(reset) and len(reset.schema.arguments) == 1:  # only the module itself
+            with naming_failures(f"reset of the policy {self._path.name}"):
+                reset()
+
+    def _forward(self, observation: np.ndarray) -> np.ndarray:
+        import torch
+
         try:
             with torch.inference_mode():
-                action = module(torch.as_tensor(observation, dtype=torch.float32)[None])
+                action = self._module(torch.as_tensor(observation, dtype=torch.float32)[None])
         except (RuntimeError, torch.jit.Error) as error:  # the lines before the last one are a traceback of TorchScript
             reason = ([line.strip() for line in str(error).splitlines() if line.strip()] or [""])[-1]
             raise RuntimeError(reason.removeprefix("RuntimeError: ")) from error
         if not isinstance(action, torch.Tensor):
-            raise InputError(f"{path} returns {brief(action)} instead of a tensor of actions")
+            raise InputError(f"{self._path} returns {brief(action)} instead of a tensor of actions")
         return action.numpy()
-
-    return ForeignPolicy(act, name=path.name)
 
 
 def _load_onnx(path: Path) -> PolicyFn:
@@ -362,10 +418,11 @@ def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[s
         InputError: If the shape of the policy's observations or actions differs from the environment's, a model's
             action space has other bounds, or the policy raises an exception.
     """
-    policy, raised = as_policy(policy), None
+    policy = as_policy(policy)
+    raised: Exception | None = None
     try:
         is_same = has_same_shapes(policy, env)
-    except (IndexError, ValueError) as error:
+    except (IndexError, TypeError, ValueError) as error:
         is_same, raised = False, error
     if is_same:
         _check_bounds(policy, env)
@@ -397,6 +454,14 @@ def _describe_mismatch(
     `raised` is the policy's exception for this environment's observations. If the shapes match anyway, or the policy
     fails for all flat observations too, the sentence is the message of `raised`.
     """
+    if isinstance(policy, ForeignPolicy) and _are_composite(policy, env):
+        if raised is not None:
+            return str(raised)
+        own, other = (
+            f"observations {_describe(source.observation_space)} and {verb}actions {_describe(source.action_space)}"
+            for source, verb in ((policy, "returns "), (env, ""))
+        )
+        return f"the policy takes {own}, and this environment has {other}: give another policy"
     observation_shape, action_shape = shapes(policy, env)
     expected = env.action_space.shape
     if isinstance(raised, InputError):
@@ -428,6 +493,17 @@ def _describe_mismatch(
     )
 
 
+def _are_composite(policy: ForeignPolicy, env: gymnasium.Env) -> bool:
+    """Return True if shapes do not describe the difference of a policy's spaces from an environment's."""
+    box = gymnasium.spaces.Box
+    given = [space for space in (policy.observation_space, policy.action_space) if space is not None]
+    return not all(isinstance(space, box) for space in (*given, env.observation_space, env.action_space))
+
+
+def _describe(space: Any) -> str:
+    return "of unknown shape" if space is None else describe_space(space)
+
+
 def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
     """Return the shapes of a policy's observation and action; None if a shape is unknown.
 
@@ -441,7 +517,7 @@ def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None
     if action_shape is None:
         try:
             action_shape = np.shape(policy(np.zeros(observation_shape, np.float32)))
-        except (IndexError, ValueError):
+        except (IndexError, TypeError, ValueError):
             found = _flat_shapes(policy) if given is None else []
             return found[0] if len(found) == 1 else (given, None)
     return observation_shape, action_shape
@@ -495,3 +571,35 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
         return is_compatible(lambda env: policy, env)
     finally:
         env.close()
+
+
+def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
+    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
+
+    Raises:
+        InputError: If `make_policy` returns no function.
+    """
+    act = make_policy(env)
+    if not callable(act):
+        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
+    try:
+        return has_same_shapes(act, env)
+    except (IndexError, TypeError, ValueError):
+        return False
+
+
+def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
+    """Return True if the policy's actions for several observations have the shape of the environment's actions.
+
+    The policy is called with the observations of `probes`. An object with `predict` is not called if it declares both
+    spaces. Otherwise a copy of a policy of another library is called, if it can be copied, so that its internal state
+    does not change. An exception of the policy is not caught.
+    """
+    if isinstance(act, ForeignPolicy):
+        if act.observation_space is not None and act.action_space is not None:
+            is_known = layout(act.action_space) == layout(env.action_space)
+            return is_known and takes_observations(act.observation_space, env.observation_space)
+        act = act.copy()
+    return all(
+        has_layout(as_action(act(observation), env), env.action_space) for observation in probes(env.observation_space)
+    )

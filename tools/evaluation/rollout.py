@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -14,85 +14,17 @@ import numpy as np
 
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
+from guiderail.tools.contract import checked_reset, checked_step
+from guiderail.tools.evaluation.episode import Callback, EnvCallback, PolicyFn, Transition, as_action
+from guiderail.tools.evaluation.policies import as_policy
+from guiderail.tools.spaces import (
+    describe_space,
+    has_layout,
+    has_values,
+)
 
 if TYPE_CHECKING:
     from rich.console import Console
-
-PolicyFn = Callable[[np.ndarray], np.ndarray]
-
-HELD_OUT_SEED = 1_000_000  # seed of the first held-out episode
-
-
-@dataclass(frozen=True)
-class Transition:
-    """Action of an episode and its outcome.
-
-    Attributes:
-        observation: Observation before the action, of the shape of the observation space.
-        action: Action, of the shape of the action space.
-        reward: Reward.
-        next_observation: Observation after the action, of the same shape.
-        terminated: True if the task ended the episode.
-        truncated: True if the episode ended for another reason.
-        info: `info` of the environment's step.
-        privileged: Privileged observation before the action, (m,); None if the environment provides none.
-        next_privileged: Privileged observation after the action, (m,), or None.
-    """
-
-    observation: np.ndarray
-    action: np.ndarray
-    reward: float
-    next_observation: np.ndarray
-    terminated: bool
-    truncated: bool
-    info: Mapping[str, Any]
-    privileged: np.ndarray | None = None
-    next_privileged: np.ndarray | None = None
-
-    @property
-    def is_last(self) -> bool:
-        """True if the episode is over."""
-        return self.terminated or self.truncated
-
-
-class Callback:
-    """Base class of callbacks of an episode, such as a learner or a camera."""
-
-    def on_episode_start(self) -> None:
-        """Handle the start of an episode, after the reset."""
-
-    def on_step(self, transition: Transition) -> None:
-        """Handle the transition of an action."""
-
-    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Handle the end of an episode; return further columns of its row."""
-        return {}
-
-
-class EnvCallback(Callback):
-    """Callback that reads data of the environment which a step does not return.
-
-    Attributes:
-        env: Environment.
-        base: Environment without its wrappers.
-    """
-
-    def __init__(self, env: gymnasium.Env):
-        self.env: Any = env
-        self.base: Any = env.unwrapped
-
-
-def check_seed(seed: object) -> int:
-    """Return a seed as an int; raise an InputError if it is not a whole number from 0 to 2^31 - 1."""
-    number = as_whole(seed, "a seed")
-    if not 0 <= number < 2**31:
-        raise InputError(f"a seed is a whole number from 0 to {2**31 - 1}, not {number}")
-    return number
-
-
-def has_image(space: Any) -> bool:
-    """Return True if the observations of a space are images, or contain an image."""
-    return len(space.shape or ()) == 3 or hasattr(space, "image_shape")
 
 
 def rollout(
@@ -122,11 +54,10 @@ def rollout(
 
     Raises:
         InputError: If `env` is no environment, `act` is no policy, the seed is invalid, the reset is refused, an action
-            is invalid, the reward of an environment of another package is NaN, or a callback returns wrong columns
-            (`new_columns`).
+            is invalid, an environment of another package raises an exception or breaks Gymnasium's contract
+            (`checked_step`), or a callback returns wrong columns (`new_columns`).
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
-    from guiderail.tools.evaluation.policies import as_policy
 
     if not isinstance(env, gymnasium.Env):
         raise InputError(f"an episode runs in an environment, as gymnasium.make returns it, not in {brief(env)}")
@@ -140,7 +71,9 @@ def rollout(
     if held_out:  # an environment of another package has no such option: its conditions depend on the seed
         seed = seed or 0
         reset_options = {"held_out": True, **(reset_options or {})} if is_own else reset_options or None
-    observation, _ = env.reset(seed=seed, options=reset_options)
+    reset = env.reset if is_own else partial(checked_reset, env)
+    step = env.step if is_own else partial(checked_step, env)
+    observation, _ = reset(seed=seed, options=reset_options)
     if isinstance(act, Callback) and act not in callbacks:
         callbacks = (act, *callbacks)
     for callback in callbacks:
@@ -149,12 +82,10 @@ def rollout(
     infos: list[Mapping[str, Any]] = []  # `info` of each step, for an environment without a trace
     is_over = False
     while not is_over:
-        action, privileged = _without_batch(act(observation), env), getattr(base, "privileged", None)
+        action, privileged = as_action(act(observation), env), getattr(base, "privileged", None)
         if not is_own:
             _check_action(action, env)
-        next_observation, reward, terminated, truncated, info = env.step(action)
-        if not is_own and math.isnan(reward):
-            raise InputError("the environment returned NaN as reward: a reward is a number")
+        next_observation, reward, terminated, truncated, info = step(action)
         transition = Transition(
             observation, action, float(reward), next_observation, terminated, truncated, info,
             privileged, getattr(base, "privileged", None),
@@ -176,34 +107,19 @@ def rollout(
     return row
 
 
-def _without_batch(action: Any, env: gymnasium.Env) -> Any:
-    """Return the only row of an action (1, A) in an environment with actions (A,), and any other action unchanged."""
-    shape = env.action_space.shape
-    return action[0] if shape and getattr(action, "shape", None) == (1, *shape) else action
-
-
 def _check_action(action: Any, env: gymnasium.Env) -> None:
-    """Raise an InputError if an action has another shape than the action space, or is outside a discrete space."""
+    """Raise an InputError if an action does not have the layout of the action space, or is outside a discrete space."""
     space = env.action_space
-    expected = space.shape
-    try:
-        shape = np.shape(action)
-    except ValueError:  # ragged
-        shape = None
-    if expected is not None and (shape != expected or action is None):
+    if not has_layout(action, space):
         raise InputError(
-            f"the policy returned {brief(action)}, and the actions of this environment have the shape {expected}"
+            f"the policy returned {brief(action)}, and the actions of this environment have the shape "
+            f"{describe_space(space) if space.shape is None else space.shape}"
         )
-    if isinstance(space, gymnasium.spaces.Discrete):
-        try:
-            is_inside = bool(0 <= action - space.start < space.n)
-        except TypeError:  # not a number
-            is_inside = False
-        if not is_inside:
-            last = space.start + space.n - 1
-            raise InputError(
-                f"the policy returned {brief(action)}, and the actions of this environment are {space.start} to {last}"
-            )
+    if not has_values(action, space):
+        values = describe_space(space)
+        if isinstance(space, gymnasium.spaces.Discrete):
+            values = f"{space.start} to {space.start + space.n - 1}"
+        raise InputError(f"the policy returned {brief(action)}, and the actions of this environment are {values}")
 
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -230,40 +146,6 @@ class Paths(EnvCallback):
         """Return the columns `commanded` and `measured`."""
         trace = self.base.trace
         return {"commanded": trace.commanded.copy(), "measured": trace.measured.copy()}
-
-
-def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's observations and actions have the shapes of the environment's; see `has_same_shapes`.
-
-    Raises:
-        InputError: If `make_policy` returns no function.
-    """
-    act = make_policy(env)
-    if not callable(act):
-        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
-    try:
-        return has_same_shapes(act, env)
-    except (IndexError, ValueError):
-        return False
-
-
-def has_same_shapes(act: PolicyFn, env: gymnasium.Env) -> bool:
-    """Return True if the policy's actions for several observations have the shape of the environment's actions.
-
-    The policy is called with 21 constant observations from −1 to 1, because a scripted policy may read some components
-    only for certain values of the others. An object with `predict` is not called if it declares both shapes. Otherwise
-    a deep copy of the object is called, if it can be copied. An exception of the policy is not caught.
-    """
-    from guiderail.tools.evaluation.policies import PredictPolicy
-
-    shape = env.observation_space.shape or ()
-    if isinstance(act, PredictPolicy):
-        if act.observation_shape is not None and act.action_shape is not None:
-            return (act.observation_shape, act.action_shape) == (env.observation_space.shape, env.action_space.shape)
-        act = act.copy()
-    observations = (np.full(shape, value, np.float32) for value in np.linspace(-1.0, 1.0, 21))
-    shapes = {np.shape(_without_batch(act(observation), env)) for observation in observations}
-    return shapes == {env.action_space.shape}
 
 
 WINDOW = 10  # default number of last episodes over which success and return are averaged

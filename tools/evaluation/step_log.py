@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import EnvCallback
+from guiderail.tools.evaluation.episode import EnvCallback
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import check_parquet
 

@@ -20,11 +20,19 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy, MakePolicy, make_baseline, scripted_policies
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED, PolicyFn, check_seed
 from guiderail.tools.evaluation.evaluation import policy_digest
 from guiderail.tools.evaluation.metrics import COLLISION
-from guiderail.tools.evaluation.policies import FunctionPolicy, as_policy, check_compatible, is_policy_file, load_policy
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, PolicyFn, check_seed, is_compatible
+from guiderail.tools.evaluation.policies import (
+    FunctionPolicy,
+    as_policy,
+    check_compatible,
+    is_compatible,
+    is_policy_file,
+    load_policy,
+)
 from guiderail.tools.files import path_exists
+from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
@@ -179,8 +187,6 @@ def find_subject(
         make_policy = partial(check_compatible, Policy.load(folder.path), learned_in=run_config.environment)
         is_stored = not str(policy).startswith(PRETRAINED)
         return Subject(folder.path.name, run_config, make_policy, folder, is_stored, policy_digest(folder.path))
-    from guiderail.tools.learning.train import configure
-
     config = None if isinstance(env, gymnasium.Env) else configure(env, environment or {})
     if not isinstance(policy, Path | str):
         act = as_policy(policy)

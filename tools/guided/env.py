@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
@@ -21,6 +20,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
+from guiderail.tools.contract import check_reset_result, check_step_result, check_values, naming_wrong_counts
 from guiderail.tools.guided.guide import (
     PRIMITIVE_GUIDANCE,
     Guide,
@@ -87,6 +87,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         observe: Terms appended to the observation: "phase" (1,), scaled to [−1, 1], and "command" (O,), the last
             command in the segment's frame, scaled to the demonstrations' range. The command of a template is in the
             template's first frame, in units of 0.2 m and π.
+        check_env: True to check in the first episode that every observation of `env`, and every action of `to_action`,
+            is within its space and has its data type. Shapes, rewards and the other results are checked in all
+            episodes.
 
     Raises:
         InputError: If an argument is out of range.
@@ -117,8 +120,12 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         horizon: int = 20,
         orientation: Orientation | None = None,
         observe: Sequence[str] = OBSERVED,
+        check_env: bool = False,
     ):
         super().__init__(env)
+        if not isinstance(check_env, bool):
+            raise InputError(f"check_env is True or False, not {brief(check_env)}")
+        self._is_checked = check_env  # False after the first episode
         if not is_whole(action_repeat, 1):
             raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
         settings = GuideSettings(action_scale, action_dims, history, history_variance, horizon, orientation)
@@ -170,10 +177,14 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """Reset the environment and begin the motion at the measured pose.
 
         Raises:
-            InputError: If the measured pose is not (O,) finite numbers, or a frame or constraints are invalid.
+            InputError: If the measured pose is not (O,) finite numbers, a frame or constraints are invalid, or the
+                environment's reset does not return an observation of its space and a dictionary.
         """
+        self._is_checked &= self._num_steps == 0  # the first episode has ended
         self._has_begun = False  # after an error below, no episode can be stepped
-        self._observation, info = self.env.reset(seed=seed, options=options)
+        self._observation, info = check_reset_result(self.env, self.env.reset(seed=seed, options=options))
+        if self._is_checked:
+            check_values(self.env, self._observation)
         self._terminated = self._truncated = self._is_pending = False
         self._num_steps = 0
         measured = self._measured()
@@ -221,7 +232,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
     def request(self) -> Any:
         """Return the request for the next step's prediction, or None if the step needs no prediction.
 
-        After an error in `to_action` or in the environment, the next step repeats the command and ignores the action.
+        After an error in `to_action`, the next step repeats the command and ignores the action.
 
         Raises:
             InputError: If the measured pose is not (O,) finite numbers.
@@ -234,7 +245,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
 
         Raises:
             InputError: If `to_action` returns an invalid action, in which case the environment is not stepped, or the
-                environment returns a reward that is not finite or an observation with NaN.
+                environment's step breaks Gymnasium's contract (`check_step_result`). After an error of the
+                environment's step, the episode cannot be continued.
         """
         command = self._command
         if command is None or not self._is_pending:
@@ -242,13 +254,17 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._is_pending = True
         action = self._to_action(self.env, self._observation, command.output, command.extra)
         self._check_action(action)
-        self._observation, reward, self._terminated, self._truncated, self._info = self.env.step(action)
-        self._is_pending = False
-        if not math.isfinite(reward):
-            raise InputError(f"the environment returned {reward} as reward: a reward is a finite number")
-        if _has_nan(self._observation):
-            raise InputError("the environment returned an observation that contains NaN: check its step")
-        self._reward += float(reward)
+        if self._is_checked:
+            check_values(self.env, self._observation, action)
+        self._has_begun = self._is_pending = False  # after an error below, the episode cannot be continued
+        with naming_wrong_counts():
+            result: Any = self.env.step(action)
+        result = check_step_result(self.env, result)
+        self._observation, reward, self._terminated, self._truncated, self._info = result
+        if self._is_checked:
+            check_values(self.env, self._observation)
+        self._has_begun = True
+        self._reward += reward
         self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
         self._fallbacks += command.is_fallback
         self._successes |= {name: self._info[name] for name in SUCCESSES if np.any(self._info.get(name, False))}
@@ -320,13 +336,6 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {"observation": self._observation, **extra}
 
 
-def _has_nan(observation: Any) -> bool:
-    """Return True if an observation, or one of its entries, is an array of floating-point numbers with NaN."""
-    if isinstance(observation, Mapping):
-        return any(map(_has_nan, observation.values()))
-    return isinstance(observation, np.ndarray) and observation.dtype.kind == "f" and bool(np.isnan(observation).any())
-
-
 def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment]:
     """Return the segments of a motion; a motion without segments becomes a single one."""
     if demonstrations is None:
@@ -363,7 +372,11 @@ class GuidedVectorEnv(SyncVectorEnv):
         if not all(map(callable, env_fns)):
             raise InputError("env_fns are functions that return an environment, such as lambda: env")
         first = GuidedEnv(env_fns[0](), **keywords)
-        own = {name: keywords[name] for name in ("pose", "to_action", "action_repeat", "observe") if name in keywords}
+        own = {
+            name: keywords[name]
+            for name in ("pose", "to_action", "action_repeat", "observe", "check_env")
+            if name in keywords
+        }
 
         def wrap(make: Callable[[], gymnasium.Env[Any, Any]]) -> Callable[[], gymnasium.Env[Any, Any]]:
             return lambda: GuidedEnv(make(), guidance=first.guide.copy(), **own)

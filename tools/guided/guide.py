@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_t
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
-from guiderail.models.primitives.fit import MIN_DEMONSTRATIONS, Selection, fit
+from guiderail.models.primitives.fit import LONG, MIN_DEMONSTRATIONS, Selection, fit
 from guiderail.models.primitives.full_turns import Orientation, orientation_of_names
 from guiderail.models.primitives.gains import authority_gains, check_action_scale, deviation, residual_gains
 from guiderail.models.primitives.poses import check_orientation
@@ -107,8 +109,10 @@ class _FittedSegment:
     def __init__(self, segment: Segment, guidance: str, settings: GuideSettings, period: float | None):
         self.segment, self.guidance, self.settings = segment, guidance, settings
         self.num_steps = segment.steps_of(period)
+        # A fit to long recordings takes seconds.
+        say = partial(print, "guiderail:", file=sys.stderr, flush=True) if self.num_steps > LONG else None
         self.selection: Selection = fit(
-            segment.recorded, num_steps=self.num_steps, floor=segment.floor, horizon=settings.horizon
+            segment.recorded, num_steps=self.num_steps, floor=segment.floor, horizon=settings.horizon, log=say
         )
         self.reference = self.selection.reference
         self.num_outputs = self.reference.num_outputs
@@ -268,7 +272,7 @@ class PrimitiveGuide(Guide):
             past.insert(0, self.frame.to_frame(output, self._orientation, past[0]))
         past = [past[0]] * (length - len(past)) + past
         start = past[-1] if primitive.history == 0 and motion_filter is None else np.array(past)
-        self._stepper: PrimitiveStepper = primitive.start(start, gains, motion=motion_filter)
+        self._stepper: PrimitiveStepper = PrimitiveStepper(primitive, start, gains, motion=motion_filter)
         self._last = past[-1]
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:

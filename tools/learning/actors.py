@@ -13,8 +13,9 @@ from stable_baselines3.common.utils import set_random_seed
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
+from guiderail.tools.evaluation.episode import Callback, PolicyFn, Transition, has_image
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, Transition, has_image, new_columns, rollout
+from guiderail.tools.evaluation.rollout import new_columns, rollout
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner

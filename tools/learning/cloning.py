@@ -12,7 +12,7 @@ from stable_baselines3.common.torch_layers import create_mlp
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.config import BcConfig
 from guiderail.tools.learning.learner import Learner, register_learner

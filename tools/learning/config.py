@@ -19,7 +19,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.evaluation.rollout import check_seed
+from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
@@ -83,7 +83,7 @@ class OffPolicyConfig(LearnerConfig):
     actor_ema: Fraction = 0.003  # weight of the newest actor in the averaged actor per gradient step; 0 for no average
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
-    image_encoder: Literal["average_pooling", "convolutional"] = "average_pooling"  # features of observed images
+    image_encoder: Literal["average_pooling", "convolutional", "pixels"] = "average_pooling"  # features of images
     random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
@@ -181,40 +181,6 @@ class BcConfig(LearnerConfig):
     def __post_init__(self) -> None:
         if not self.demonstration_episodes:
             raise InputError("bc learns from demonstrations: give --set demonstration_episodes=... of at least 1")
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class ChunkConfig(BcConfig):
-    """Settings of chunk cloning, which trains a base policy."""
-
-    algorithm: str = "chunk"
-    demonstration_episodes: NonNegative = 30  # first episodes in which the demonstrator acts, at least 1
-    gradient_steps: Positive = 3000  # gradient steps of each network, after the last demonstration
-    net_arch: NetArch = (64, 64)  # units of the hidden layers of each network
-    members: Annotated[Positive, Field(le=50)] = 5  # E, networks of the ensemble
-    chunk_steps: Annotated[Positive, Field(le=1000)] = 16  # K, control steps of a chunk
-    observation_noise: Noise = 0.1  # standard deviation of the noise of observations in training
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class DistillationConfig(ChunkConfig):
-    """Settings of policy distillation, which trains a base policy on the commands of a trained KGRL policy."""
-
-    algorithm: str = "distillation"
-    demonstration_episodes: NonNegative = 0  # always 0: the teacher acts in every episode
-    teacher: str = ""  # folder of the teacher's run, or pretrained:NAME
-    action_noise: Fraction = 0.2  # standard deviation of the noise of the teacher's actions
-    noisy_copies: NonNegative = 4  # noisy copies of each observation, labeled by the teacher
-    copy_noise: Noise = 0.2  # standard deviation of a copy's noise, in standard deviations of each entry
-    members: Annotated[Positive, Field(le=50)] = 1  # E, networks of the ensemble
-    net_arch: NetArch = (128, 128)  # units of the hidden layers
-    batch_size: BatchSize = 256  # observations
-    gradient_steps: Positive = 8000  # gradient steps after the last episode
-    observation_noise: Noise = 0.0  # standard deviation of further noise in training; labels do not change
-
-    def __post_init__(self) -> None:
-        if self.demonstration_episodes:
-            raise InputError("distillation learns from its teacher: leave demonstration_episodes out")
 
 
 _TABLE_4_1 = OffPolicyConfig(

@@ -24,7 +24,7 @@ from pydantic.dataclasses import dataclass, is_pydantic_dataclass
 from guiderail.models.common.errors import InputError, brief, require_extra
 from guiderail.models.common.registry import Registry, check_callable, did_you_mean
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Callback, has_image
+from guiderail.tools.evaluation.episode import Callback, has_image
 
 LOG_FORMATS = ("tensorboard", "wandb", "csv", "json", "log", "stdout")
 # Columns of an episode's row that are logged, and their names in the log.

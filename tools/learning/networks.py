@@ -136,21 +136,22 @@ def pack_observation(observation: np.ndarray, shape: tuple[int, int, int]) -> np
 class ImageFeatures(BaseFeaturesExtractor):
     """Features of a packed observation: the features of the image, followed by the state.
 
-    The image's features are the averages of squares of pixels (thesis, 4.4.1), or the outputs of convolutions. In
-    training mode, the image of a convolutional extractor is shifted at random (DrQ; Yarats et al., 2021).
+    The image's features are the averages of squares of pixels, the pixels (thesis, 4.4.1), or the outputs of
+    convolutions. In training mode, the image of a convolutional extractor is shifted at random (DrQ; Yarats et al.,
+    2021).
 
     Without pooling or convolutions, an image of 110×144×3 needs twelve million weights in a first layer of 256 units.
 
     Attributes:
-        pool: Side of the averaged squares [pixels]; 1 for convolutions.
-        convolutions: Convolutions, each followed by a ReLU; empty for pooling.
+        pool: Side of the averaged squares [pixels]; 1 without pooling.
+        convolutions: Convolutions, each followed by a ReLU; empty without convolutions.
     """
 
     def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str, random_shift: int):
         """Construct the extractor of packed observations with images of height, width and channels.
 
-        The encoder is "average_pooling" or "convolutional". In training mode, images are shifted by up to
-        `random_shift` pixels.
+        The encoder is "average_pooling", "convolutional" or "pixels" (none). In training mode, images are shifted by
+        up to `random_shift` pixels before convolutions.
 
         Raises:
             InputError: If the image is too small.
@@ -165,7 +166,7 @@ class ImageFeatures(BaseFeaturesExtractor):
             raise InputError(f"an image of {height} x {width} pixels is too small for {encoder.replace('_', ' ')}")
         self._num_pixels = height * width * channels
         num_state = (observation_space.shape[0] - self._num_pixels) // 4
-        maps = channels if encoder == "average_pooling" else CHANNELS[-1]
+        maps = CHANNELS[-1] if encoder == "convolutional" else channels
         super().__init__(observation_space, maps * math.prod(sides) + num_state)
         self._num_state = num_state
         self.pool, self._shape, self._random_shift = side_of_squares, (channels, height, width), random_shift

@@ -24,7 +24,7 @@ from torch.nn.utils import parameters_to_vector
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_off_policy
 from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc

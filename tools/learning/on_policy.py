@@ -17,7 +17,7 @@ from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
 from guiderail.tools.learning.networks import export_layers

@@ -19,7 +19,7 @@ import torch
 
 from guiderail.models.common.errors import InputError, naming_failures
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import write_step_log
 from guiderail.tools.learning.actors import Weights, copy_weights, load_weights, record_transition
 from guiderail.tools.learning.checkpoint import entries_of

@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.tools.evaluation.rollout import Callback, Transition
+from guiderail.tools.evaluation.episode import Callback, Transition
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn
+from guiderail.tools.evaluation.episode import Callback, PolicyFn
 from guiderail.tools.learning.run_folder import RunConfig
 
 

@@ -17,8 +17,10 @@ from threadpoolctl import threadpool_limits
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment, task_of
+from guiderail.tools.evaluation.episode import Callback, PolicyFn
 from guiderail.tools.evaluation.metrics import WORDS
-from guiderail.tools.evaluation.rollout import Callback, PolicyFn, is_compatible, rollout
+from guiderail.tools.evaluation.policies import is_compatible
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, remove_step_logs
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint

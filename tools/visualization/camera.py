@@ -12,7 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from guiderail.tools.environments import make_environment, task_of
-from guiderail.tools.evaluation.rollout import EnvCallback, Transition, rollout
+from guiderail.tools.evaluation.episode import EnvCallback, Transition
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
 from guiderail.tools.visualization.style import new_figure, save_figure

@@ -27,8 +27,9 @@ from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
+from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn, Transition
 from guiderail.tools.evaluation.metrics import TOLERANCE, VIOLATION
-from guiderail.tools.evaluation.rollout import EnvCallback, PolicyFn, Transition, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_page, write_atomically
 

@@ -24,6 +24,7 @@ from guiderail.diagrams.tasks.pouring.options import (
     MAX_MUG_OFFSET,
     POSITION_SCALE,
     SPARSE_INPUT_SPEED,
+    THESIS,
     PouringOptions,
     PouringReset,
     frames_of,
@@ -138,7 +139,8 @@ def scripted_pour_aimed(observation: np.ndarray) -> np.ndarray:
         goal = np.array([*(distance * p_BP[:2] / max(np.hypot(p_BP[0], p_BP[1]), 1e-9)), height])
         return np.clip((goal - p_BP) / SOFTNESS, -1.0, 1.0)
     to_aim = AIM - p_MP[:2]
-    is_tilting = np.linalg.norm(to_aim) < AIM_TOLERANCE or _tilt(observation) > POURING_TILT
+    is_shielded = observation[STATE] > 1.5  # in the state Pour of the shielded template, which moves nowhere else
+    is_tilting = is_shielded or np.linalg.norm(to_aim) < AIM_TOLERANCE or _tilt(observation) > POURING_TILT
     return np.array([*np.clip(to_aim / AIM_SOFTNESS, -1.0, 1.0), float(is_tilting)])
 
 
@@ -162,7 +164,8 @@ class Pouring(Task):
 
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
     "hand_shaped" follows 3.8 to 3.10. With the standard template, a constant action pours the balls into the mug. With
-    difficulty="hard", the mug is not at the position that the template assumes.
+    difficulty="hard", the mug is not at the position that the template assumes. With difficulty="thesis", the
+    template's inputs are as slow as in the thesis.
     """
 
     workcell_kind = "pouring"
@@ -172,7 +175,7 @@ class Pouring(Task):
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
     defaults = {"guidance": "sct", "action_repeat": 10}
-    difficulties = {STANDARD: {}, "hard": HARD}
+    difficulties = {STANDARD: {}, "hard": HARD, "thesis": THESIS}
     learner = {"algorithm": "sac", "preset": "pouring"}
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
@@ -192,7 +195,9 @@ class Pouring(Task):
         is_sparse_sct = (config.guidance, config.reward) == ("sct", "sparse")
         speed = self.options.input_speed or (SPARSE_INPUT_SPEED if is_sparse_sct else 1.0)
         aiming = {"aim_speed": self.options.aim_speed, "pour_speed": self.options.pour_speed}
-        self._template = make_template(self._scene_config, speed, **(aiming if self.options.aim else {}))
+        self._template = make_template(
+            self._scene_config, speed, shield=self.options.shield, **(aiming if self.options.aim else {})
+        )
 
     def workcell(self) -> PouringConfig:
         """Return the vessels and their poses."""
@@ -232,7 +237,7 @@ class Pouring(Task):
 
         The reward of an action is the sum over its control steps. Values that the thesis defines per action are
         therefore divided by `action_repeat`. With the option `aim`, "shaped" includes the distance gained towards `AIM`
-        in the state Pour.
+        in the state Pour; the progress of the shielded template includes the distance gained in its state aim.
         """
         reward, action_repeat = self.config.reward, self.config.action_repeat
         poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
@@ -242,7 +247,7 @@ class Pouring(Task):
         ]
         if reward == "shaped":
             terms.append(RewardTerm("shaping", {"progress": 1, "last_progress": 1}, _progress_gained))
-            if self.options.aim:
+            if self.options.aim and not self.options.shield:
                 terms.append(RewardTerm("aiming", {**poses, "state": 1}, _aiming))
         if reward == "hand_shaped":
 
@@ -313,7 +318,7 @@ class Pouring(Task):
             error = sample_mug_error(episode, self.options, options)
             # The error moves the actual mug, so that the estimated mug position stays within reach.
             estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
-            frames = frames_of(self._template, estimated)
+            frames = frames_of(self._template, estimated, RigidTransform([*p_TMug, 0.0]))
             # The thermos is oriented as in the template's first state, so that all guidance has the same start pose.
             X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
             nearest = estimated.inverse() @ X_TP.translation()

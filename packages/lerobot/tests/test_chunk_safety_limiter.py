@@ -10,6 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail_lerobot.chunk_guard import ChunkGuard
 from guiderail_lerobot.chunk_safety_limiter import ChunkSafetyLimiter
+from oracles.systems import check_start_time
 
 PERIOD, STEPS, REPLAN = 0.02, 12, 4
 VELOCITY, JERK, BOUND = np.array([0.1, 0.2]), np.array([50.0, 100.0]), np.array([0.05, 0.03])
@@ -103,3 +104,12 @@ def test_argument_is_refused_when_it_is_out_of_range():
 def test_measured_pose_at_initialization_must_be_finite():
     with pytest.raises(InputError, match="measured pose must be finite"):
         run(np.zeros((1, STEPS, 2)), pose=(0.0, np.nan))
+
+
+@pytest.mark.parametrize("steps", [1, 29, 50, 43210])
+def test_outputs_are_the_same_when_the_start_time_is_not_zero(steps):
+    def limiter():
+        box = LinearConstraints.box([-1.0], [1.0])
+        return ChunkSafetyLimiter(ChunkGuard(box, [1.0], [90.0], period=0.02, start=[0.0]), 8, 3, 0.02)
+
+    check_start_time(limiter, {"chunk": np.full(8, 0.5), "pose": [0.0]}, 0.02, steps)

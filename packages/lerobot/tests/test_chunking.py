@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import chunk_samples, find_base_policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
-from guiderail.tools.learning.config import ChunkConfig, DistillationConfig
 from guiderail.tools.learning.train import train
+from guiderail_lerobot.base_policy import chunk_samples, find_base_policy
 from guiderail_lerobot.chunking import ChunkLearner
+from guiderail_lerobot.config import ChunkConfig, DistillationConfig
 from guiderail_lerobot.distillation import DistillationLearner
 
 SETTINGS = {"demonstration_episodes": 4, "gradient_steps": 400, "members": 3, "chunk_steps": 4, "net_arch": (16,)}

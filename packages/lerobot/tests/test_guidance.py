@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.make import _base_policy_key, make_env
+from guiderail.diagrams.envs.make import make_env
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionConstraints
-from guiderail.models.policy import BASE_POLICIES
 from guiderail.models.primitives import LinearConstraints
+from guiderail_lerobot.base_policy import BASE_POLICIES, base_policy_key
 from guiderail_lerobot.guidance import guard_limits
 
 KINDS = ("kgrl_base_policy", "residual_base_policy")
@@ -74,11 +74,11 @@ def test_diagram_is_not_reused_when_base_policy_is_replaced(register):
 def test_key_changes_when_a_policy_file_is_replaced(tmp_path):
     file = tmp_path / "policy.safetensors"
     file.write_bytes(b"one")
-    before = _base_policy_key(str(tmp_path))
-    assert before == _base_policy_key(str(tmp_path))
+    before = base_policy_key(str(tmp_path))
+    assert before == base_policy_key(str(tmp_path))
     (tmp_path / "new").write_bytes(b"two")
     (tmp_path / "new").replace(file)
-    assert before != _base_policy_key(str(tmp_path))
+    assert before != base_policy_key(str(tmp_path))
 
 
 def test_commands_satisfy_constraints_for_any_base_policy(register):

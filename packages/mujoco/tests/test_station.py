@@ -300,3 +300,18 @@ def test_parts_with_more_pairs_than_mask_bits_are_refused():
 def test_disturbed_period_is_a_multiple_of_the_engine_step():
     with pytest.raises(InputError, match=r"whole multiple of the plant's time step of 0\.02 s"):
         make_env("GridClamp", station="mujoco", clock_factor=1.5, time_step=0.02)
+
+
+def test_set_pose_raises_when_the_pose_is_not_finite():
+    station = MujocoStation(CONNECTOR)
+    context, zero = station.CreateDefaultContext(), np.zeros(6)
+    invalid = [np.r_[np.nan, zero[1:]], np.r_[zero[1:], -np.inf], zero[1:], [*zero, 0.0], ["a"] * len(zero), None]
+    for pose in invalid:
+        with pytest.raises(InputError, match="pose must be 6 finite numbers, not"):
+            station.set_pose(context, pose)
+
+
+@pytest.mark.parametrize("time_step", [0.0, -0.01, np.nan])
+def test_station_raises_when_the_time_step_is_not_positive(time_step):
+    with pytest.raises(InputError, match="whole multiple"):
+        MujocoStation(CONNECTOR, time_step=time_step)

@@ -19,7 +19,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
-from guiderail.tools.learning.train import configure, with_defaults
+from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts import trial
 from guiderail_parts.contact import rank

@@ -12,8 +12,8 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random, zero_policy
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.evaluation import episodes_file
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
 from guiderail.tools.evaluation.subject import Subject
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.trainer import run_training

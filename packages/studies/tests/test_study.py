@@ -13,13 +13,12 @@ from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import constant_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
-from guiderail.tools.evaluation.metrics import STATISTICS, statistics_of, wilson
-from guiderail.tools.imports import import_modules
+from guiderail.tools.evaluation.metrics import STATISTICS, wilson
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.tables import read_table
 from guiderail_studies.declaration import EvalSet, Ratio, Study, load_study, source_file
 from guiderail_studies.engines.engine import make_engine
-from guiderail_studies.job import Job, check_job
+from guiderail_studies.job import Job
 from guiderail_studies.study import (
     AT_ONCE,
     NEVER,
@@ -32,7 +31,7 @@ from guiderail_studies.study import (
     run_study,
     study_command,
 )
-from research.studies import study_names, study_path
+from research.studies import study_path
 from research.thesis import describe_differences
 
 SETTINGS = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
@@ -558,18 +557,6 @@ def test_subset_refuses_invalid_seeds(seeds, message):
     with pytest.raises(InputError, match=message) as error:
         load_study(study_path("connector")).subset(None, seeds)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize("name", study_names())
-def test_study_of_research_is_valid(name, tmp_path):
-    study = load_study(study_path(name))
-    assert study.name == name
-    import_modules(study.imports)
-    for method in study.methods:
-        check_job(Job(study, method, study.seeds[0], tmp_path))
-    for declared in study.ratios:
-        assert declared.of.removeprefix("training_") in statistics_of(study.task)
-        assert {declared.method, declared.against} <= study.methods.keys()
 
 
 def test_scripted_pour_succeeds_with_constraints_only(tmp_path):

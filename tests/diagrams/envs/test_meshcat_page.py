@@ -2,10 +2,15 @@
 
 import gc
 import os
+import shutil
 import socket
+import subprocess
+import sys
 import time
 import urllib.error
 import urllib.request
+from importlib.util import find_spec
+from pathlib import Path
 
 import msgpack
 import numpy as np
@@ -16,8 +21,11 @@ from pydrake.geometry import Sphere
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from guiderail.diagrams.envs import meshcat_page
 from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 from guiderail.diagrams.envs.page_gateway import MAX_GAMEPAD, MAX_MESSAGE, SceneCache, parse_event
+from guiderail.diagrams.envs.scene import open_meshcat
+from guiderail.models.common.errors import InputError
 
 CONTROLS = {"x": (-2.0, 2.0), "keep": None}
 GAMEPAD = {"index": 0, "button_values": [0.5], "axes": [0.25, -1.0]}
@@ -302,3 +310,38 @@ def test_largest_gamepad_and_range_are_accepted():
 def test_random_bytes_are_parsed_to_a_valid_event_or_none(message):
     event = parse_event(message, CONTROLS)
     assert event is None or event["type"] in ("slider", "button", "gamepad")
+
+
+@pytest.mark.parametrize("place", ["PYTHONPATH", "user site"])
+def test_page_opens_when_modules_are_outside_of_the_prefix(place, tmp_path):
+    """The modules of the gateway are in a folder of PYTHONPATH, or of `pip install --user`, only."""
+    folder = tmp_path / "modules"
+    if place == "user site":
+        version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+        folder = tmp_path / "lib" / version / "site-packages"
+    folder.mkdir(parents=True)
+    for module in meshcat_page.GATEWAY_MODULES:
+        shutil.copytree(Path(find_spec(module).origin).parent, folder / module)
+    rest = [entry for entry in sys.path if entry and not (Path(entry) / "msgpack").is_dir()]
+    installed = [entry for entry in sys.path if (Path(entry) / "msgpack").is_dir()]
+    program = (
+        "import sys\n"
+        f"sys.path += {installed + rest!r}\n"  # after the folder above, from which the modules are imported
+        "import msgpack\n"
+        f"assert msgpack.__file__.startswith({str(folder)!r})\n"
+        "from guiderail.diagrams.envs.meshcat_page import GATEWAY_MODULES, MeshcatPage, _folders\n"
+        f"assert _folders(GATEWAY_MODULES) == [{str(folder.resolve())!r}]\n"
+        "page = MeshcatPage()\n"
+        "assert page.port() > 0\n"
+    )
+    places = {"PYTHONPATH": str(folder)} if place == "PYTHONPATH" else {"PYTHONUSERBASE": str(tmp_path)}
+    environment = {"PATH": os.environ["PATH"], "HOME": str(tmp_path), "DRAKE_ALLOW_NETWORK": "meshcat"} | places
+    python = str(Path(sys._base_executable).resolve())
+    ended = subprocess.run([python, "-c", program], env=environment, capture_output=True, text=True, timeout=120)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_missing_module_of_the_gateway_is_named(monkeypatch):
+    monkeypatch.setattr(meshcat_page, "GATEWAY_MODULES", ("msgpack", "missing_module"))
+    with pytest.raises(InputError, match=r"the module missing_module is missing.*pip install missing_module"):
+        open_meshcat()

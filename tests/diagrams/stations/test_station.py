@@ -9,13 +9,11 @@ from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail_mujoco.station import MujocoStation
 
 STATIONS = [
     ("NarrowPassage", "plane"),
     ("Pouring", "pouring"),
     ("BncConnector", "gantry"),
-    ("BncConnector", "mujoco"),
     ("BncConnector", "arm"),
 ]
 
@@ -31,7 +29,7 @@ def test_set_pose_raises_when_the_pose_is_not_finite(task, name):
             station.set_pose(context, pose)
 
 
-@pytest.mark.parametrize("station", [ArmStation, GantryStation, MujocoStation])
+@pytest.mark.parametrize("station", [ArmStation, GantryStation])
 @pytest.mark.parametrize("time_step", [0.0, -0.01, np.nan])
 def test_station_raises_when_the_time_step_is_not_positive(station, time_step):
     with pytest.raises(InputError, match="whole multiple"):

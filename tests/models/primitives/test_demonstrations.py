@@ -234,3 +234,32 @@ def test_outputs_without_a_jump_of_a_full_turn_are_unchanged(names):
     turning[2, ::2, 4] = 5.0  # neither a full turn nor a small change
     result = Demonstrations(np.arange(40), turning, (*"xyz", *names)).outputs
     np.testing.assert_array_equal(result, turning)
+
+
+ORIENTATIONS = [("Rz", "Ry", "Rx"), ("psi_z", "psi_y", "psi_x"), ("r_x", "r_y", "r_z"), ("rx", "ry", "rz")]
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("unit", [" [deg]", " [degrees]", " (deg)", "_deg", " [\u00b0]"])
+def test_orientation_in_degrees_is_refused(orientation, unit):
+    names = ["x [m]", "y [m]", "z [m]", *(name + unit for name in orientation)]
+    with pytest.raises(InputError, match=r"is in degrees: convert it to radians, and name it with \[rad\]"):
+        Demonstrations(np.arange(3.0), [np.zeros((3, 6))] * 2, names)
+
+
+@pytest.mark.parametrize("orientation", ORIENTATIONS)
+@pytest.mark.parametrize("steps", [16, 18, 60])
+def test_orientation_that_may_be_in_degrees_is_unchanged(orientation, steps):
+    t = np.linspace(0, 1, steps)
+    y = np.column_stack([t, t, t, 90 * t, 0 * t, 0 * t])
+    result = Demonstrations(t, [y] * 3, ["x", "y", "z", *orientation])
+    np.testing.assert_array_equal(result.outputs, [y] * 3)
+
+
+@pytest.mark.parametrize("unit", ["", " [rad]"])
+def test_full_turn_of_an_angle_in_radians_is_removed(unit):
+    angle = np.linspace(2.5, 3.8, 20)
+    wrapped = np.angle(np.exp(1j * angle))
+    y = np.column_stack([np.zeros((20, 3)), wrapped, np.zeros((20, 2))])
+    names = ["x", "y", "z", *(name + unit for name in ("Rz", "Ry", "Rx"))]
+    np.testing.assert_allclose(Demonstrations(np.arange(20.0), [y], names).outputs[0][:, 3], angle)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory, SquaredExponential, mixture
 from guiderail.models.primitives.fit import MIN_SHARE, estimated_share, fit, motion_without_actions, share_within_spread
 from guiderail.models.primitives.mixture import information_criteria
 from oracles.handwriting import LETTERS, make_correlated, share_within_deviation, write_letter
@@ -164,3 +164,45 @@ def test_fit_refuses_too_many_components(components, demonstrations):
 def test_fit_refuses_a_number_of_components_that_is_not_whole(components, demonstrations):
     with pytest.raises(InputError, match="components must be a whole number"):
         fit(demonstrations, components=components)
+
+
+def slow(steps, count=3):
+    """Return slow smooth motions, each with its own duration, and `steps` samples."""
+    rng, s = np.random.default_rng(0), np.linspace(0, 1, steps)
+    shapes = [np.column_stack([s, np.sin(3 * s)]) for _ in range(count)]
+    bends = 0.02 * rng.normal(size=(count, 2))
+    outputs = [y + bend * np.sin(np.pi * s)[:, None] for y, bend in zip(shapes, bends, strict=True)]
+    return Demonstrations([(19.0 + m) * s for m in range(count)], outputs)
+
+
+def test_long_recordings_are_thinned_out_before_the_mixture():
+    lines = []
+    long = fit(slow(1500), log=lines.append)
+    short = fit(slow(150))
+    assert long.why.endswith("The mixture was fitted to 150 evenly spaced steps of 1500.")
+    assert "evenly spaced" not in short.why
+    assert lines[0].endswith("components to 150 of 1500 steps")
+    assert len(lines) == 5
+    assert long.reference.num_steps == 1500
+    assert long.components == short.components
+    np.testing.assert_allclose(long.reference.means[[0, -1]], short.reference.means[[0, -1]], atol=2e-3)
+
+
+@pytest.mark.parametrize("steps", [401, 1000, 5000])
+def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch):
+    """The cost of expectation maximization is bounded by the number of samples that it sees."""
+    sizes = []
+    fitted = mixture._fit
+
+    def counted(data, *arguments):
+        sizes.append(len(data))
+        return fitted(data, *arguments)
+
+    monkeypatch.setattr(mixture, "_fit", counted)
+    selection = fit(slow(steps), components=5, length_scale=4.0, lambda_=1.0)
+    assert max(sizes) == 3 * 150
+    assert selection.reference.num_steps == steps
+
+
+def test_recordings_of_usual_length_are_not_thinned_out():
+    assert "evenly spaced" not in fit(slow(400), components=5, length_scale=4.0, lambda_=1.0).why

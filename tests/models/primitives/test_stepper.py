@@ -8,7 +8,13 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
+from guiderail.models.primitives import (
+    LcNsKmp,
+    LinearConstraints,
+    PrimitiveStepper,
+    ReferenceTrajectory,
+    UnsolvableError,
+)
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
@@ -47,13 +53,13 @@ def commands_of_diagram(p, action, pose, steps):
 @pytest.mark.parametrize("action", [[0.0, 0.0], [1.0, -1.0]])
 def test_commands_equal_the_commands_of_the_diagram(history, action):
     p, pose = primitive(history), np.array([0.01, -0.02])
-    stepper = p.start(pose, GAIN)
+    stepper = PrimitiveStepper(p, pose, GAIN)
     commands = np.array([stepper.step(action).output for _ in range(STEPS + 5)])
     np.testing.assert_array_equal(commands, commands_of_diagram(p, action, pose, STEPS + 5))
 
 
 def test_violation_of_every_command_is_at_most_zero():
-    stepper = primitive(upper=0.3).start(gain=[1e5, 1e5])
+    stepper = PrimitiveStepper(primitive(upper=0.3), gain=[1e5, 1e5])
     commands = [stepper.step([1.0, 1.0]) for _ in range(STEPS)]
     assert max(command.violation for command in commands) <= 1e-9
     assert commands[-1].violation == pytest.approx(0.0, abs=1e-9)
@@ -62,7 +68,7 @@ def test_violation_of_every_command_is_at_most_zero():
 
 def test_fallback_repeats_the_last_allowed_command(monkeypatch):
     p = primitive(history=0)
-    stepper = p.start()
+    stepper = PrimitiveStepper(p)
     last = stepper.step([0.0, 0.0]).output
 
     def fail(*_):
@@ -79,7 +85,7 @@ def test_stepper_copies_its_commands():
     p = primitive(history=0)
     motion = MotionConstraintFilter(MotionConstraints(p.constraints, max_speed=[1.0, 1.0]), PERIOD)
     for filtered in (None, motion):
-        first, second = p.start(motion=filtered), p.start(motion=filtered)
+        first, second = PrimitiveStepper(p, motion=filtered), PrimitiveStepper(p, motion=filtered)
         for _ in range(2):
             expected = first.step([0.0, 0.0]).output
             changed = second.step([0.0, 0.0]).output
@@ -90,7 +96,7 @@ def test_stepper_copies_its_commands():
 
 def test_measured_history_follows_the_measured_pose():
     p = primitive()
-    commanded, measured = p.start([0.0, 0.0]), p.start([0.0, 0.0], history_source="measured")
+    commanded, measured = PrimitiveStepper(p, [0.0, 0.0]), PrimitiveStepper(p, [0.0, 0.0], history_source="measured")
     pose = np.array([0.0, 0.05])
     first = [stepper.step([0.0, 0.0], [0.0, 0.0]).output for stepper in (commanded, measured)]
     np.testing.assert_array_equal(*first)
@@ -110,11 +116,11 @@ def test_measured_history_follows_the_measured_pose():
 )
 def test_start_refuses_invalid_arguments(keywords, message):
     with pytest.raises(InputError, match=message):
-        primitive().start(**keywords)
+        PrimitiveStepper(primitive(), **keywords)
 
 
 def test_step_refuses_invalid_arguments_without_advancing():
-    stepper = primitive().start(history_source="measured")
+    stepper = PrimitiveStepper(primitive(), history_source="measured")
     for action in ([0.0], [np.nan, 0.0], [np.inf, 0.0]):
         with pytest.raises(InputError, match="action must be 2 finite numbers"):
             stepper.step(action)
@@ -129,7 +135,7 @@ def test_filter_of_another_type_or_size_is_refused():
     larger = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(3)), PERIOD)
     for motion in (5, MotionConstraints(p.constraints), larger):
         with pytest.raises(InputError, match="motion is a"):
-            p.start(motion=motion)
+            PrimitiveStepper(p, motion=motion)
     for arguments in ((p.constraints, PERIOD), (MotionConstraints(p.constraints), "0.02")):
         with pytest.raises(InputError, match=r"needs MotionConstraints|must be a number, not '0.02'"):
             MotionConstraintFilter(*arguments)
@@ -139,10 +145,10 @@ def test_filter_of_another_type_or_size_is_refused():
 def test_filter_starts_with_the_velocity_of_two_outputs(history):
     p = primitive(history)
     motion = MotionConstraintFilter(MotionConstraints(p.constraints, max_acceleration=[1.0, 1.0]), PERIOD)
-    first = p.start([[0.0, 0.0], [0.01, 0.0]], motion=motion).step([0.0, 0.0]).output
+    first = PrimitiveStepper(p, [[0.0, 0.0], [0.01, 0.0]], motion=motion).step([0.0, 0.0]).output
     assert abs(first[0] - 0.02) <= PERIOD**2 * (1 + 1e-9)
     with pytest.raises(InputError, match="pose must be 2 finite numbers"):
-        p.start([[0.0, 0.0], [0.01, 0.0]])
+        PrimitiveStepper(p, [[0.0, 0.0], [0.01, 0.0]])
 
 
 def test_motion_that_cannot_brake_is_stopped_with_a_fallback():
@@ -150,7 +156,7 @@ def test_motion_that_cannot_brake_is_stopped_with_a_fallback():
     wall = LinearConstraints(np.array([[0.0, -1.0]]), np.array([-0.02]))
     for speed, is_fallback in ((0.0004, False), (0.01, True)):
         motion = MotionConstraintFilter(MotionConstraints(wall, max_acceleration=[1.0, 1.0]), PERIOD)
-        stepper = p.start([[0.0, -speed], [0.0, 0.0]], motion=motion)
+        stepper = PrimitiveStepper(p, [[0.0, -speed], [0.0, 0.0]], motion=motion)
         commands = [stepper.step([0.0, 0.0]) for _ in range(3)]
         assert commands[0].is_fallback == is_fallback
         assert max(command.violation for command in commands) <= 1e-9

@@ -11,7 +11,8 @@ from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support.drake_multibody import transform_to_pose
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Callback, rollout
+from guiderail.tools.evaluation.episode import Callback
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.tables import read_table
 from research.action_fuzzing import tasks

@@ -35,7 +35,6 @@ def call(capsys, *arguments):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "choose one of"),
         (["trian"], "did you mean train?"),
         (["xyz"], "choose one of"),
         (["train"], "--out"),

@@ -14,8 +14,8 @@ from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, Policy, chunk_samples, find_base_policy
-from guiderail.tools.environments import check_environment, make_environment, task_content
+from guiderail.models.policy import Policy
+from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
     PredictPolicy,
@@ -26,7 +26,6 @@ from guiderail.tools.evaluation.policies import (
 )
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.imports import trust_imports
 from guiderail.tools.pretrained import find_run
 
 OBSERVATION = np.array([0.1, -0.2, 0.3], np.float32)
@@ -114,44 +113,6 @@ def test_onnx_acts_as_its_network(batch, env, tmp_path):
     np.testing.assert_allclose(act(OBSERVATION), np.tanh(OBSERVATION @ weight + bias), rtol=1e-6)
     single, double = (evaluate(file, "Bead", 3, baselines=(), processes=processes) for processes in (1, 2))
     assert single == double
-
-
-@pytest.fixture
-def base_policies(monkeypatch):
-    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
-    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
-    return BASE_POLICIES
-
-
-def test_base_policy_of_a_file_needs_trust_when_executable(tmp_path, monkeypatch, base_policies):
-    (tmp_path / "policy.onnx").write_bytes(linear_policy(np.zeros((3, 4), np.float32), np.zeros(4, np.float32), 1))
-    torch.jit.trace(Script(), torch.zeros(1, 3)).save(tmp_path / "policy.pt")
-    (tmp_path / "lab_base.py").write_text("raise RuntimeError\n")
-    monkeypatch.chdir(tmp_path)
-    environment = {"guidance": "kgrl_base_policy", "base_policy": "policy.onnx"}
-    resolved = check_environment("NarrowPassage", environment)["base_policy"]
-    assert resolved == str(tmp_path / "policy.onnx")
-    assert chunk_samples(find_base_policy(resolved), np.zeros(3, np.float32), 2).shape == (1, 2, 2)
-    for source in ("policy.pt", "lab_base.py:chunk"):
-        with pytest.raises(InputError, match="give --trust-imports"):
-            check_environment("NarrowPassage", environment | {"base_policy": source})
-    with trust_imports():
-        check_environment("NarrowPassage", environment | {"base_policy": "policy.pt"})
-    assert str(tmp_path / "policy.pt") in base_policies.names()
-
-
-def test_base_policy_of_a_function_is_stored_with_path_and_code(tmp_path, monkeypatch, base_policies):
-    file = tmp_path / "lab_chunk.py"
-    file.write_text("import numpy as np\ndef chunk(observation):\n    return np.zeros((1, 2, 2))\n")
-    monkeypatch.chdir(tmp_path)
-    with trust_imports():
-        environment = check_environment(
-            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "lab_chunk.py:chunk"}
-        )
-    assert environment["base_policy"] == f"{file}:chunk"
-    before = task_content("NarrowPassage", environment, ())
-    file.write_text(file.read_text().replace("zeros", "ones"))
-    assert task_content("NarrowPassage", environment, ()) != before
 
 
 def test_functions_in_files_of_equal_name_are_separate_policies(tmp_path):
@@ -537,3 +498,97 @@ def test_policy_folder_is_loaded_without_code(tmp_path):
     description = {"observation_shape": [3], "action_low": [-1, -1], "action_high": [1, 1]}
     Policy([(np.zeros((2, 3), np.float32), np.zeros(2, np.float32))], description).save(tmp_path)
     np.testing.assert_array_equal(load_policy(tmp_path)(OBSERVATION), [0, 0])
+
+
+class StatefulModule(torch.nn.Module):
+    """Policy that acts in its first three calls, counted in a buffer or an attribute."""
+
+    def __init__(self, kind):
+        super().__init__()
+        self.is_buffer = kind != "attribute"
+        self.number = 0
+        self.register_buffer("calls", torch.zeros(1))
+
+    def forward(self, x):
+        self.calls += 1
+        self.number += 1
+        count = self.calls if self.is_buffer else torch.ones(1) * self.number
+        return torch.ones(x.shape[0], 2) * (count <= 3)
+
+
+class ResetModule(StatefulModule):
+    """Policy whose stored state is used up, and which `reset` restores."""
+
+    def __init__(self):
+        super().__init__("buffer")
+        self.calls += 5
+
+    @torch.jit.export
+    def reset(self):
+        self.calls[:] = 0.0
+
+
+class StatefulFunction:
+    """Object that acts in its first three calls; a call after a `reset` is the first again."""
+
+    def __init__(self, kind):
+        self.calls, self.kind = 0, kind
+        if kind == "predict":
+            self.predict = self.act
+
+    def reset(self):
+        self.calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return np.ones(2) * (self.calls <= 3)
+
+    def __call__(self, observation):
+        return self.act(observation)
+
+
+STATEFUL = {
+    "buffer": lambda: StatefulModule("buffer"),
+    "attribute": lambda: StatefulModule("attribute"),
+    "reset": ResetModule,
+    "call": lambda: StatefulFunction("call"),
+    "predict": lambda: StatefulFunction("predict"),
+}
+
+
+class Steps(gymnasium.Env):
+    """Environment of five steps, whose return is the number of steps with actions of one."""
+
+    observation_space, action_space = gymnasium.spaces.Box(-1, 1, (3,)), gymnasium.spaces.Box(-1, 1, (2,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return np.zeros(3, np.float32), {}
+
+    def step(self, action):
+        self.count += 1
+        return np.zeros(3, np.float32), float(np.sum(action) / 2), False, self.count == 5, {}
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+@pytest.mark.parametrize("kind", STATEFUL)
+def test_stateful_policy_starts_every_episode_in_its_first_state(kind, processes, tmp_path):
+    policy = STATEFUL[kind]()
+    if isinstance(policy, torch.nn.Module):
+        torch.jit.script(policy).save(tmp_path / "policy.pt")
+        policy = load_policy(tmp_path / "policy.pt", trust_policy=True)
+    policy = check_compatible(policy, Steps())
+    assert evaluate(policy, Steps(), 5, baselines=(), processes=processes)["mean_return"] == 3.0
+
+
+@pytest.mark.parametrize("kind", STATEFUL)
+def test_state_of_a_policy_is_not_used_up_by_the_check(kind, tmp_path):
+    policy = STATEFUL[kind]()
+    if isinstance(policy, torch.nn.Module):
+        torch.jit.script(policy).save(tmp_path / "policy.pt")
+        policy = load_policy(tmp_path / "policy.pt", trust_policy=True)
+    policy = check_compatible(policy, Steps())
+    if kind == "reset":
+        policy.on_episode_start()
+    assert [policy(np.zeros(3, np.float32))[0] for _ in range(4)] == [1.0, 1.0, 1.0, 0.0]

@@ -7,8 +7,9 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy
+from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import COLUMNS
-from guiderail.tools.evaluation.rollout import Callback, rollout
+from guiderail.tools.evaluation.rollout import rollout
 
 
 class Recorder(Callback):
@@ -79,7 +80,7 @@ def test_rollout_accepts_models_and_refuses_invalid_arguments(change, message):
 
 def test_reward_that_is_not_a_number_is_refused():
     env = gymnasium.wrappers.TransformReward(gymnasium.make("CartPole-v1"), lambda reward: float("nan"))
-    with pytest.raises(InputError, match="the environment returned NaN as reward"):
+    with pytest.raises(InputError, match="the environment returned nan as reward"):
         rollout(env, lambda observation: 0, seed=0)
 
 

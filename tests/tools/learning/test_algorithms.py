@@ -10,7 +10,7 @@ from gymnasium import spaces
 from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.networks import DroppedNormalizedReLU

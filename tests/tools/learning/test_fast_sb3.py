@@ -9,7 +9,7 @@ from sb3_contrib.common.utils import quantile_huber_loss
 from stable_baselines3 import SAC
 from torch.nn.utils import parameters_to_vector
 
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.fast_sb3 import FastTrainingStep
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner

@@ -9,7 +9,7 @@ from spaces_only_env import SpacesOnlyEnv
 from guiderail.diagrams.envs.observation import ImageAndStateSpace
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, described_observation
 

@@ -13,7 +13,7 @@ from stable_baselines3 import DDPG
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner

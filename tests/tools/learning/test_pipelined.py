@@ -8,7 +8,7 @@ import pytest
 from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.rollout import Transition
+from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS

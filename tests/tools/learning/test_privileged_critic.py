@@ -13,7 +13,8 @@ from guiderail import make_env
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.rollout import Transition, rollout
+from guiderail.tools.evaluation.episode import Transition
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner

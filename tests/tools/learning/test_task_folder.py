@@ -18,8 +18,9 @@ from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.imports import import_modules
+from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, start_or_resume
+from guiderail.tools.learning.train import start_or_resume
 from guiderail_lerobot.env_server import open_environment
 from guiderail_studies.certify import certify_skill
 from guiderail_studies.declaration import Study

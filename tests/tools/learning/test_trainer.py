@@ -18,10 +18,11 @@ from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.learning import actors, trainer
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.configure import configure, resumed_config, with_defaults
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import SacLearner
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure, resumed_config, start_or_resume, train, with_defaults
+from guiderail.tools.learning.train import start_or_resume, train
 from guiderail.tools.learning.trainer import run_training
 
 # Program that trains the run of `bead_config` and prints the number of each finished episode.
@@ -32,7 +33,7 @@ sys.path.insert(0, {tests!r})
 import bead
 bead.register()
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import configure
+from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.trainer import run_training
 settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
 run_training(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from guiderail.tools.cli import app as cli
-from guiderail.tools.cli.app import argument, command, option, print_result
+from guiderail.tools.cli.app import argument, command, option, print_progress, print_result
 
 dataset = cli.command_group("dataset", "Import, export and validate demonstrations, and fit bounds to them.")
 
@@ -71,7 +71,8 @@ def validate(
     """Validate and summarize demonstrations before they are used."""
     from guiderail_data.validate import validate_demonstrations
 
-    print_result(validate_demonstrations(file, draw, fit=fit), as_json)
+    log = None if as_json else print_progress
+    print_result(validate_demonstrations(file, draw, fit=fit, log=log), as_json)
 
 
 @command("dataset fit-bounds demonstrations.npz --phases 4 --draw bounds.png --task ./peg", "fit-bounds", dataset)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +124,9 @@ def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> Non
 _MAX_COMPONENTS = 8  # largest number of mixture components in the comparison with a default primitive
 
 
-def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool = False) -> dict[str, Any]:
+def validate_demonstrations(
+    file: Path, draw: Path | None = None, *, fit: bool = False, log: Callable[[str], object] | None = None
+) -> dict[str, Any]:
     """Read demonstrations and return their number, durations, ranges and spread, with the fit of a primitive.
 
     The fit is the deviation of a primitive with default parameters. If `fit` is True, it is the result of
@@ -133,6 +136,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         file: File of demonstrations, or a folder of files.
         draw: Picture to write, with the mean, two standard deviations and the range.
         fit: True to fit the parameters of a primitive, which takes seconds.
+        log: Function that receives sentences on the progress of the fit.
 
     Raises:
         InputError: If the demonstrations are invalid, or cannot be drawn or fitted.
@@ -160,7 +164,7 @@ def validate_demonstrations(file: Path, draw: Path | None = None, *, fit: bool =
         "tightest": spread.min(axis=0).round(6).tolist(),
         "widest": spread.max(axis=0).round(6).tolist(),
     }
-    fitted = fit_primitive(demonstrations) if fit else _default_deviation(common)
+    fitted = fit_primitive(demonstrations, log) if fit else _default_deviation(common)
     if draw is not None:
         draw_demonstrations(common, draw)
         summary["picture"] = str(draw)
@@ -234,7 +238,7 @@ def _fit_reference(common: Demonstrations, components: int | None) -> ReferenceT
     return ReferenceTrajectory.from_demonstrations(common, components, floor=floor)
 
 
-def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
+def fit_primitive(demonstrations: Demonstrations, log: Callable[[str], object] | None = None) -> dict[str, Any]:
     """Return the parameters of a primitive that reproduces the demonstrations, and the deviation with the defaults.
 
     Raises:
@@ -242,7 +246,7 @@ def fit_primitive(demonstrations: Demonstrations) -> dict[str, Any]:
     """
     from guiderail.models.primitives.fit import fit
 
-    chosen = fit(demonstrations, floor=_variance_floor(demonstrations))
+    chosen = fit(demonstrations, floor=_variance_floor(demonstrations), log=log)
     share = estimated_share(chosen.reference, SquaredExponential(), lambda_=6.0, beta=6.0)
     verdict = "follows the demonstrations" if share >= MIN_SHARE else "LEAVES the demonstrations: use these values"
     return {

@@ -1,7 +1,11 @@
 """CSV recordings: units in the names of columns, delimiters, and refused tables."""
 
+import re
+from itertools import permutations
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail_data.formats.csv_layouts import read_csv_files
@@ -200,10 +204,165 @@ def test_velocity_and_force_columns_are_not_positions(prefix, file):
 
 
 def test_unused_columns_are_listed_as_left_out(file):
-    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,rx,ry,rz", *range(6)))
-    assert result.assumptions == ["there is no orientation", "rx, ry and rz are left out"]
+    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,a,b,c", *range(6)))
+    assert result.assumptions == ["there is no orientation", "a, b and c are left out"]
     many = ",".join(f"f{n}" for n in range(20))
     result = read_csv_files(write(file, f"t [s],x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{many}", *range(26)))
     assert result.assumptions[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
     result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,force", *range(4)))
     assert result.assumptions[-1] == "force is left out"
+
+
+TRUE = Rotation.from_euler("ZYX", [0.4, -0.3, 0.2])
+POSITION = (0.5, -0.1, 0.3)  # [m]
+QUATERNIONS = [
+    "q{}", "q_{}", "quat_{}", "quaternion.{}", "o{}", "orientation_{}", "orientation.{}", "pose.orientation.{}",
+    "pose.pose.orientation.{}", "field.pose.orientation.{}", "/tool/pose/orientation/{}", "transform.rotation.{}",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("layout", QUATERNIONS)
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_quaternion_is_read_in_the_order_of_its_names(layout, scale, file):
+    unit = "m" if scale == 1.0 else "mm"
+    values = dict(zip("xyzw", TRUE.as_quat().tolist(), strict=True))
+    for order in permutations("xyzw"):
+        header = f"t,x_{unit},y_{unit},z_{unit}," + ",".join(layout.format(axis) for axis in order)
+        row = [scale * value for value in POSITION] + [values[axis] for axis in order]
+        result = read_csv_files(write(file, header, *row))
+        np.testing.assert_allclose(result.outputs[0][0], [*POSITION, 0.4, -0.3, 0.2], atol=1e-12)
+
+
+@pytest.mark.parametrize("layout", QUATERNIONS)
+@pytest.mark.parametrize("missing", "xyzw")
+def test_incomplete_quaternion_is_refused_by_name(layout, missing, file):
+    names = [layout.format(axis) for axis in "xyzw" if axis != missing]
+    write(file, "t,x_m,y_m,z_m," + ",".join(names), *range(6))
+    with pytest.raises(InputError, match="not the whole of an orientation") as error:
+        read_csv_files(file)
+    assert all(name in str(error.value) for name in names)
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        "yaw",
+        "roll,yaw",
+        "heading",
+        "w",
+        "W,P,R",
+        "A,B",
+        "euler_x,euler_y,euler_z",
+        "r11,r12,r13",
+        "phi,theta,psi",
+        "quat[0],quat[1]",
+        "axis_angle_x",
+        "angle_deg",
+        "O_T_EE_0",
+    ],
+)
+def test_unknown_orientation_is_never_dropped(names, file):
+    write(file, f"t,x_m,y_m,z_m,{names}", *range(4 + names.count(",")))
+    with pytest.raises(InputError, match=f"has {re.escape(names.split(',')[0])}.* not the whole of an orientation"):
+        read_csv_files(file)
+
+
+@pytest.mark.parametrize(
+    ("names", "values"),
+    [
+        ("rx,ry,rz", TRUE.as_rotvec()),
+        ("tcp.rx,tcp.ry,tcp.rz", TRUE.as_rotvec()),
+        ("rx [rad],ry [rad],rz [rad]", TRUE.as_rotvec()),
+        ("A,B,C", TRUE.as_euler("ZYX", degrees=True)),
+        ("A [deg],B [deg],C [deg]", TRUE.as_euler("ZYX", degrees=True)),
+        ("A_rad,B_rad,C_rad", TRUE.as_euler("ZYX")),
+        ("Rz [deg],Ry [deg],Rx [deg]", TRUE.as_euler("ZYX", degrees=True)),
+        ("roll_deg,pitch_deg,yaw_deg", TRUE.as_euler("xyz", degrees=True)),
+        ("roll [rad],pitch [rad],yaw [rad]", TRUE.as_euler("xyz")),
+    ],
+)
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 1e2), ("mm", 1e3)])
+def test_three_angles_are_read_in_any_order_of_columns(names, values, unit, scale, file):
+    pairs = list(zip(names.split(","), values.tolist(), strict=True))
+    for order in permutations(pairs):
+        header = f"t,X [{unit}],Y [{unit}],Z [{unit}]," + ",".join(name for name, _ in order)
+        row = [scale * value for value in POSITION] + [value for _, value in order]
+        result = read_csv_files(write(file, header, *row))
+        np.testing.assert_allclose(result.outputs[0][0], [*POSITION, 0.4, -0.3, 0.2], atol=1e-12)
+
+
+@pytest.mark.parametrize("names", ["rx_deg,ry_deg,rz_deg", "rx [deg],ry [deg],rz [deg]", "rx,ry,rz"])
+def test_rotation_vector_in_degrees_is_refused(names, file):
+    write(file, f"t,x_m,y_m,z_m,{names}", 0, 0, 0, 90, 0, 0)
+    with pytest.raises(InputError, match="name the columns roll, pitch and yaw if they are angles about fixed axes"):
+        read_csv_files(file)
+
+
+RECORDERS = {  # header and time of a sample of common recorders, each with a pose in meters
+    "rostopic echo -p": (
+        "%time,field.header.seq,field.header.stamp,field.header.frame_id,field.pose.position.{},field.pose.orientation.{}",
+        lambda n: f"{10**18 + n * 10**7},{n},{10**18 + n * 10**7},base",
+    ),
+    "ros2 topic echo --csv with names": (
+        "sec,nanosec,frame_id,pose.position.{},pose.orientation.{}",
+        lambda n: f"{1 + n // 100},{n % 100 * 10**7},base",
+    ),
+    "PlotJuggler": (
+        "__time,/tool/header/stamp/sec,/tool/header/stamp/nanosec,/tool/pose/position/{},/tool/pose/orientation/{}",
+        lambda n: f"{1.7e9 + 0.01 * n},{1 + n // 100},{n % 100 * 10**7}",
+    ),
+}
+
+
+@pytest.mark.parametrize("recorder", RECORDERS)
+def test_recorder_of_poses_is_read_without_options(recorder, file):
+    header, stamp = RECORDERS[recorder]
+    start, position, orientation = header.rsplit(",", 2)
+    names = [start, *(position.format(axis) for axis in "xyz"), *(orientation.format(axis) for axis in "xyzw")]
+    pose = ",".join(str(value) for value in (*POSITION, *TRUE.as_quat()))
+    file.write_text("\n".join([",".join(names), *(f"{stamp(n)},{pose}" for n in range(150))]))
+    result = read_csv_files(file)
+    np.testing.assert_allclose(np.diff(result.times[0][:99]), 0.01, atol=1e-6)
+    np.testing.assert_allclose(result.outputs[0], np.tile([*POSITION, 0.4, -0.3, 0.2], (150, 1)), atol=1e-12)
+    assert any("is a field of a ROS message, in meters" in text for text in result.assumptions)
+
+
+def test_tool_pose_of_rtde_is_read(file):
+    header = "timestamp [s]," + ",".join(f"{kind}_{n}" for kind in ("actual_q", "actual_TCP_pose") for n in range(6))
+    result = read_csv_files(write(file, header, *range(6), *POSITION, *TRUE.as_rotvec()))
+    np.testing.assert_allclose(result.outputs[0][0], [*POSITION, 0.4, -0.3, 0.2], atol=1e-12)
+    both = header + "," + ",".join(f"target_TCP_pose_{n}" for n in range(6))
+    with pytest.raises(InputError, match="keep the columns of one of them"):
+        read_csv_files(write(file, both, *range(18)))
+
+
+def test_table_without_names_is_refused_with_the_line_to_add(file):
+    file.write_text("".join(f"1,{n}0000000,base,0.5,0,0.3,0,0,0,1\n" for n in range(5)))
+    with pytest.raises(InputError, match=r"sec,nanosec,frame_id,pose\.position\.x"):
+        read_csv_files(file)
+
+
+@pytest.mark.parametrize("name", ["frame_id", "field.header.frame_id", "header.frame_id", "child_frame_id"])
+@pytest.mark.parametrize("is_within", [True, False])
+def test_frames_of_files_must_be_equal(name, is_within, file):
+    lines = [f"{0.01 * n},{frame},{n},0,0" for n, frame in enumerate(["base"] * 3 + ["world"] * 3)]
+    parts = [lines] if is_within else [lines[:3], lines[3:]]
+    for number, part in enumerate(parts):
+        file.with_name(f"{number}.csv").write_text("\n".join([f"t,{name},x_m,y_m,z_m", *part]))
+    with pytest.raises(InputError, match=r"(?s)(base.*world|world.*base)"):
+        read_csv_files(file.parent)
+
+
+def test_position_and_orientation_of_two_messages_are_refused(file):
+    header = "t," + ",".join(f"a.position.{axis}" for axis in "xyz") + ","
+    header += ",".join(f"b.orientation.{axis}" for axis in "xyzw")
+    with pytest.raises(InputError, match=r"a\.position\.x and b\.orientation\.x, of two messages"):
+        read_csv_files(write(file, header, 0, 0, 0, 0, 0, 0, 1))
+
+
+def test_lines_without_a_position_are_left_out(file):
+    rows = [f"{0.01 * n},{n},0,0,1" if n % 2 else f"{0.01 * n},,,,1" for n in range(8)]
+    file.write_text("\n".join(["t,x_m,y_m,z_m,force", *rows]))
+    result = read_csv_files(file)
+    np.testing.assert_array_equal(result.outputs[0][:, 0], [1, 3, 5, 7])
+    assert "4 lines without a position are left out" in result.assumptions

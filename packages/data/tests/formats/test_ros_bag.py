@@ -1,5 +1,8 @@
 """ROS 2 bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
 
+from functools import cache
+from itertools import product
+
 import numpy as np
 import pytest
 
@@ -13,18 +16,24 @@ POSE = "geometry_msgs/msg/Pose"
 ARRAY = "std_msgs/msg/Float64MultiArray"
 
 
-def write(path, kind, make, values):
+@cache
+def typestore():
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def write(path, kind, make, values, topic="/topic"):
     """Write a bag with a message for each of `values`; return its path.
 
     `make` returns a message from the message types by short name and a value.
     """
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys import Stores, get_typestore
 
-    store = get_typestore(Stores.ROS2_HUMBLE)
+    store = typestore()
     types = {name.split("/")[-1]: message_type for name, message_type in store.types.items()}
     with Writer(path, version=8) as writer:
-        connection = writer.add_connection("/topic", kind, typestore=store)
+        connection = writer.add_connection(topic, kind, typestore=store)
         for n, value in enumerate(values):
             writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, value), kind))
     return path
@@ -113,7 +122,7 @@ def test_array_outputs_are_named_after_its_dimension(tmp_path):
     result = read_bags(write(tmp_path / "bag", ARRAY, labeled_array, ["force", "force"]), None, None)
     assert result.names == ("force 0", "force 1", "force 2")
     np.testing.assert_array_equal(result.outputs[0], [[0, 1, 2]] * 2)
-    unnamed = read_bags(write(tmp_path / "unnamed", ARRAY, labeled_array, ["", ""]), None, None)
+    unnamed = read_bags(write(tmp_path / "unnamed", ARRAY, labeled_array, ["", ""]), "/topic", None)
     assert unnamed.names == ("output 0", "output 1", "output 2")
 
 
@@ -151,3 +160,98 @@ def test_bag_export_refuses_time_out_of_range(times, message, tmp_path):
     with pytest.raises(InputError, match=message):
         write_mcap(tmp_path / "bags", Demonstrations([np.array(times)], [np.ones((2, 1))]))
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "topic", ["/forward_position_controller/commands", "/forward_velocity_controller/commands", "/pose"]
+)
+@pytest.mark.parametrize("size", [1, 3, 6, 7])
+def test_array_without_labels_is_refused_unless_named(topic, size, tmp_path):
+    bag = write(tmp_path / "bag", ARRAY, array, [np.arange(size) + n for n in range(3)], topic)
+    with pytest.raises(InputError, match=r"have no labels|states changes, rates or forces"):
+        read_bags(bag, None, None)
+    named = read_bags(bag, topic, None)
+    assert named.names == tuple(f"output {number}" for number in range(size))
+    assert any("plain outputs without a unit" in text for text in named.assumptions)
+
+
+def test_array_is_refused_when_its_labels_change(tmp_path):
+    def labeled(types, labels):
+        dims = [types["MultiArrayDimension"](label=label, size=1, stride=1) for label in labels]
+        return types["Float64MultiArray"](
+            layout=types["MultiArrayLayout"](dim=dims, data_offset=0), data=np.arange(float(len(labels)))
+        )
+
+    bag = write(tmp_path / "bag", ARRAY, labeled, ["xyz", "xyz", "zyx"])
+    with pytest.raises(InputError, match=r"message 2 on /topic of .* has other labels"):
+        read_bags(bag, None, None)
+
+
+@pytest.mark.parametrize(
+    "topic",
+    ["/servo/delta_pose", "/cmd_vel", "/tcp/velocity", "/pose_error", "/eeTwist", "/relative/pose", "/ft/wrench"],
+)
+def test_pose_topic_that_is_called_a_rate_is_refused_unless_named(topic, tmp_path):
+    bag = write(tmp_path / "bag", POSE, pose, [1.0] * 3, topic)
+    with pytest.raises(InputError, match="name it with --signal to import it as it is"):
+        read_bags(bag, None, None)
+    assert len(read_bags(bag, topic, None).times) == 1
+
+
+def in_frame(kind):
+    """Return a maker of messages of a kind from their frame and child frame."""
+
+    def make(types, frames):
+        frame, child = frames
+        header = types["Header"](stamp=types["Time"](sec=0, nanosec=0), frame_id=frame)
+        point, rotation = types["Point"](x=0.0, y=0.0, z=0.0), types["Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+        plain = types["Pose"](position=point, orientation=rotation)
+        if kind == "PoseStamped":
+            return types[kind](header=header, pose=plain)
+        with_covariance = types["PoseWithCovariance"](pose=plain, covariance=np.zeros(36))
+        if kind == "PoseWithCovarianceStamped":
+            return types[kind](header=header, pose=with_covariance)
+        if kind == "TransformStamped":
+            shift = types["Vector3"](x=0.0, y=0.0, z=0.0)
+            transform = types["Transform"](translation=shift, rotation=rotation)
+            return types[kind](header=header, child_frame_id=child, transform=transform)
+        zero = types["Vector3"](x=0.0, y=0.0, z=0.0)
+        twist = types["TwistWithCovariance"](twist=types["Twist"](linear=zero, angular=zero), covariance=np.zeros(36))
+        return types[kind](header=header, child_frame_id=child, pose=with_covariance, twist=twist)
+
+    return make
+
+
+KINDS = {
+    "PoseStamped": "geometry_msgs/msg/PoseStamped",
+    "PoseWithCovarianceStamped": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "TransformStamped": "geometry_msgs/msg/TransformStamped",
+    "Odometry": "nav_msgs/msg/Odometry",
+}
+FRAMES = [("base_link", "tool"), ("world", "tool"), ("", "tool"), ("base_link", "camera")]
+
+
+@pytest.mark.parametrize(("kind", "second"), list(product(KINDS, range(len(FRAMES)))))
+@pytest.mark.parametrize("target", [None, (0.5, 0.0, 0.2, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("is_within", [True, False])
+def test_poses_in_different_frames_are_refused(kind, second, target, is_within, tmp_path):
+    has_child = kind in ("TransformStamped", "Odometry")
+    first, other = ((frame, child if has_child else "") for frame, child in (FRAMES[0], FRAMES[second]))
+    sequences = [[first] * 3 + [other] * 3] if is_within else [[first] * 3, [other] * 3]
+    for number, sequence in enumerate(sequences):
+        write(tmp_path / f"bag_{number}", KINDS[kind], in_frame(kind), sequence)
+    if first == other:
+        assert read_bags(tmp_path, None, target).frames == first
+        return
+    differing = next(name or "unnamed" for a, name in zip(first, other, strict=True) if a != name)
+    with pytest.raises(InputError, match=differing) as error:
+        read_bags(tmp_path, None, target)
+    assert "base_link" in str(error.value)
+
+
+def test_leading_slash_of_a_frame_is_ignored(tmp_path):
+    frames = [("/base_link", ""), ("base_link", "")]
+    bag = write(tmp_path / "bag", KINDS["PoseStamped"], in_frame("PoseStamped"), frames)
+    result = read_bags(bag, None, (0.0,) * 6)
+    assert result.frames == ("base_link", "")
+    assert "--target is a pose in the frame 'base_link'" in result.assumptions

@@ -40,7 +40,6 @@ from guiderail.systems.wrench_tare import WrenchTare
 from guiderail_hardware.drivers.driver import (
     Driver,
     PoseDriver,
-    RobotImpedance,
     check_driver,
     check_robot,
     open_driver,
@@ -49,6 +48,7 @@ from guiderail_hardware.drivers.driver import (
 )
 from guiderail_hardware.drivers.driver import status_limits as default_status_limits
 from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, Fault, StatusLimits
+from guiderail_hardware.models.robot_impedance import RobotImpedance
 from guiderail_hardware.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail_hardware.systems.pose_publisher import PosePublisher
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter

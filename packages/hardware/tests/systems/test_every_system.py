@@ -1,4 +1,4 @@
-"""Rules of `oracles.system_rules` for the systems of robots."""
+"""Rules of `oracles.systems` for the systems of robots."""
 
 import re
 from pathlib import Path
@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail_hardware import systems
 from guiderail_hardware.models.joint_status import StatusLimits
 from oracles.franka import FRANKA_LIMITS
-from oracles.system_rules import RULES, check_source, system_names
+from oracles.systems import RULES, check_source, system_names
 
 FOLDER = Path(systems.__file__).parent
 FILES = sorted(path for path in FOLDER.glob("*.py") if path.stem != "__init__")

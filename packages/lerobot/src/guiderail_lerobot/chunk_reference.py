@@ -4,11 +4,11 @@ import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BasePolicy, chunk_samples, mean_and_variance
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.policy_system import PolicyError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail_lerobot.base_policy import BasePolicy, chunk_samples, mean_and_variance
 
 
 class ChunkReference(LeafSystem):

@@ -10,11 +10,12 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import UnsolvableError
-from guiderail.tools.evaluation.rollout import Transition, is_compatible
-from guiderail.tools.learning.config import DistillationConfig
+from guiderail.tools.evaluation.episode import Transition
+from guiderail.tools.evaluation.policies import is_compatible
 from guiderail.tools.learning.learner import register_learner
 from guiderail.tools.pretrained import find_run
 from guiderail_lerobot.chunking import ChunkLearner
+from guiderail_lerobot.config import DistillationConfig
 
 CLOCK_SPREAD = 1e-6  # an observation entry with a smaller range over the episodes, at every step, is a clock
 

@@ -8,17 +8,17 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.envs.options import BasePolicyOptions, GuardOptions
 from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.guidance.residual import ResidualGuidance
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import find_base_policy
+from guiderail_lerobot.base_policy import find_base_policy
 from guiderail_lerobot.chunk_guard import ChunkGuard
 from guiderail_lerobot.chunk_reference import ChunkReference
 from guiderail_lerobot.chunk_safety_limiter import ChunkSafetyLimiter
+from guiderail_lerobot.options import BasePolicyOptions, GuardOptions
 
 LIMIT_FACTOR = 2.0  # default limits of a guard, relative to the largest speed and jerk of the demonstrations
 

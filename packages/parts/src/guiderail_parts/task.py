@@ -44,6 +44,7 @@ from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
+from guiderail.tools.learning.config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
 from guiderail_parts.task_file import (
@@ -430,10 +431,15 @@ def load_task_folder(folder: Path) -> type[PartInsertion]:
     """Return the task class of a folder.
 
     Raises:
-        InputError: As `read_task_file`.
+        InputError: As `read_task_file`, or if the recommended learner is unknown.
     """
     folder = folder.resolve()
-    return _task_class(folder, task_folder_digest(folder))
+    task = _task_class(folder, task_folder_digest(folder))
+    try:
+        resolve_preset(**{"preset": None, **task.learner})
+    except InputError as error:
+        raise InputError(f"recommended.learner in {folder / FILE_NAME} is invalid: {error}") from None
+    return task
 
 
 @cache

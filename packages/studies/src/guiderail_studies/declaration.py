@@ -26,7 +26,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import task_named
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 
 Integer = Annotated[int, Field(strict=True)]  # without `strict`, YAML's `true` would be 1
 FolderName = Annotated[str, Field(pattern=r"^[\w-][\w.-]*\z", max_length=100)]

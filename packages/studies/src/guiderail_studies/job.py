@@ -29,15 +29,16 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
+from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.evaluate import evaluate_run
 from guiderail.tools.evaluation.evaluation import load_or_compute, read_complete
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.policies import check_compatible
-from guiderail.tools.evaluation.rollout import PolicyFn, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
+from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
-from guiderail.tools.learning.train import configure, with_defaults
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome
 

@@ -20,11 +20,11 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.primitives.io import find_repeated
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, digest_of, zero_policy
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.evaluate import check_num_episodes, evaluate_once
 from guiderail.tools.evaluation.evaluation import POLICY
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.subject import (
     Subject,
     default_baselines,

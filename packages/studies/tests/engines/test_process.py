@@ -3,12 +3,11 @@ import signal
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail_studies.engines.engine import ENGINES, make_engine
+from guiderail_studies.engines.engine import ENGINES, make_engine, register_engine
 from oracles.work import die, work
 
 # Program that runs two jobs without end in two workers.
@@ -67,7 +66,7 @@ def test_job_fails_when_three_workers_are_lost():
 @pytest.mark.parametrize("stop_signal", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
 def test_workers_end_when_the_study_is_killed(stop_signal, tmp_path):
     (tmp_path / "parent.py").write_text(PARENT)
-    paths = os.pathsep.join([str(Path(__file__).parents[4] / "tests"), *filter(None, sys.path)])
+    paths = os.pathsep.join(filter(None, sys.path))
     with subprocess.Popen(
         [sys.executable, tmp_path / "parent.py"],
         env=os.environ | {"PYTHONPATH": paths},
@@ -95,3 +94,17 @@ def test_engine_refuses_unsupported_arguments():
         make_engine("process", address="auto")
     with pytest.raises(InputError, match="at least one process, not 0"):
         make_engine("process", 0)
+
+
+def test_registration_refuses_an_object_that_is_not_callable():
+    with pytest.raises(InputError, match="registered with a function or a class, not with 3"):
+        register_engine("lab")(3)
+    assert "lab" not in ENGINES.names()
+
+
+def test_study_refuses_an_engine_that_is_none(monkeypatch):
+    monkeypatch.setattr(ENGINES, "_entries", dict(ENGINES._entries))
+    monkeypatch.setattr(ENGINES, "_origins", dict(ENGINES._origins))
+    register_engine("lab", lambda *arguments, **options: None)
+    with pytest.raises(InputError, match="the engine 'lab' must be an Engine, not None"):
+        make_engine("lab")

@@ -13,7 +13,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.files import atomic_folder
 from guiderail.tools.tables import check_parquet
-from guiderail_data.formats.recorded import Recorded, choose_signal, describe_time_shift
+from guiderail_data.formats.recorded import Recorded, choose_signal, describe_time_shift, is_rate
 
 VERSION = "v3.0"
 INFO = Path("meta") / "info.json"
@@ -72,6 +72,12 @@ def read_lerobot(folder: Path, signal: str | None) -> Recorded:
     except (arrow.ArrowException, OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(f"{folder} holds data that its {INFO} does not describe: {brief(str(error))}") from error
     names = _names(features[chosen], values.shape[1])
+    rates = [name for name in names if is_rate(name)]
+    if rates and signal is None:
+        raise InputError(
+            f"{chosen} of {folder} has {rates[0]}, whose name states a change, a rate or a force instead of a "
+            "position: name another feature with --signal, or this one to import it as it is"
+        )
     assumptions += [
         f"time is the frame index at {fps:g} frames per second",
         "numbers are kept as they are: a LeRobot dataset does not state their unit or frame",

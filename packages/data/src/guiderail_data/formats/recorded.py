@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -18,6 +19,16 @@ COMMANDED = ("command", "desired", "target", "equilibrium", "cmd", "action", "go
 """Words that distinguish the name of a commanded signal from that of a measured signal."""
 
 
+Frames = tuple[str, str]
+"""Names of the frame that poses are relative to and of the frame that they move, each "" if it is not stated."""
+NO_FRAMES: Frames = ("", "")
+# Words in the name of a signal or of its numbers that are changes, rates or forces and no positions.
+_RATES = re.compile(
+    r"(?:^|[^a-z])(d[xyz]|deltas?|increments?|relative|residual|errors?|vel|velocity|velocities|speeds?|twists?"
+    r"|acc|accel|accelerations?|jerk|efforts?|torques?|forces?|wrench)(?:$|[^a-z])"
+)
+
+
 @dataclass
 class Recorded:
     """Imported motions."""
@@ -27,6 +38,7 @@ class Recorded:
     names: tuple[str, ...]  # names of the outputs
     # Assumptions about facts that the file does not state, one sentence each.
     assumptions: list[str] = field(default_factory=list)
+    frames: Frames = NO_FRAMES  # frames of all motions
 
 
 def rotations_of(quaternions: np.ndarray, where: str) -> Rotation:
@@ -93,6 +105,22 @@ def describe_time_shift(demonstrations: Demonstrations) -> list[str]:
     return [f"time is shifted to start at 0; the first samples were at {where} s"]
 
 
+def describe_frames(frame: str, child: str) -> str:
+    """Return the names of frames as part of a sentence."""
+    base = f"the frame {brief(frame)}" if frame else "an unnamed frame"
+    return f"{brief(child)} in {base}" if child else f"a tool in {base}"
+
+
+def plain_frame(name: str) -> str:
+    """Return the name of a frame without the leading slash of ROS 1."""
+    return str(name).strip().lstrip("/")
+
+
+def is_rate(name: str) -> bool:
+    """Return True if the name of a signal states a change, a rate or a force, and no position."""
+    return _RATES.search(re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower().replace("_", " ")) is not None
+
+
 def is_commanded(name: str) -> bool:
     """Return True if the name of a signal states that it was commanded."""
     return any(word in name.lower() for word in COMMANDED)
@@ -118,6 +146,11 @@ def choose_signal(candidates: Sequence[str], given: str | None, where: str, opti
         return given, []
     commanded = [name for name in candidates if is_commanded(name)]
     chosen = commanded if len(commanded) == 1 else list(candidates)
+    if len(chosen) == 1 and is_rate(chosen[0]):
+        raise InputError(
+            f"{where} has {chosen[0]}, whose name states changes, rates or forces instead of a motion: record "
+            f"positions, or name it with {option} to import it as it is"
+        )
     if len(chosen) > 1:
         raise InputError(
             f"{where} has {', '.join(chosen)}, and does not state which one to import: name one with {option}"

@@ -17,9 +17,13 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_LINES
 from guiderail.tools.files import atomic_folder
 from guiderail_data.formats.recorded import (
+    NO_FRAMES,
+    Frames,
     Recorded,
     choose_signal,
+    describe_frames,
     describe_time_shift,
+    plain_frame,
     poses_in_target,
     rotations_of,
 )
@@ -61,16 +65,22 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
 
     Raises:
         InputError: If a bag cannot be read, or no single topic can be chosen. Also if a topic has several publishers,
-            fewer than two messages, more than `MAX_LINES`, or messages of different sizes or joints; if `target` is
-            given for a topic without poses; or if the outputs of two bags differ.
+            fewer than two messages, more than `MAX_LINES`, or messages of different sizes, labels, joints or frames.
+            Also if an array has no labels and `topic` is None; if `target` is given for a topic without poses; or if
+            the outputs or frames of two bags differ.
         MissingExtraError: If rosbags is not installed.
     """
     recorded = Recorded([], [], ())
     for bag in find_bags(path):
         like = recorded.outputs[0] if recorded.outputs else None
-        times, outputs, names, assumptions = _read_bag(bag, topic, target, like)
+        times, outputs, names, frames, assumptions = _read_bag(bag, topic, target, like)
         if sorted(names) == sorted(recorded.names):  # the order of joints may differ
             names, outputs = recorded.names, outputs[:, [names.index(name) for name in recorded.names]]
+        if recorded.names and frames != recorded.frames:
+            raise InputError(
+                f"{bag} has poses of {describe_frames(*frames)}, and the previous bag of "
+                f"{describe_frames(*recorded.frames)}: record the same frames in all bags"
+            )
         if recorded.names and names != recorded.names:
             raise InputError(
                 f"{bag} has the outputs {', '.join(names)}, and the previous bag {', '.join(recorded.names)}: "
@@ -78,14 +88,14 @@ def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> 
             )
         recorded.times.append(times)
         recorded.outputs.append(outputs)
-        recorded.names = names
+        recorded.names, recorded.frames = names, frames
         recorded.assumptions += [text for text in assumptions if text not in recorded.assumptions]
     return recorded
 
 
 def _read_bag(
     bag: Path, topic: str | None, target: Sequence[float] | None, like: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], list[str]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], Frames, list[str]]:
     highlevel = import_extra("rosbags.highlevel")
     from rosbags.typesys import Stores, get_typestore
 
@@ -122,41 +132,66 @@ def _read_bag(
     if target is not None and kinds[chosen] in (DATA, JOINTS):
         raise InputError(f"{chosen} of {bag} does not state which numbers are a pose: leave --target out")
     if kinds[chosen] == DATA:
-        names = _array_names(messages[0])
-        for number, message in enumerate(messages):
-            if len(message.data) != len(names):
-                raise InputError(
-                    f"message {number} on {chosen} of {bag} has {len(message.data)} numbers instead of {len(names)}: "
-                    "record the same number in every message, one for each label, or six without labels"
-                )
-        return times, np.array([message.data for message in messages]), names, assumptions
+        names, values = _labeled(messages, f"on {chosen} of {bag}", topic is not None, assumptions)
+        return times, values, names, NO_FRAMES, assumptions
     if kinds[chosen] == JOINTS:
         assumptions.append("joints are revolute, so that their positions are in radians")
         names = tuple(f"{name} [rad]" for name in messages[0].name)
-        return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, assumptions
+        return times, _joint_positions(messages, f"on {chosen} of {bag}"), names, NO_FRAMES, assumptions
     poses = [reduce(getattr, POSES[kinds[chosen]], message) for message in messages]
     points = [getattr(pose, "position", None) or pose.translation for pose in poses]
     positions = np.array([(p.x, p.y, p.z) for p in points])
     orientations = [getattr(pose, "orientation", None) or pose.rotation for pose in poses]
     rotations = rotations_of(np.array([(q.x, q.y, q.z, q.w) for q in orientations]), str(bag))
-    frame = _frame(messages[0], POSES[kinds[chosen]])
+    frames = _frames(messages, POSES[kinds[chosen]], f"on {chosen} of {bag}")
+    frame = f"the frame {frames[0]!r}" if frames[0] else "the frame of the recording"
     assumptions.append("positions are in meters, and quaternions follow the names of their fields (REP 103)")
     if target is None:
         assumptions.append(
             f"poses stay in {frame}: to convert them, give the pose of the task's target in it as --target"
         )
-    return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, assumptions
+    else:
+        assumptions.append(f"--target is a pose in {frame}")
+    return times, poses_in_target(positions, rotations, target, like), POSE_NAMES, frames, assumptions
+
+
+def _labeled(
+    messages: Sequence[Any], where: str, is_named: bool, assumptions: list[str]
+) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the names and values (N, O) of arrays; arrays without labels are refused unless the user named the topic.
+
+    A number of values does not state what they are: six may be a pose, joint positions, velocities or a wrench.
+    """
+    names = _array_names(messages[0])
+    for number, message in enumerate(messages):
+        if len(message.data) != len(names):
+            raise InputError(
+                f"message {number} {where} has {len(message.data)} numbers instead of {len(names)}: record the same "
+                "number in every message, one for each label"
+            )
+        if _array_names(message) != names:
+            raise InputError(f"message {number} {where} has other labels than message 0: record one signal")
+    if all(not dimension.label for dimension in messages[0].layout.dim):
+        if not is_named:
+            raise InputError(
+                f"the {len(names)} numbers {where} have no labels and do not state what they are, such as a pose, "
+                "joint positions or velocities: record a PoseStamped or a JointState, label the array's layout, or "
+                "name the topic with --signal to import plain numbers"
+            )
+        assumptions.append(f"the numbers {where} have no labels: they are plain outputs without a unit")
+    return names, np.array([message.data for message in messages])
 
 
 def _array_names(message: Any) -> tuple[str, ...]:
     """Return the names of an array's numbers: the labels of dimensions of size 1, as `write_mcap` writes them.
 
-    With a single longer dimension, the names are its label and an index. An array without dimensions is a pose.
+    With a single longer dimension, or without dimensions, the names are its label, or "output", and an index.
     """
     dimensions = message.layout.dim
-    if len(dimensions) == 1 and dimensions[0].size == len(message.data) > 1:
-        return tuple(f"{dimensions[0].label or 'output'} {number}" for number in range(dimensions[0].size))
-    return tuple(dimension.label for dimension in dimensions) or POSE_NAMES
+    if len(dimensions) > 1 or (dimensions and dimensions[0].size == len(message.data) == 1):
+        return tuple(dimension.label or f"output {number}" for number, dimension in enumerate(dimensions))
+    label, size = (dimensions[0].label, dimensions[0].size) if dimensions else ("", len(message.data))
+    return tuple(f"{label or 'output'} {number}" for number in range(size))
 
 
 def _joint_positions(messages: Sequence[Any], where: str) -> np.ndarray:
@@ -200,13 +235,23 @@ def _message_times(rows: Sequence[tuple[int, Any]]) -> tuple[np.ndarray, list[st
     ]
 
 
-def _frame(message: Any, path: Sequence[str]) -> str:
-    """Return a description of the frame of a pose; `path` has the nested attributes that contain the pose."""
-    for holder in (message, reduce(getattr, path[:1], message)):
-        header = getattr(holder, "header", None)
-        if header is not None and header.frame_id:
-            return f"the frame {str(header.frame_id)!r}"
-    return "the frame of the recording"
+def _frames(messages: Sequence[Any], path: Sequence[str], where: str) -> Frames:
+    """Return the frame of the poses and the frame that they move; poses in several frames are refused.
+
+    `path` has the nested attributes of a message that contain the pose. A frame that a message does not state is "".
+    """
+    frames = NO_FRAMES
+    for number, message in enumerate(messages):
+        holders = (message, reduce(getattr, path[:1], message))
+        names = (getattr(getattr(holder, "header", None), "frame_id", "") for holder in holders)
+        found = plain_frame(next(filter(None, names), "")), plain_frame(getattr(message, "child_frame_id", ""))
+        if number and found != frames:
+            raise InputError(
+                f"message {number} {where} has a pose of {describe_frames(*found)}, and message 0 of "
+                f"{describe_frames(*frames)}: record each frame on a topic of its own"
+            )
+        frames = found
+    return frames
 
 
 def write_mcap(path: Path, demonstrations: Demonstrations) -> list[str]:

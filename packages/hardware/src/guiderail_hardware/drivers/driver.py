@@ -22,6 +22,7 @@ from guiderail.models.robots.mounting import add_robot
 from guiderail.models.robots.robot import Robot, find_robot
 from guiderail_hardware.drivers.driver_guard import ERRORS, DriverGuard
 from guiderail_hardware.models.joint_status import Fault, Heartbeat, JointStatus, StatusLimits
+from guiderail_hardware.models.robot_impedance import RobotImpedance
 from guiderail_hardware.systems.torque_safety_limiter import SafetyLimits
 
 STATUS_PERIOD = CONTROL_PERIOD / 4  # period of Drake's drivers [s], 5 ms; a control period is an exact multiple
@@ -155,21 +156,6 @@ class Driver(ABC):
     def __str__(self) -> str:
         """Return the address at which the robot is reached, for messages."""
         return self.url or self.name
-
-
-@dataclass(frozen=True)
-class RobotImpedance:
-    """Impedance at the tool center, for a robot with its own impedance controller."""
-
-    X_FlangeTool: RigidTransform  # pose of the tool center on the flange
-    stiffness: np.ndarray  # stiffness in the axes of the robot's base, (6, 6) [N/m, Nm/rad], translation first
-    damping: np.ndarray  # damping in the same axes and order, (6, 6) [Ns/m, Nms/rad]
-    # Largest magnitude of each component of the impedance's wrench in the axes of the base, (6,) [N, Nm].
-    max_wrench: np.ndarray
-    posture: np.ndarray  # joint positions towards which the null space is controlled, (n,) [rad]
-    mass: float  # mass of tool and workpiece [kg]
-    center_of_mass: np.ndarray  # center of mass of tool and workpiece in the flange's frame, (3,) [m]
-    inertia: np.ndarray  # inertia of tool and workpiece about the center of mass in the flange's axes, (3, 3) [kg m²]
 
 
 class PoseDriver(Driver):

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import time as wall_time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.models.joint_status import MALFORMED_STATUS, Fault, Heartbeat, JointStatus, parse_status
-
-if TYPE_CHECKING:
-    from guiderail_hardware.drivers.driver import Driver, RobotImpedance
+from guiderail_hardware.models.robot_impedance import RobotImpedance
 
 ERRORS = (Exception, SystemExit)  # exceptions of a driver that must not end the control of an arm
 
@@ -23,7 +21,7 @@ class DriverGuard:
     If the driver raises an exception while a status is received, or returns no valid status object, the status counts
     as malformed. If it raises an exception while a command is sent, `take_failure` returns True once. The command of
     the next step is sent as usual; once a command has succeeded, `take_recovery` returns True once. All stations on a
-    driver share one guard, `Driver.guard`.
+    driver share one guard, `Driver.guard`. The driver is any object: no method of it is trusted to be complete.
 
     Attributes:
         read_error: Newest exception of receiving or reading, in words; empty if there was none.
@@ -31,7 +29,7 @@ class DriverGuard:
         num_failed_commands: Number of commands that raised an exception.
     """
 
-    def __init__(self, driver: Driver):
+    def __init__(self, driver: Any):
         self._driver = driver
         self.num_failed_commands = 0
         self.forget_errors()

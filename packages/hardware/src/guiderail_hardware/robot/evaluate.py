@@ -13,8 +13,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import HELD_OUT_SEED, EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.files import write_atomically, write_record
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run

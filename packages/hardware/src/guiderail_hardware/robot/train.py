@@ -20,11 +20,12 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import check_room, write_atomically
+from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.pipelined import PipelinedLearner
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.learning.train import SUMMARY, configure, resumed_config, warn_of_unfinished_source, with_defaults
+from guiderail.tools.learning.train import SUMMARY
 from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection

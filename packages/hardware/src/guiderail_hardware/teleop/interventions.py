@@ -22,7 +22,8 @@ from guiderail.models.common.termination import Termination
 from guiderail.models.primitives.gains import deviation
 from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
-from guiderail.tools.evaluation.rollout import Callback, EnvCallback, PolicyFn, Transition, rollout
+from guiderail.tools.evaluation.episode import Callback, EnvCallback, PolicyFn, Transition
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.run_folder import RunConfig
 
 LABEL_REWARDS: dict[str, float] = {

@@ -2,9 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
+from onnx_file import linear_policy
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import BASE_POLICIES, FORMAT, Policy, chunk_samples, find_base_policy, mean_and_variance
+from guiderail.models.policy import FORMAT, Policy
+from guiderail.tools.environments import check_environment, task_content
+from guiderail.tools.imports import trust_imports
+from guiderail_lerobot.base_policy import BASE_POLICIES, chunk_samples, find_base_policy, mean_and_variance
 
 
 def make_chunk_policy(ensemble=2, points=3, outputs=2, seed=0):
@@ -61,3 +66,54 @@ def test_find_base_policy_returns_a_registered_function(monkeypatch):
     monkeypatch.setattr(BASE_POLICIES, "_origins", {})
     function = BASE_POLICIES.register("rest", lambda observation: np.zeros((1, 2, 6)))
     assert find_base_policy("rest") is function
+
+
+class Script(torch.nn.Module):
+    """Network that returns the first two entries of the observation."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return observation[:, :2]
+
+
+@pytest.fixture
+def base_policies(monkeypatch):
+    monkeypatch.setattr(BASE_POLICIES, "_entries", {})
+    monkeypatch.setattr(BASE_POLICIES, "_origins", {})
+    return BASE_POLICIES
+
+
+def test_base_policy_of_a_file_needs_trust_when_executable(tmp_path, monkeypatch, base_policies):
+    (tmp_path / "policy.onnx").write_bytes(linear_policy(np.zeros((3, 4), np.float32), np.zeros(4, np.float32), 1))
+    torch.jit.trace(Script(), torch.zeros(1, 3)).save(tmp_path / "policy.pt")
+    (tmp_path / "lab_base.py").write_text("raise RuntimeError\n")
+    monkeypatch.chdir(tmp_path)
+    environment = {"guidance": "kgrl_base_policy", "base_policy": "policy.onnx"}
+    resolved = check_environment("NarrowPassage", environment)["base_policy"]
+    assert resolved == str(tmp_path / "policy.onnx")
+    assert chunk_samples(find_base_policy(resolved), np.zeros(3, np.float32), 2).shape == (1, 2, 2)
+    for source in ("policy.pt", "lab_base.py:chunk"):
+        with pytest.raises(InputError, match="give --trust-imports"):
+            check_environment("NarrowPassage", environment | {"base_policy": source})
+    with trust_imports():
+        check_environment("NarrowPassage", environment | {"base_policy": "policy.pt"})
+    assert str(tmp_path / "policy.pt") in base_policies.names()
+
+
+def test_base_policy_of_a_function_is_stored_with_path_and_code(tmp_path, monkeypatch, base_policies):
+    file = tmp_path / "lab_chunk.py"
+    file.write_text("import numpy as np\ndef chunk(observation):\n    return np.zeros((1, 2, 2))\n")
+    monkeypatch.chdir(tmp_path)
+    with trust_imports():
+        environment = check_environment(
+            "NarrowPassage", {"guidance": "kgrl_base_policy", "base_policy": "lab_chunk.py:chunk"}
+        )
+    assert environment["base_policy"] == f"{file}:chunk"
+    before = task_content("NarrowPassage", environment, ())
+    file.write_text(file.read_text().replace("zeros", "ones"))
+    assert task_content("NarrowPassage", environment, ()) != before
+
+
+def test_registration_refuses_an_object_that_is_not_callable():
+    with pytest.raises(InputError, match="registered with a function or a class, not with 3"):
+        BASE_POLICIES.register("lab", 3)
+    assert "lab" not in BASE_POLICIES.names()

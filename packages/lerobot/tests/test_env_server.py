@@ -105,5 +105,6 @@ def test_name_that_is_too_long_is_refused(open_name, message):
 
 
 def test_real_robot_is_refused():
+    pytest.importorskip("guiderail_hardware", reason="needs the station of guiderail-hardware")
     with pytest.raises(InputError, match="real robot"):
         open_environment("BncConnector", {"station": "hardware"})

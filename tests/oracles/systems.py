@@ -1,16 +1,22 @@
-"""Rules that every LeafSystem of the project satisfies, for the tests of the core and of its siblings.
-
-- Each port has a typed and documented getter, and the docstring of the class lists all ports.
-- Outputs declare their prerequisites and depend only on inputs, parameters and discrete state.
-- The source raises only `InputError`, `PolicyError`, `DivergedError` and `AttributeError`.
-"""
+"""Rules that every LeafSystem of the core and of the siblings satisfies; see `tests/systems/test_every_system.py`."""
 
 import ast
 import inspect
 import re
 
+import numpy as np
 from pydrake.common.value import Value
+from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, OutputPort, ValueProducer
+
+EXCEPTIONS = ("InputError", "PolicyError", "DivergedError", "AttributeError")
+
+
+def check_system(system):
+    """Check the ports, their getters and documentation, and the prerequisites of the outputs of a system."""
+    check_getters(system)
+    check_documentation(system)
+    check_prerequisites(system)
 
 
 def classes(path):
@@ -52,8 +58,8 @@ def check_getters(system):
         assert inspect.getdoc(method)
 
 
-def check_documented_ports(system):
-    """Check that the docstring of the class lists the ports of the system."""
+def check_documentation(system):
+    """Check that the docstring of the class lists all ports."""
     (block,) = re.findall(r"\.\. pydrake_system::\n\n((?:    .*\n)+)", inspect.getdoc(type(system)) + "\n")
     assert re.search(r"name: (\w+)", block)[1] == type(system).__name__
     for kind in ("input", "output"):
@@ -66,7 +72,7 @@ def check_documented_ports(system):
 
 
 def check_prerequisites(system):
-    """Check that outputs depend only on declared inputs, parameters and discrete state.
+    """Check that outputs depend only on inputs, parameters and discrete state.
 
     Default prerequisites would cause an evaluation at every plant step and false direct feedthrough.
     """
@@ -94,15 +100,45 @@ def check_prerequisites(system):
 
 
 def check_source(path):
-    """Check that a file gives prerequisites and raises only errors for users."""
+    """Check that a file's outputs and cache entries have prerequisites, and that it raises only `EXCEPTIONS`."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             name = node.func.attr
             if name in ("DeclareVectorOutputPort", "DeclareAbstractOutputPort", "DeclareCacheEntry"):
                 assert "prerequisites_of_calc" in {keyword.arg for keyword in node.keywords}, f"line {node.lineno}"
         if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-            exceptions = ("InputError", "PolicyError", "DivergedError", "AttributeError")
-            assert node.exc.func.id in exceptions, f"line {node.lineno}"
+            assert node.exc.func.id in EXCEPTIONS, f"line {node.lineno}"
 
 
-RULES = (check_getters, check_documented_ports, check_prerequisites)
+def check_start_time(make, inputs, period, steps):
+    """Check that the first output is the same if the simulation starts `steps` control periods later."""
+    expected = _run_six_steps(make, inputs, period, 0.0)
+    assert len(np.unique(expected, axis=0)) > 1
+    np.testing.assert_allclose(_run_six_steps(make, inputs, period, steps * period), expected, rtol=0.0, atol=1e-9)
+
+
+def _run_six_steps(make, inputs, period, start):
+    """Return the first output at the initialization at time `start` and in the middle of six control steps.
+
+    Args:
+        make: Function that returns the system.
+        inputs: Values of the input ports by name.
+        period: Control period [s].
+        start: Start time [s].
+    """
+    system = make()
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    context.SetTime(start)
+    for name, value in inputs.items():
+        system.GetInputPort(name).FixValue(context, value)
+    simulator.Initialize()
+    values = [system.get_output_port(0).Eval(context)]
+    for step in range(6):
+        simulator.AdvanceTo(start + (step + 0.5) * period)
+        values.append(system.get_output_port(0).Eval(context))
+    return values
+
+
+RULES = (check_getters, check_documentation, check_prerequisites)
+"""Checks of one system."""
