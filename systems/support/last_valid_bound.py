@@ -48,13 +48,14 @@ class LastValidBound:
         return numbers if is_valid.all() else np.where(is_valid, numbers, last)
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_wrench.HasValue(context):
-            numbers = np.zeros(MAX_WRENCH_SIZE)
-            # All systems initialize at once, and the port may depend on one that has no start yet. The first evaluation
-            # after the initialization raises all other errors again.
-            with suppress(InputError):
-                numbers = self._numbers(context, numbers)
-            discrete_state.set_value(self._last, numbers)
+        numbers = np.zeros(MAX_WRENCH_SIZE)
+        # All systems initialize at once, and the port may depend on one that has no start yet. The first evaluation
+        # after the initialization raises all other errors again. `HasValue` evaluates the port.
+        with suppress(InputError):
+            if not self._max_wrench.HasValue(context):
+                return
+            numbers = self._numbers(context, numbers)
+        discrete_state.set_value(self._last, numbers)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_wrench.HasValue(context):
