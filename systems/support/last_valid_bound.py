@@ -1,8 +1,11 @@
 """Wrench bound of an impedance that an input port lowers at run time."""
 
+from contextlib import suppress
+
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 
@@ -45,8 +48,14 @@ class LastValidBound:
         return numbers if is_valid.all() else np.where(is_valid, numbers, last)
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._max_wrench.HasValue(context):
-            discrete_state.set_value(self._last, self._numbers(context, np.zeros(MAX_WRENCH_SIZE)))
+        numbers = np.zeros(MAX_WRENCH_SIZE)
+        # All systems initialize at once, and the port may depend on one that has no start yet. The first evaluation
+        # after the initialization raises all other errors again. `HasValue` evaluates the port.
+        with suppress(InputError):
+            if not self._max_wrench.HasValue(context):
+                return
+            numbers = self._numbers(context, numbers)
+        discrete_state.set_value(self._last, numbers)
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._max_wrench.HasValue(context):

@@ -357,7 +357,9 @@ def test_stations_have_the_same_ports():
         HardwareStation(WORKCELL, IiwaDriver(DrakeLcm("memq://"))),
     ]
     # Ports of simulated stations only, and of the hardware station only.
-    one_kind_only = {"query", "body_poses", "fault", "arm_state"} | {f"iiwa.{name}" for name in ALIASES}
+    one_kind_only = {"query", "body_poses", "contact_results", "fault", "arm_state"} | {
+        f"iiwa.{name}" for name in ALIASES
+    }
     for station in stations:
         inputs = {station.get_input_port(i).get_name(): station.get_input_port(i).size() for i in range(2)}
         assert inputs == {"desired_pose": 6, "command_time": 1}
