@@ -29,6 +29,7 @@ from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
+from oracles.prerequisites import changed_outputs
 
 FOLDER = Path(guiderail.systems.__file__).parent
 TESTS = Path(__file__).parent
@@ -207,6 +208,29 @@ def test_output_depends_only_on_declared_prerequisites(system):
                 pending.append(declared[ticket])
             else:
                 assert ticket in sources, f"{entry.description()} depends on ticket {ticket}"
+
+
+def test_outputs_follow_every_source(system):
+    """A missing prerequisite is a stale output after a change of this source on the same context."""
+    stale, _ = changed_outputs(system)
+    assert not stale
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "output"),
+    [
+        ("Residual", "action", "desired_pose"),
+        ("ImageObservation", "image", "observation"),
+        ("CartesianImpedanceController", "max_wrench", "impedance_wrench"),
+        ("PhaseWrenchLimit", "max_wrench", "phase_max_wrench"),
+        ("ReferenceGovernor", "max_wrench", "reference_pose"),
+        ("ActiveConstraintProjector", "parameter 0", "desired_pose"),
+        ("SctInputMapping", "parameter 0", "requested_pose"),
+    ],
+)
+def test_changes_of_sources_have_an_effect(system_by_name, name, source, output):
+    """Without an effect, the comparison above could not notice a missing prerequisite."""
+    assert (source, output) in changed_outputs(system_by_name[name])[1]
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)
