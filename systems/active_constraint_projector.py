@@ -90,7 +90,11 @@ class ActiveConstraintProjector(LeafSystem):
         )
         declare.part_output(self, "desired_pose", self._command, lambda command: command[:6], 6)
         declare.output(
-            self, "last_desired_pose", 6, lambda context: declare.initialized(self, context, self._last)[:6], [self._last]
+            self,
+            "last_desired_pose",
+            6,
+            lambda context: declare.initialized(self, context, self._last)[:6],
+            [self._last],
         )
         declare.part_output(self, "fallback", self._command, lambda command: command[6])
         declare.scalar_output(self, "commanded_violation", self._commanded_violation, [self._command, *constraints])

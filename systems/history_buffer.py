@@ -17,15 +17,15 @@ class HistoryBuffer(LeafSystem):
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
     At every control step, the newest output replaces the oldest. An initialization fills all P entries with
-    ``initial_output`` if this port is connected, otherwise with ``output``. If ``output`` is a command, connect the
-    measured pose to ``initial_output``.
+    ``initial_output``, the measured pose if ``output`` is a command. A history of measured outputs has the same signal
+    at both ports.
 
     .. pydrake_system::
 
         name: HistoryBuffer
         input_ports:
         - output
-        - initial_output (optional)
+        - initial_output
         output_ports:
         - history
 
@@ -39,7 +39,7 @@ class HistoryBuffer(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If an argument is out of range; at initialization, if the output that fills the history is not
+        InputError: If an argument is out of range; at initialization, if ``initial_output`` is not connected or not
             finite.
     """
 
@@ -63,12 +63,16 @@ class HistoryBuffer(LeafSystem):
         declare.update_after_start(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
-    get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,); optional")
+    get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,)")
     get_history_output_port = output_getter("history", "last P outputs, (P*O,), oldest first")
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
-        has_initial = self._initial_output_port.HasValue(context)
-        initial = (self._initial_output_port if has_initial else self._output_port).Eval(context)
+        if not self._initial_output_port.HasValue(context):
+            raise InputError(
+                "a history begins at its input 'initial_output': connect the measured pose, because the motion would "
+                "begin elsewhere"
+            )
+        initial = self._initial_output_port.Eval(context)
         if not is_finite(initial):
             raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
         discrete_state.set_value(self._state, np.tile(initial, self._shape[0]))

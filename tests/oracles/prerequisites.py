@@ -76,8 +76,11 @@ def _sources(
         yield port.get_name(), lambda port=port: _fix(system, port, context, rng, samplers)
     for i in range(context.num_numeric_parameter_groups()):
         default = system.CreateDefaultContext().get_numeric_parameter(i).CopyToVector()
-        yield f"parameter {i}", lambda i=i, default=default: context.get_mutable_numeric_parameter(i).SetFromVector(
-            default + rng.uniform(0.0, 0.3, default.size)
+        yield (
+            f"parameter {i}",
+            lambda i=i, default=default: context.get_mutable_numeric_parameter(i).SetFromVector(
+                default + rng.uniform(0.0, 0.3, default.size)
+            ),
         )
     for i in range(context.num_discrete_state_groups()):
         size = context.get_discrete_state(i).size()

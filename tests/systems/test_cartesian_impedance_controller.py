@@ -538,3 +538,14 @@ def _axis_angle(axis, angle):
 
 def _random_rotation(rng):
     return Rotation.random(random_state=rng.integers(1 << 30)).as_matrix()
+
+
+def test_gains_are_copies_that_cannot_be_written_to():
+    limits, posture = [10.0] * 6, np.zeros(7)
+    gains = ImpedanceGains(np.eye(6), limits, posture)
+    posture[:] = 1.0
+    assert gains.wrench_limits.shape == (6,)
+    assert not gains.posture.any()
+    for array in (gains.stiffness, gains.wrench_limits, gains.posture):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 2.0

@@ -25,6 +25,7 @@ def test_history_of_length_one_is_the_last_output():
     system = HistoryBuffer(1, 1, 0.1)
     simulator = Simulator(system)
     port = system.get_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
+    system.get_initial_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
     simulator.Initialize()
     assert system.get_history_output_port().Eval(simulator.get_context()) == [3.0]
     port.GetMutableData().set_value([4.0])
@@ -53,12 +54,17 @@ def test_buffer_has_no_direct_feedthrough(system):
     assert not system.HasAnyDirectFeedthrough()
 
 
-def test_history_is_filled_with_the_output_at_initialization(system):
+def test_initialization_without_initial_output_is_refused(system):
     simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_output_input_port().FixValue(context, [1.0, -2.0])
-    simulator.Initialize()
-    np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
+    system.get_output_input_port().FixValue(simulator.get_mutable_context(), [1.0, -2.0])
+    with pytest.raises(InputError, match="connect the measured pose"):
+        simulator.Initialize()
+
+
+def test_history_without_initialization_is_refused(system):
+    context = system.CreateDefaultContext()
+    with pytest.raises(InputError, match=r"call Simulator\.Initialize\(\)"):
+        history(system, context)
 
 
 @pytest.mark.parametrize("period", ["0.1", None, [0.1]])
@@ -67,7 +73,7 @@ def test_period_must_be_a_number(period):
         HistoryBuffer(1, 1, period)
 
 
-@pytest.mark.parametrize("inputs", [{"output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
+@pytest.mark.parametrize("inputs", [{"initial_output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
 def test_output_that_fills_the_history_must_be_finite(system, inputs):
     simulator = Simulator(system)
     for name, value in inputs.items():
@@ -76,7 +82,7 @@ def test_output_that_fills_the_history_must_be_finite(system, inputs):
         simulator.Initialize()
 
 
-def test_history_is_filled_with_initial_output_if_connected(system):
+def test_history_is_filled_with_initial_output(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_output_input_port().FixValue(context, [1.0, -2.0])
@@ -91,6 +97,7 @@ def test_newest_output_replaces_the_oldest(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     port = system.get_output_input_port().FixValue(context, [0.0, 0.0])
+    system.get_initial_output_input_port().FixValue(context, [0.0, 0.0])
     simulator.Initialize()
     for k in range(1, 5):
         port.GetMutableData().set_value([k, -k])
@@ -104,6 +111,7 @@ def test_each_command_is_stored_exactly_once(period):
     counter = builder.AddSystem(Counter(period))
     buffer = builder.AddSystem(HistoryBuffer(1, 2, period))
     builder.Connect(counter.get_output_port(), buffer.get_output_input_port())
+    builder.Connect(counter.get_output_port(), buffer.get_initial_output_input_port())
     simulator = Simulator(builder.Build())
     context = buffer.GetMyContextFromRoot(simulator.get_context())
     simulator.Initialize()
@@ -117,7 +125,8 @@ def test_initialization_fills_the_history_again(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     pristine = system.CreateDefaultContext()
-    port = system.get_output_input_port().FixValue(context, [1.0, 1.0])
+    system.get_output_input_port().FixValue(context, [1.0, 1.0])
+    port = system.get_initial_output_input_port().FixValue(context, [1.0, 1.0])
     simulator.Initialize()
     simulator.AdvanceTo(1.05)
     context.SetTimeStateAndParametersFrom(pristine)

@@ -10,13 +10,14 @@ from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail_lerobot.chunk_guard import ChunkGuard
+from guiderail_lerobot.chunk_safety_limiter import ChunkSafetyLimiter
 
 PERIOD = 0.02
 BOX = LinearConstraints.box([-1.0], [1.0])
 
 
 def chunk_limiter():
-    return systems.ChunkSafetyLimiter(ChunkGuard(BOX, [1.0], [90.0], period=PERIOD, start=[0.0]), 8, 3, PERIOD)
+    return ChunkSafetyLimiter(ChunkGuard(BOX, [1.0], [90.0], period=PERIOD, start=[0.0]), 8, 3, PERIOD)
 
 
 def command_filter():
