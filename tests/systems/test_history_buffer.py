@@ -146,3 +146,27 @@ def test_constructor_refuses_arguments_out_of_range(arguments):
 def test_input_of_another_size_is_refused(system):
     with pytest.raises(Exception, match="size"):
         system.get_output_input_port().FixValue(system.CreateDefaultContext(), [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_angles_of_a_history_have_no_full_turn_jumps(seed):
+    """Poses of a motion of several turns are measured within ±π, and the history follows the motion."""
+    rng = np.random.default_rng(seed)
+    near = rng.uniform(-7.0, 7.0, 6)
+    buffer = HistoryBuffer(6, 4, 0.1, near)
+    simulator = Simulator(buffer)
+    context = simulator.get_mutable_context()
+    motion = near + rng.uniform(-3.0, 3.0, 6) + np.linspace(0.0, 1.0, 40)[:, None] * rng.uniform(-15.0, 15.0, 6)
+    measured = np.column_stack([motion[:, :3], np.remainder(motion[:, 3:] + np.pi, 2 * np.pi) - np.pi])
+    buffer.get_initial_output_input_port().FixValue(context, measured[0])
+    port = buffer.get_output_input_port().FixValue(context, measured[0])
+    simulator.Initialize()
+    for k, pose in enumerate(measured[1:], 1):
+        port.GetMutableData().set_value(pose)
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        np.testing.assert_allclose(buffer.get_history_output_port().Eval(context)[-6:], motion[k], atol=1e-9)
+
+
+def test_near_is_refused_for_other_outputs():
+    with pytest.raises(InputError, match="leave it out"):
+        HistoryBuffer(2, 3, 0.1, np.zeros(2))

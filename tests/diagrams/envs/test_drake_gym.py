@@ -55,8 +55,8 @@ def test_first_command_is_that_of_diagram_env(env):
         np.testing.assert_array_equal(command, first_command(env))
 
 
-def test_reset_without_initialization_is_refused(env):
+def test_step_without_initialization_is_refused(env):
     drake = drake_env(env, lambda simulator, context, seed: None)
+    drake.reset(seed=0)  # does not evaluate the command
     with pytest.raises(InputError, match=r"call Simulator\.Initialize\(\)"):
-        drake.reset(seed=0)
         drake.step(np.zeros(drake.action_space.shape))
