@@ -2,9 +2,12 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory
 from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
 class Counter(LeafSystem):
@@ -170,3 +173,30 @@ def test_angles_of_a_history_have_no_full_turn_jumps(seed):
 def test_near_is_refused_for_other_outputs():
     with pytest.raises(InputError, match="leave it out"):
         HistoryBuffer(2, 3, 0.1, np.zeros(2))
+
+
+def test_first_commands_start_at_the_measured_angle_beyond_pi():
+    """The demonstrations are at Rx = +3.14, and the start is measured at −3.12, 23 mrad away."""
+    rng, s = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)
+    sway = 0.02 * rng.standard_normal(5)
+    outputs = [np.column_stack([0.1 * s, a * s, 0 * s, 0 * s, 0 * s, 3.14 + a * np.sin(s)]) for a in sway]
+    reference = ReferenceTrajectory.from_demonstrations(
+        Demonstrations(0.02 * np.arange(60), outputs), components=3, floor=0.002, num_steps=60
+    )
+    builder = DiagramBuilder()
+    kmp = builder.AddSystem(LcNsKmpSystem(LcNsKmp(reference, history=5, horizon=8), None, 0.02))
+    buffer = builder.AddSystem(HistoryBuffer(6, 5, 0.02, reference.means[0]))
+    action = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
+    pose = builder.AddSystem(ConstantVectorSource([0.0, 0.0, 0.0, 0.0, 0.0, -3.12]))
+    builder.Connect(action.get_output_port(), kmp.get_null_space_action_input_port())
+    builder.Connect(pose.get_output_port(), buffer.get_initial_output_input_port())
+    builder.Connect(kmp.get_command_output_port(), buffer.get_output_input_port())
+    builder.Connect(buffer.get_history_output_port(), kmp.get_history_input_port())
+    simulator = Simulator(builder.Build())
+    context = kmp.GetMyContextFromRoot(simulator.get_context())
+    last = 2 * np.pi - 3.12
+    for step in range(10):
+        simulator.AdvanceTo((step + 0.5) * 0.02)
+        angle = kmp.get_command_output_port().Eval(context)[5]
+        assert abs(angle - last) < 0.02
+        last = angle
