@@ -3,8 +3,9 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import is_finite
+from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives.full_turns import continued_angles
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
@@ -17,15 +18,15 @@ class HistoryBuffer(LeafSystem):
         history = [y_{t−P} … y_{t−1}]    (T_p of equation 5.3)
 
     At every control step, the newest output replaces the oldest. An initialization fills all P entries with
-    ``initial_output`` if this port is connected, otherwise with ``output``. If ``output`` is a command, connect the
-    measured pose to ``initial_output``.
+    ``initial_output``, the measured pose if ``output`` is a command. A history of measured outputs has the same signal
+    at both ports.
 
     .. pydrake_system::
 
         name: HistoryBuffer
         input_ports:
         - output
-        - initial_output (optional)
+        - initial_output
         output_ports:
         - history
 
@@ -37,18 +38,24 @@ class HistoryBuffer(LeafSystem):
         num_outputs: Size O of an output, at least 1.
         length: Number P of stored outputs, at least 1; P·O is at most a million.
         period: Control period [s], positive.
+        near: Pose (6,), [x y z Rz Ry Rx], such as the first mean of the reference; None: outputs are stored unchanged.
+            With it, the angles of the first output are on the full turn nearest to `near`, and those of each output on
+            the full turn nearest to the output before, so that the history has no jump at ±π.
 
     Raises:
-        InputError: If an argument is out of range; at initialization, if the output that fills the history is not
+        InputError: If an argument is out of range; at initialization, if ``initial_output`` is not connected or not
             finite.
     """
 
-    def __init__(self, num_outputs: int, length: int, period: float):
+    def __init__(self, num_outputs: int, length: int, period: float, near: np.ndarray | None = None):
         super().__init__()
         num_outputs, length = as_count(num_outputs, "num_outputs of a history"), as_count(length, "length of a history")
         if length * num_outputs > MAX_NUMBERS:
             raise InputError(f"a history has at most {MAX_NUMBERS} numbers, not {length} times {num_outputs}")
         self._shape = (length, num_outputs)
+        self._near = None if near is None else as_numbers(near, "near")
+        if self._near is not None and not (num_outputs == 6 and self._near.shape == (6,) and is_finite(self._near)):
+            raise InputError("near is a finite pose (6,) of a history with 6 outputs: leave it out for other outputs")
 
         self._output_port = self.DeclareVectorInputPort("output", num_outputs)
         self._initial_output_port = self.DeclareVectorInputPort("initial_output", num_outputs)
@@ -63,16 +70,27 @@ class HistoryBuffer(LeafSystem):
         declare.update_after_start(self, period, self._shift, self._fill)
 
     get_output_input_port = input_getter("output", "output to store, (O,)")
-    get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,); optional")
+    get_initial_output_input_port = input_getter("initial_output", "output that fills the history, (O,)")
     get_history_output_port = output_getter("history", "last P outputs, (P*O,), oldest first")
 
     def _fill(self, context: Context, discrete_state: DiscreteValues) -> None:
-        has_initial = self._initial_output_port.HasValue(context)
-        initial = (self._initial_output_port if has_initial else self._output_port).Eval(context)
+        if not self._initial_output_port.HasValue(context):
+            raise InputError(
+                "a history begins at its input 'initial_output': connect the measured pose, because the motion would "
+                "begin elsewhere"
+            )
+        initial = self._initial_output_port.Eval(context)
         if not is_finite(initial):
             raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
-        discrete_state.set_value(self._state, np.tile(initial, self._shape[0]))
+        discrete_state.set_value(self._state, np.tile(self._continued(initial, self._near), self._shape[0]))
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        remaining = declare.initialized(self, context, self._state)[self._shape[1] :]
-        discrete_state.set_value(self._state, np.concatenate([remaining, self._output_port.Eval(context)]))
+        stored, size = declare.initialized(self, context, self._state), self._shape[1]
+        newest = self._continued(self._output_port.Eval(context), stored[-size:])
+        discrete_state.set_value(self._state, np.concatenate([stored[size:], newest]))
+
+    def _continued(self, output: np.ndarray, last: np.ndarray | None) -> np.ndarray:
+        """Return the output with its angles on the full turns nearest to those of `last`."""
+        if self._near is None or last is None:
+            return output
+        return np.concatenate([output[:3], continued_angles(output[None, 3:], last[3:])[0]])

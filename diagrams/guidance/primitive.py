@@ -220,7 +220,8 @@ class SkgrlGuidance(PrimitiveGuidance):
             builder.ConnectInput("wrench", schedule.get_wrench_input_port())
             builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
         # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
-        history = HistoryBuffer(config.num_outputs, config.history, config.control_period)
+        near = primitive.reference.means[0] if config.num_outputs == 6 else None  # a pose, with angles
+        history = HistoryBuffer(config.num_outputs, config.history, config.control_period, near)
         add_system(builder, "history", history, initial_output=pose)
         command, fallback = self._constrain(builder, config, kmp, pose)
         past = command if config.history_source == "commanded" else pose

@@ -1,5 +1,6 @@
 from .diagrams.envs.assemble import build_skill_diagram as build_skill_diagram
 from .diagrams.envs.assemble import build_task_diagram as build_task_diagram
+from .diagrams.envs.drake_gym import drake_gym_reset as drake_gym_reset
 from .diagrams.envs.env import DiagramEnv as DiagramEnv
 from .diagrams.envs.make import make_env as make_env
 from .diagrams.envs.make import make_skill as make_skill

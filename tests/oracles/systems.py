@@ -9,6 +9,8 @@ from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, OutputPort, ValueProducer
 
+from oracles.prerequisites import changed_outputs
+
 EXCEPTIONS = ("InputError", "PolicyError", "DivergedError", "AttributeError")
 
 
@@ -140,5 +142,11 @@ def _run_six_steps(make, inputs, period, start):
     return values
 
 
-RULES = (check_getters, check_documentation, check_prerequisites)
+def check_stale_outputs(system):
+    """Check that no output is stale after a change of any input, parameter or state on the same context."""
+    stale, _ = changed_outputs(system)
+    assert not stale
+
+
+RULES = (check_getters, check_documentation, check_prerequisites, check_stale_outputs)
 """Checks of one system."""

@@ -599,3 +599,14 @@ def test_center_of_a_payload_is_relative_to_the_tool_center():
 def test_payload_is_refused_when_out_of_range(arguments):
     with pytest.raises(InputError, match="payload"):
         Payload(*arguments)
+
+
+def test_gains_are_copies_that_cannot_be_written_to():
+    limits, posture = [10.0] * 6, np.zeros(7)
+    gains = ImpedanceGains(np.eye(6), limits, posture)
+    posture[:] = 1.0
+    assert gains.wrench_limits.shape == (6,)
+    assert not gains.posture.any()
+    for array in (gains.stiffness, gains.wrench_limits, gains.posture):
+        with pytest.raises(ValueError, match="read-only"):
+            array[...] = 2.0

@@ -24,6 +24,7 @@ from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
+from oracles.prerequisites import changed_outputs
 from oracles.systems import RULES, check_source, classes, system_names
 
 FOLDER = Path(guiderail.systems.__file__).parent
@@ -138,6 +139,23 @@ def test_these_tests_cover_every_system(system_by_name):
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
 def test_system_satisfies_the_rules(rule, system):
     rule(system)
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "output"),
+    [
+        ("Residual", "action", "desired_pose"),
+        ("ImageObservation", "image", "observation"),
+        ("CartesianImpedanceController", "max_wrench", "impedance_wrench"),
+        ("PhaseWrenchLimit", "max_wrench", "phase_max_wrench"),
+        ("ReferenceGovernor", "max_wrench", "reference_pose"),
+        ("ActiveConstraintProjector", "frame_poses", "desired_pose"),
+        ("SctInputMapping", "frame_poses", "requested_pose"),
+    ],
+)
+def test_changes_of_sources_have_an_effect(system_by_name, name, source, output):
+    """Without an effect, the comparison above could not notice a missing prerequisite."""
+    assert (source, output) in changed_outputs(system_by_name[name])[1]
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)

@@ -2,9 +2,12 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
+from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory
 from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
 class Counter(LeafSystem):
@@ -25,6 +28,7 @@ def test_history_of_length_one_is_the_last_output():
     system = HistoryBuffer(1, 1, 0.1)
     simulator = Simulator(system)
     port = system.get_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
+    system.get_initial_output_input_port().FixValue(simulator.get_mutable_context(), [3.0])
     simulator.Initialize()
     assert system.get_history_output_port().Eval(simulator.get_context()) == [3.0]
     port.GetMutableData().set_value([4.0])
@@ -53,12 +57,17 @@ def test_buffer_has_no_direct_feedthrough(system):
     assert not system.HasAnyDirectFeedthrough()
 
 
-def test_history_is_filled_with_the_output_at_initialization(system):
+def test_initialization_without_initial_output_is_refused(system):
     simulator = Simulator(system)
-    context = simulator.get_mutable_context()
-    system.get_output_input_port().FixValue(context, [1.0, -2.0])
-    simulator.Initialize()
-    np.testing.assert_array_equal(history(system, context), [[1.0, -2.0]] * 3)
+    system.get_output_input_port().FixValue(simulator.get_mutable_context(), [1.0, -2.0])
+    with pytest.raises(InputError, match="connect the measured pose"):
+        simulator.Initialize()
+
+
+def test_history_without_initialization_is_refused(system):
+    context = system.CreateDefaultContext()
+    with pytest.raises(InputError, match=r"call Simulator\.Initialize\(\)"):
+        history(system, context)
 
 
 @pytest.mark.parametrize("period", ["0.1", None, [0.1]])
@@ -67,7 +76,7 @@ def test_period_must_be_a_number(period):
         HistoryBuffer(1, 1, period)
 
 
-@pytest.mark.parametrize("inputs", [{"output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
+@pytest.mark.parametrize("inputs", [{"initial_output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
 def test_output_that_fills_the_history_must_be_finite(system, inputs):
     simulator = Simulator(system)
     for name, value in inputs.items():
@@ -76,7 +85,7 @@ def test_output_that_fills_the_history_must_be_finite(system, inputs):
         simulator.Initialize()
 
 
-def test_history_is_filled_with_initial_output_if_connected(system):
+def test_history_is_filled_with_initial_output(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     system.get_output_input_port().FixValue(context, [1.0, -2.0])
@@ -91,6 +100,7 @@ def test_newest_output_replaces_the_oldest(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     port = system.get_output_input_port().FixValue(context, [0.0, 0.0])
+    system.get_initial_output_input_port().FixValue(context, [0.0, 0.0])
     simulator.Initialize()
     for k in range(1, 5):
         port.GetMutableData().set_value([k, -k])
@@ -104,6 +114,7 @@ def test_each_command_is_stored_exactly_once(period):
     counter = builder.AddSystem(Counter(period))
     buffer = builder.AddSystem(HistoryBuffer(1, 2, period))
     builder.Connect(counter.get_output_port(), buffer.get_output_input_port())
+    builder.Connect(counter.get_output_port(), buffer.get_initial_output_input_port())
     simulator = Simulator(builder.Build())
     context = buffer.GetMyContextFromRoot(simulator.get_context())
     simulator.Initialize()
@@ -117,7 +128,8 @@ def test_initialization_fills_the_history_again(system):
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     pristine = system.CreateDefaultContext()
-    port = system.get_output_input_port().FixValue(context, [1.0, 1.0])
+    system.get_output_input_port().FixValue(context, [1.0, 1.0])
+    port = system.get_initial_output_input_port().FixValue(context, [1.0, 1.0])
     simulator.Initialize()
     simulator.AdvanceTo(1.05)
     context.SetTimeStateAndParametersFrom(pristine)
@@ -137,3 +149,54 @@ def test_constructor_refuses_arguments_out_of_range(arguments):
 def test_input_of_another_size_is_refused(system):
     with pytest.raises(Exception, match="size"):
         system.get_output_input_port().FixValue(system.CreateDefaultContext(), [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_angles_of_a_history_have_no_full_turn_jumps(seed):
+    """Poses of a motion of several turns are measured within ±π, and the history follows the motion."""
+    rng = np.random.default_rng(seed)
+    near = rng.uniform(-7.0, 7.0, 6)
+    buffer = HistoryBuffer(6, 4, 0.1, near)
+    simulator = Simulator(buffer)
+    context = simulator.get_mutable_context()
+    motion = near + rng.uniform(-3.0, 3.0, 6) + np.linspace(0.0, 1.0, 40)[:, None] * rng.uniform(-15.0, 15.0, 6)
+    measured = np.column_stack([motion[:, :3], np.remainder(motion[:, 3:] + np.pi, 2 * np.pi) - np.pi])
+    buffer.get_initial_output_input_port().FixValue(context, measured[0])
+    port = buffer.get_output_input_port().FixValue(context, measured[0])
+    simulator.Initialize()
+    for k, pose in enumerate(measured[1:], 1):
+        port.GetMutableData().set_value(pose)
+        simulator.AdvanceTo(0.1 * k + 0.05)
+        np.testing.assert_allclose(buffer.get_history_output_port().Eval(context)[-6:], motion[k], atol=1e-9)
+
+
+def test_near_is_refused_for_other_outputs():
+    with pytest.raises(InputError, match="leave it out"):
+        HistoryBuffer(2, 3, 0.1, np.zeros(2))
+
+
+def test_first_commands_start_at_the_measured_angle_beyond_pi():
+    """The demonstrations are at Rx = +3.14, and the start is measured at −3.12, 23 mrad away."""
+    rng, s = np.random.default_rng(0), np.linspace(0.0, 1.0, 60)
+    sway = 0.02 * rng.standard_normal(5)
+    outputs = [np.column_stack([0.1 * s, a * s, 0 * s, 0 * s, 0 * s, 3.14 + a * np.sin(s)]) for a in sway]
+    reference = ReferenceTrajectory.from_demonstrations(
+        Demonstrations(0.02 * np.arange(60), outputs), components=3, floor=0.002, num_steps=60
+    )
+    builder = DiagramBuilder()
+    kmp = builder.AddSystem(LcNsKmpSystem(LcNsKmp(reference, history=5, horizon=8), None, 0.02))
+    buffer = builder.AddSystem(HistoryBuffer(6, 5, 0.02, reference.means[0]))
+    action = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
+    pose = builder.AddSystem(ConstantVectorSource([0.0, 0.0, 0.0, 0.0, 0.0, -3.12]))
+    builder.Connect(action.get_output_port(), kmp.get_null_space_action_input_port())
+    builder.Connect(pose.get_output_port(), buffer.get_initial_output_input_port())
+    builder.Connect(kmp.get_command_output_port(), buffer.get_output_input_port())
+    builder.Connect(buffer.get_history_output_port(), kmp.get_history_input_port())
+    simulator = Simulator(builder.Build())
+    context = kmp.GetMyContextFromRoot(simulator.get_context())
+    last = 2 * np.pi - 3.12
+    for step in range(10):
+        simulator.AdvanceTo((step + 0.5) * 0.02)
+        angle = kmp.get_command_output_port().Eval(context)[5]
+        assert abs(angle - last) < 0.02
+        last = angle

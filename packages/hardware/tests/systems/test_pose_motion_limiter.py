@@ -10,6 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail_hardware.systems import pose_motion_limiter
 from guiderail_hardware.systems.pose_motion_limiter import PoseMotionLimiter
 from oracles.franka import FRANKA_LIMITS
+from oracles.prerequisites import changed_outputs
 
 PERIOD = 0.005
 START = np.array([0.5, 0.0, 0.5, 0.3, 0.1, 3.0])
@@ -218,3 +219,9 @@ def test_measured_pose_is_ignored_when_it_is_not_finite(number):
     loop.context.SetTime(0.0)
     with pytest.raises(InputError, match="measured pose must be finite"):
         loop.simulator.Initialize()
+
+
+def test_output_follows_every_source():
+    stale, effects = changed_outputs(PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD))
+    assert not stale
+    assert ("blend_factor", "limited_pose") in effects
