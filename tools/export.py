@@ -23,6 +23,7 @@ from guiderail.tools.pretrained import find_run
 
 WRENCH_NAMES = ("Fx [N]", "Fy [N]", "Fz [N]", "Mx [Nm]", "My [Nm]", "Mz [Nm]")
 NAMES = {"time": ("time [s]",), "phase": ("phase",), "wrench": WRENCH_NAMES}
+NAMES["center_of_pressure"] = ("center of pressure x [m]", "center of pressure y [m]")
 NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in ("pose", "desired_pose")}
 """Names of a signal's entries with their units; entries of another signal are numbered."""
 GUIDED = ("kgrl", "skgrl")  # guidance whose data can be exported
@@ -59,7 +60,9 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     resolved = EnvConfig.resolve(config.task, config.environment)
     task, prior = resolved.make_task(), make_prior_knowledge(resolved)
     primitive_config = prior.demonstrations
-    skill["observation"] = _observation(task.observation_terms(), task.clip)
+    skill["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size)
+    if len(skill["observation"]) != math.prod(policy.description["observation_shape"]):
+        raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")
     assert primitive_config is not None
     if primitive_config.motion is not None or primitive_config.progress is not None:
         raise InputError("constraints of the motion and progress=state cannot be exported: train without them")
@@ -83,7 +86,7 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     skill["control_period_s"] = prior.period
     low, high = (policy.description[f"action_{end}"] for end in ("low", "high"))
     skill["action"] = [
-        {"name": f"null-space action of {POSE_NAMES[output] if prior.pose_size == 6 else output}", "output": output,
+        {"name": f"null-space action of {POSE_NAMES[output]}", "output": output,
          "low": low[i], "high": high[i]}
         for i, output in enumerate(moved)
     ]  # fmt: skip
@@ -98,13 +101,14 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _observation(terms: Any, clip: float) -> list[dict[str, Any]]:
+def _observation(terms: Any, clip: float, pose_size: int) -> list[dict[str, Any]]:
     """Return the entries of the observation, each clip((value − center) / scale)."""
     if not isinstance(terms, Sequence):
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     entries = []
     for term in terms:
         names: Sequence[str] = NAMES.get(term.signal, ())
+        names = names[:pose_size] if "pose" in term.signal else names
         size = max(np.size(term.center), np.size(term.scale), len(names) if term.entries is None else 1)
         indices = range(size) if term.entries is None else term.entries
         centers, scales = (np.broadcast_to(values, len(indices)) for values in (term.center, term.scale))

@@ -1,6 +1,7 @@
 """Export of skills: the ONNX file computes the policy's actions, and a loop without an environment its commands."""
 
 import json
+from itertools import pairwise
 
 import numpy as np
 import onnxruntime
@@ -29,7 +30,7 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
     rng = np.random.default_rng(seed)
     layers = [
         (rng.normal(size=(after, before)).astype(np.float32), rng.normal(size=after).astype(np.float32))
-        for before, after in zip(sizes[:-1], sizes[1:], strict=True)
+        for before, after in pairwise(sizes)
     ]
     low = rng.normal(size=sizes[-1])
     description = {
@@ -43,7 +44,7 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
         np.testing.assert_allclose(action[0], policy(observation), rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["connector", "clamp", "passage"])
+@pytest.mark.parametrize("name", ["connector", "passage"])
 def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
     export_skill(f"pretrained:{name}", tmp_path / "skill")
     skill = json.loads((tmp_path / "skill/skill.json").read_text())
@@ -71,7 +72,7 @@ def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
         null_space_action[outputs] = row[0]
         commands = [stepper.step(null_space_action).output for _ in range(skill["action_repeat"])]
         observation, _, terminated, truncated, _ = env.step(row[0])
-        assert not (terminated or truncated)
+        assert (terminated, truncated) == (False, False)
         np.testing.assert_allclose(env.unwrapped.trace.commanded[-len(commands) :], commands, atol=1e-6)
     env.close()
 
