@@ -314,7 +314,9 @@ def register_environment(env: gymnasium.Env) -> str:
     """Register an environment that is given as an object with Gymnasium, for this process; return its id."""
     kind = re.sub(r"\W", "", type(env.unwrapped).__name__) or "Environment"
     name = f"given/{kind}-v{sum(known.startswith(f'given/{kind}-v') for known in gymnasium.registry)}"
-    gymnasium.register(name, entry_point=lambda: _KeptOpen(env), disable_env_checker=True, order_enforce=False)
+    gymnasium.register(
+        name, entry_point=cast(Any, lambda: _KeptOpen(env)), disable_env_checker=True, order_enforce=False
+    )
     return name
 
 
@@ -322,7 +324,7 @@ def register_environment(env: gymnasium.Env) -> str:
 class OtherTask:
     """What training needs to know about an environment of another package."""
 
-    observation_space: gymnasium.Space  # observations
+    observation_space: gymnasium.Space[Any]  # observations
     num_steps: int  # largest number of actions in an episode
     symmetry: None = None  # no symmetry is known
     near_symmetry: None = None

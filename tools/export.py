@@ -128,7 +128,9 @@ def policy_to_onnx(policy: Policy) -> bytes:
     layers, description = policy.layers, policy.description
     if len(description["observation_shape"]) != 1 or "image_shape" in description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
-    nodes, tensors, value = [], {}, "observation"
+    nodes: list[tuple[str, Sequence[str], str]] = []
+    tensors: dict[str, np.ndarray] = {}
+    value = "observation"
     for index, (weight, bias) in enumerate(layers):
         tensors |= {f"weight_{index}": weight.T.copy(), f"bias_{index}": bias}
         nodes.append(("MatMul", (value, f"weight_{index}"), f"product_{index}"))
@@ -138,7 +140,7 @@ def policy_to_onnx(policy: Policy) -> bytes:
             break
         if description["activation"] == "normalized_relu":
             tensors["epsilon"] = np.array([1e-5], np.float32)
-            steps = (
+            steps: Sequence[tuple[str, Sequence[str], str]] = (
                 ("ReduceMean", (value,), "mean"), ("Sub", (value, f"mean_{index}"), "centered"),
                 ("Mul", (f"centered_{index}",) * 2, "squared"), ("ReduceMean", (f"squared_{index}",), "variance"),
                 ("Add", (f"variance_{index}", "epsilon"), "shifted"), ("Sqrt", (f"shifted_{index}",), "deviation"),

@@ -61,9 +61,10 @@ def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
     policy = Policy.load(find_run(f"pretrained:{name}"))
     observation, _ = env.reset(seed=1_000_000)
     assert len(skill["observation"]) == len(observation)
-    stepper = primitive.start(
-        env.unwrapped.trace.start if hasattr(env.unwrapped.trace, "start") else None, data["gains"]
-    )
+    simulator = env.unwrapped.simulator
+    station = simulator.get_system().GetSubsystemByName("station")
+    pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
+    stepper = primitive.start(pose, data["gains"])
     outputs = [entry["output"] for entry in skill["action"]]
     for _ in range(3):
         (row,) = session.run(None, {"observation": observation[None].astype(np.float32)})
