@@ -322,7 +322,7 @@ def register_environment(env: gymnasium.Env) -> str:
 
 @dataclass(frozen=True)
 class OtherTask:
-    """What training needs to know about an environment of another package."""
+    """Properties of an environment of another package that training uses."""
 
     observation_space: gymnasium.Space[Any]  # observations
     num_steps: int  # largest number of actions in an episode
