@@ -298,7 +298,7 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     """
     threadpool_limits(1)
     arguments = check_environment(task, arguments)
-    if render_mode is not None:
+    if render_mode is not None or environment_id(task) != task:  # others may not have the argument
         arguments = {**arguments, "render_mode": render_mode}
     return gymnasium.make(environment_id(task), disable_env_checker=True, **arguments)
 
