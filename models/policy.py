@@ -67,6 +67,11 @@ class Policy:
             raise ValueError("a description needs observation_shape, action_low and action_high, as numbers") from error
         self._check()
 
+    @property
+    def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Weight (out, in) and bias (out,) of each layer, first to last."""
+        return list(self._layers)
+
     def _check(self) -> None:
         """Raise a ValueError if description and layers are inconsistent."""
         image = self._image_shape

@@ -286,7 +286,7 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
         InputError: If the task or an argument is unknown, or options are incompatible.
     """
     arguments = check_environment(task, arguments)
-    if render_mode is not None:
+    if render_mode is not None or environment_id(task) != task:  # others may not have the argument
         arguments = {**arguments, "render_mode": render_mode}
     return gymnasium.make(environment_id(task), disable_env_checker=True, **arguments)
 
@@ -312,7 +312,7 @@ def register_environment(env: gymnasium.Env) -> str:
 
 @dataclass(frozen=True)
 class OtherTask:
-    """What training needs to know about an environment of another package."""
+    """Properties of an environment of another package that training uses."""
 
     observation_space: gymnasium.Space[Any]  # observations
     num_steps: int  # largest number of actions in an episode

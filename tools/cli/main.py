@@ -23,6 +23,7 @@ COMMANDS = {
     "visualize": ("visualize",),
     "template": ("template",),
     "list": ("list",),
+    "export": ("export",),
 }
 """Names of the commands that each module of this package registers."""
 ENVIRONMENT_OPTIONS = (

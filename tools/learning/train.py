@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import pandas as pd
 
-from guiderail.diagrams.tasks.registry import is_task_folder
+from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
@@ -43,6 +43,9 @@ SUMMARY = (
     "episodes", "episodes_to_convergence", "success_rate", "success_rate_last_10", "mean_return_last_10",
     "max_commanded_violation", "peak_force", "collisions", "wall_time",
 )  # fmt: skip
+
+# Statistics that an environment of another package may lack, by their column.
+_OF_TASKS = {"max_commanded_violation", "peak_force", "collisions"}
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -82,8 +85,10 @@ class Run:
     def summary(self) -> dict[str, Any]:
         """Statistics of training, and the paths of the pictures; `collisions` is None if the task declares none."""
         rows = self.episodes
-        recent, values = own_episodes(rows)["success"].tail(10), summary(rows, SUMMARY)
         config = load_yaml(self.path / "config.yaml", "configuration")  # `self.config` would import modules
+        missing = () if environment_id(config["task"]) != config["task"] else _OF_TASKS - {*rows}
+        known = [name for name in SUMMARY if name not in missing]
+        recent, values = own_episodes(rows)["success"].tail(10), summary(rows, known)
         if not counts_collisions(config["task"]):
             values["collisions"] = None
         note = f"{recent.sum()} of the last {len(recent)}, with exploration" if len(recent) else "only demonstrations"

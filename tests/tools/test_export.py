@@ -1,0 +1,95 @@
+"""Export of skills: the ONNX file computes the policy's actions, and a loop without an environment its commands."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import onnxruntime
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
+from guiderail.tools.cli.main import main
+from guiderail.tools.environments import make_environment
+from guiderail.tools.export import export_skill, policy_to_onnx
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.pretrained import find_run
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    sizes=st.lists(st.integers(1, 9), min_size=2, max_size=5),
+    activation=st.sampled_from(["relu", "normalized_relu", "tanh"]),
+    squash=st.sampled_from(["tanh", "clip"]),
+    seed=st.integers(0, 1000),
+)
+def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed):
+    rng = np.random.default_rng(seed)
+    layers = [
+        (rng.normal(size=(after, before)).astype(np.float32), rng.normal(size=after).astype(np.float32))
+        for before, after in pairwise(sizes)
+    ]
+    low = rng.normal(size=sizes[-1])
+    description = {
+        "observation_shape": [sizes[0]], "activation": activation, "squash": squash,
+        "action_low": low.tolist(), "action_high": (low + rng.uniform(0.5, 2.0, sizes[-1])).tolist(),
+    }  # fmt: skip
+    policy = Policy(layers, description)
+    session = onnxruntime.InferenceSession(policy_to_onnx(policy), providers=["CPUExecutionProvider"])
+    for observation in rng.normal(size=(3, sizes[0])).astype(np.float32):
+        (action,) = session.run(None, {"observation": observation[None]})
+        np.testing.assert_allclose(action[0], policy(observation), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["connector", "passage"])
+def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
+    export_skill(f"pretrained:{name}", tmp_path / "skill")
+    skill = json.loads((tmp_path / "skill/skill.json").read_text())
+    config = RunFolder(find_run(f"pretrained:{name}")).config()
+    env = make_environment(config.task, config.environment)
+    session = onnxruntime.InferenceSession(tmp_path / "skill/policy.onnx", providers=["CPUExecutionProvider"])
+    data, settings = np.load(tmp_path / "skill/primitive.npz"), skill["primitive"]
+    primitive = LcNsKmp(
+        ReferenceTrajectory(data["times"], data["means"], data["covariances"]),
+        kernel=SquaredExponential(length_scale=settings["length_scale"]),
+        constraints=LinearConstraints(data["G"], data["c"]),
+        **{key: settings[key] for key in ("lambda_", "beta", "horizon", "history", "history_variance")},
+    )
+    policy = Policy.load(find_run(f"pretrained:{name}"))
+    observation, _ = env.reset(seed=1_000_000)
+    assert len(skill["observation"]) == len(observation)
+    simulator = env.unwrapped.simulator
+    station = simulator.get_system().GetSubsystemByName("station")
+    pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
+    stepper = primitive.start(pose, data["gains"])
+    outputs = [entry["output"] for entry in skill["action"]]
+    for _ in range(3):
+        (row,) = session.run(None, {"observation": observation[None].astype(np.float32)})
+        np.testing.assert_allclose(row[0], policy(observation), rtol=1e-4, atol=1e-5)
+        null_space_action = np.zeros(primitive.num_outputs)
+        null_space_action[outputs] = row[0]
+        commands = [stepper.step(null_space_action).output for _ in range(skill["action_repeat"])]
+        observation, _, terminated, truncated, _ = env.step(row[0])
+        assert (terminated, truncated) == (False, False)
+        np.testing.assert_allclose(env.unwrapped.trace.commanded[-len(commands) :], commands, atol=1e-6)
+    env.close()
+
+
+def test_export_is_refused_in_one_sentence(tmp_path, capsys):
+    (tmp_path / "full").mkdir()
+    for arguments, message in (
+        (["pretrained:passage", "--out", str(tmp_path / "full")], "already exists"),
+        (["pretrained:passage", "--target", "onx", "--out", str(tmp_path / "new")], "did you mean onnx?"),
+        (["pretrained:pouring", "--out", str(tmp_path / "new")], "the guidance of a run to export is kgrl or skgrl"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(["export", *arguments])
+        assert end.value.code == 2
+        assert message in capsys.readouterr().err
+    image = Policy.__new__(Policy)
+    image._layers, image.description = [], {"observation_shape": [8, 8, 3]}
+    with pytest.raises(InputError, match="observes images"):
+        policy_to_onnx(image)
