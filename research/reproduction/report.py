@@ -250,8 +250,8 @@ def _pouring_endings(tables: Path) -> list[Entry]:
                 "episodes until ten successes in a row; spills and collisions per episode",
                 tuple(ours) or ("no run yet",),
                 f"{sum(ended.values())} of 40 ended (40)",
-                "`difficulty=thesis`: inputs a quarter as fast as at the standard difficulty and 20 s, so that a success "
-                "needs about as many actions as in the thesis; the template pours from 100 mm instead of 75 mm and has "
+                "`difficulty=thesis`: inputs a quarter as fast as at the standard difficulty and 20 s, so that a "
+                "success needs about as many actions as in the thesis; the template pours from 100 mm instead of 75 mm and has "
                 "no funnel; own template and vessels; a spill ends the episode; Drake instead of Bullet",
                 (f"reproduction/tables/{name}.csv",) if table is not None else (f"studies/{name}.yaml",),
                 f"python -m research.thesis --figure {number} --resume",
