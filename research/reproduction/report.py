@@ -24,6 +24,7 @@ RESULTS = ROOT / "research" / "results"
 PAGE = ROOT / "docs" / "thesis.md"
 BEGIN, END = "<!-- report: begin -->", "<!-- report: end -->"
 STREAK = 10  # consecutive successes that count as convergence
+LONGEST = 1400  # planned episodes of a run of figures 3.5 and 3.6
 AVOIDED = -5.0  # mean obstacle cost of five episodes above which the obstacle counts as avoided
 HOLDS, PARTLY, NOT, OPEN = "holds", "holds partly", "does not hold", "open"
 
@@ -195,6 +196,14 @@ def converged_at(success: pd.Series) -> int | None:
     return None
 
 
+def _convergence(runs: list[pd.DataFrame], planned: int) -> str:
+    """Return the episodes to convergence of each run; "not yet" for a run with fewer than `planned` episodes."""
+    converged = [(converged_at(run["success"]), len(run)) for run in runs]
+    return ", ".join(
+        str(value) if value is not None else "not yet" if number < planned else "never" for value, number in converged
+    )
+
+
 def avoided_at(obstacle_cost: pd.Series) -> int | None:
     """Return the first episode from which five episodes have a mean obstacle cost above `AVOIDED`; None if none."""
     means = obstacle_cost.rolling(5).mean()
@@ -232,10 +241,12 @@ def _pouring_endings(tables: Path) -> list[Entry]:
             runs = _runs_of(table, method)
             if runs:
                 converged = [converged_at(run["success"]) for run in runs]
-                ended[method] = sum(c is not None or len(run) == 1400 for c, run in zip(converged, runs, strict=True))
+                ended[method] = sum(
+                    c is not None or len(run) == LONGEST for c, run in zip(converged, runs, strict=True)
+                )
                 ours.append(
                     f"{label}, {len(runs)} of 10 runs so far, episodes done {_each(runs, len)}, ten successes in a row "
-                    f"after {_each(runs, lambda run: converged_at(run['success']))} episodes, spills "
+                    f"after {_convergence(runs, LONGEST)} episodes, spills "
                     f"{_each(runs, lambda run: int((run['termination'] == 'spill').sum()))}, collisions "
                     f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}"
                 )
@@ -251,8 +262,8 @@ def _pouring_endings(tables: Path) -> list[Entry]:
                 tuple(ours) or ("no run yet",),
                 f"{sum(ended.values())} of 40 ended (40)",
                 "`difficulty=thesis`: inputs a quarter as fast as at the standard difficulty and 20 s, so that a "
-                "success needs about as many actions as in the thesis; the template pours from 100 mm instead of 75 mm and has "
-                "no funnel; own template and vessels; a spill ends the episode; Drake instead of Bullet",
+                "success needs about as many actions as in the thesis; the template pours from 100 mm instead of 75 mm "
+                "and has no funnel; own template and vessels; a spill ends the episode; Drake instead of Bullet",
                 (f"reproduction/tables/{name}.csv",) if table is not None else (f"studies/{name}.yaml",),
                 f"python -m research.thesis --figure {number} --resume",
                 hours[algorithm],
@@ -332,7 +343,7 @@ def _hard_pouring(tables: Path) -> list[Entry]:
         f"{len(finished)} of 10 runs so far have their 150 episodes; episodes done: {_each(runs, len)}",
         f"spills of each run in training: {', '.join(map(str, spills))}; collisions: "
         f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}; ten successes in a row begin "
-        f"after {_each(runs, lambda run: converged_at(run['success']))} episodes",
+        f"after {_convergence(runs, 150)} episodes",
     ]
     held_out = []
     if evaluated is not None:
