@@ -59,7 +59,7 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     skill |= {"action_repeat": config.action_repeat, "policy": POLICY_FILE}
     resolved = EnvConfig.resolve(config.task, config.environment)
     task, prior = resolved.make_task(), make_prior_knowledge(resolved)
-    primitive_config = prior.demonstrations
+    primitive_config = prior.primitive
     skill["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size)
     if len(skill["observation"]) != math.prod(policy.description["observation_shape"]):
         raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")

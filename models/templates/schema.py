@@ -61,7 +61,7 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
 
     Args:
         source: Path of a .yaml or .yml file, or the name of a shipped template: `pouring`, `pouring_aimed`,
-            `grid_clamp` or `end_effector_velocity`.
+            `pouring_shielded`, `grid_clamp` or `end_effector_velocity`.
         **parameters: Values, such as sizes of objects, that replace the values under `parameters` in the file.
 
     Raises:

@@ -83,7 +83,7 @@ def _sources(
 
 
 def _set_parameter(context: Context, index: int, default: np.ndarray, rng: np.random.Generator) -> None:
-    """Set a parameter to a multiple of its default, which keeps a stiffness valid, or if it is zero to random numbers."""
+    """Set a parameter to a multiple of its default, valid for a stiffness too, or if it is zero to random numbers."""
     value = default * rng.uniform(1.0, 1.1) if default.any() else rng.uniform(0.0, 0.3, default.size)
     context.get_mutable_numeric_parameter(index).SetFromVector(value)
 

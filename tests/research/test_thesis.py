@@ -78,10 +78,14 @@ OTHER_VALUES = {
     "max_speed": (0.1,), "max_acceleration": (1.0,), "joint_margin": 0.1, "min_singular_value": 0.05,
     "progress": "state", "progress_tolerance": (0.005, 0.2), "base_policy": "other", "guard": "none",
     "max_jerk": (100.0,), "num_demonstrations": 1, "prior_std": (0.001, 0.001, 0.001, 0.01, 0.01, 0.01),
-    "reference_model": "promp", "gap_scale": 0.1,
+    "reference_model": "promp", "gap_scale": 0.1, "pour_distance": 0.09,
 }  # fmt: skip
 # Options without which the value in `OTHER_VALUES` is refused.
-FURTHER_OPTIONS = {"balls": {"ball_diameter": 0.026}, "mug_error_least": {"mug_error_most": 0.02}}
+FURTHER_OPTIONS = {
+    "balls": {"ball_diameter": 0.026},
+    "mug_error_least": {"mug_error_most": 0.02},
+    "shield": {"aim": True},
+}
 
 
 def other_value(task, name, field, default):

@@ -20,7 +20,7 @@ def env():
 
 def drake_env(env, reset_handler):
     """Return Drake's environment around the diagram of `env`."""
-    task = env.unwrapped.task
+    task = env.unwrapped.diagram
     simulator, port = Simulator(task.diagram), task.diagram.GetInputPort("action")
     port.FixValue(simulator.get_mutable_context(), np.zeros(port.size()))
     spaces = gymnasium.spaces.Box(-1.0, 1.0, (port.size(),)), task.observation_space
@@ -36,12 +36,12 @@ def drake_env(env, reset_handler):
 
 
 def first_command(env):
-    return env.unwrapped.task.diagram.GetOutputPort("desired_pose").Eval(env.unwrapped.simulator.get_context())
+    return env.unwrapped.diagram.diagram.GetOutputPort("desired_pose").Eval(env.unwrapped.simulator.get_context())
 
 
 def test_first_command_is_that_of_diagram_env(env):
     """Both environments wrap the same diagram and begin in the same state."""
-    task = env.unwrapped.task
+    task = env.unwrapped.diagram
 
     def set_start(simulator, context, seed):
         task.randomize(context, np.random.default_rng(seed), {})

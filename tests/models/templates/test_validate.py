@@ -29,7 +29,9 @@ def errors(change):
     return [finding.message for finding in validate_changed(change) if finding.is_error]
 
 
-@pytest.mark.parametrize("name", ["pouring", "pouring_aimed", "grid_clamp", "end_effector_velocity"])
+@pytest.mark.parametrize(
+    "name", ["pouring", "pouring_aimed", "pouring_shielded", "grid_clamp", "end_effector_velocity"]
+)
 def test_validate_finds_no_errors_in_shipped_templates(name):
     assert [f.message for f in validate(load_template(name)) if f.is_error] == []
 
