@@ -12,11 +12,11 @@ from pathlib import Path
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.registry import did_you_mean
-from guiderail.tools.experiments.declaration import load_study
-from guiderail.tools.experiments.engines.engine import make_engine
-from guiderail.tools.experiments.job import Job, is_done
-from guiderail.tools.experiments.study import run_study
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail_studies.declaration import load_study
+from guiderail_studies.engines.engine import make_engine
+from guiderail_studies.job import Job, is_done
+from guiderail_studies.study import run_study
 from research.studies import study_path
 
 SUCCESSES = 10  # consecutive successes that end a run of pouring

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.experiments.job import Job
+from guiderail_studies.job import Job
 from research.reproduction import runs as module
 from research.reproduction.command import main
 from research.reproduction.runs import FIGURES, find_runs, jobs_of, remaining_hours
