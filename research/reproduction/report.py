@@ -387,6 +387,7 @@ def _hard_pouring(tables: Path) -> list[Entry]:
             "observed mug; the policy observes the same position",
             (
                 "reproduction/tables/pouring_hard_shield.csv",
+                "reproduction/tables/pouring_hard_shield_evaluated.csv",
                 "reproduction/tables/pour_line.csv",
                 "results/pouring_hard.csv",
             ),
