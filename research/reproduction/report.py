@@ -231,11 +231,13 @@ def _pouring_endings(tables: Path) -> list[Entry]:
     """Return the entries of figures 3.5, 3.6 and 3.8."""
     names = {"rl_sparse": "RL-Sparse", "rl_shaped": "RL-Shaped", "rl_sct_sparse": "RL-SCT-Sparse",
              "rl_sct_shaped": "RL-SCT-Shaped"}  # fmt: skip
-    found, counts, hours = [], {}, {}
+    found = []
     for algorithm, number in (("sac", "3.5"), ("tqc", "3.6")):
         name = f"thesis_pouring_{algorithm}"
         table = _read(tables, name)
-        ours = []
+        ours: list[str] = []
+        stored: tuple[str, ...] = (f"studies/{name}.yaml",)
+        stored += () if table is None else (f"reproduction/tables/{name}.csv",)
         ended = dict.fromkeys(names, 0)
         for method, label in names.items() if table is not None else ():
             runs = _runs_of(table, method)
@@ -245,15 +247,14 @@ def _pouring_endings(tables: Path) -> list[Entry]:
                     c is not None or len(run) == LONGEST for c, run in zip(converged, runs, strict=True)
                 )
                 ours.append(
-                    f"{label}, {len(runs)} of 10 runs so far, episodes done {_each(runs, len)}, ten successes in a row "
-                    f"after {_convergence(runs, LONGEST)} episodes, spills "
+                    f"{label}, {len(runs)} of 10 runs so far, episodes done {_each(runs, len)}, episodes until ten "
+                    f"successes in a row {_convergence(runs, LONGEST)}, spills "
                     f"{_each(runs, lambda run: int((run['termination'] == 'spill').sum()))}, collisions "
                     f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}"
                 )
         if algorithm == "sac" and (probes := _read(tables, "pouring_probes")) is not None:
             ours += _probe_sentences(probes)
-        counts[algorithm] = min(ended.values())
-        hours[algorithm] = 0.0 if table is None else _hours(table)
+            stored += ("reproduction/tables/pouring_probes.csv",)
         found.append(
             Entry(
                 (number,),
@@ -263,10 +264,11 @@ def _pouring_endings(tables: Path) -> list[Entry]:
                 f"{sum(ended.values())} of 40 ended (40)",
                 "`difficulty=thesis`: inputs a quarter as fast as at the standard difficulty and 20 s, so that a "
                 "success needs about as many actions as in the thesis; the template pours from 100 mm instead of 75 mm "
-                "and has no funnel; own template and vessels; a spill ends the episode; Drake instead of Bullet",
-                (f"reproduction/tables/{name}.csv",) if table is not None else (f"studies/{name}.yaml",),
+                "and has no funnel, and therefore spills more often than the thesis's; own template and vessels; a "
+                "spill ends the episode; Drake instead of Bullet",
+                stored,
                 f"python -m research.thesis --figure {number} --resume",
-                hours[algorithm],
+                None if table is None else _hours(table),
             )
         )
     found.append(
@@ -342,8 +344,8 @@ def _hard_pouring(tables: Path) -> list[Entry]:
     ours = [
         f"{len(finished)} of 10 runs so far have their 150 episodes; episodes done: {_each(runs, len)}",
         f"spills of each run in training: {', '.join(map(str, spills))}; collisions: "
-        f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}; ten successes in a row begin "
-        f"after {_convergence(runs, 150)} episodes",
+        f"{_each(runs, lambda run: int((run['termination'] == 'collision').sum()))}; episodes until ten "
+        f"successes in a row: {_convergence(runs, 150)}",
     ]
     held_out = []
     if evaluated is not None:
@@ -385,6 +387,7 @@ def _hard_pouring(tables: Path) -> list[Entry]:
             "observed mug; the policy observes the same position",
             (
                 "reproduction/tables/pouring_hard_shield.csv",
+                "reproduction/tables/pouring_hard_shield_evaluated.csv",
                 "reproduction/tables/pour_line.csv",
                 "results/pouring_hard.csv",
             ),

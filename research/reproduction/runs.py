@@ -28,7 +28,8 @@ class Runs:
 
     Attributes:
         study: Name of the study.
-        seconds: Measured duration of one episode by method [s of one core]; the key "" is for all other methods.
+        seconds: Duration of one episode by method [s of one core], the key "" for all other methods. Those of TQC at
+            pouring, of RL without a template there and of `kgrl_pixels` are estimates, the others are measured.
         stops: True if a run ends after `SUCCESSES` consecutive successes.
         methods: Names of the methods that the figure needs; empty for all methods.
     """
