@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import INSIDE, SharedControlTemplate
+from guiderail.models.templates.template import INSIDE, SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
@@ -77,6 +77,7 @@ class ActiveConstraintProjector(LeafSystem):
         super().__init__()
         if not as_number(max_tracking_error, "max_tracking_error") > 0.0:
             raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
+        check_template(template, frames)
         self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
         template.check_consistency()
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)

@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import SharedControlTemplate
+from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
@@ -52,6 +52,7 @@ class SctInputMapping(LeafSystem):
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
         check_period(period)
+        check_template(template, frames)
         self._template, self._period = template, period
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

@@ -17,6 +17,7 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.policy import Policy
+from guiderail.models.primitives.kernels import DEFAULT_KERNEL
 from guiderail.tools.files import check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
@@ -26,6 +27,8 @@ NAMES = {"time": ("time [s]",), "phase": ("phase",), "wrench": WRENCH_NAMES}
 NAMES["center_of_pressure"] = ("center of pressure x [m]", "center of pressure y [m]")
 NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in ("pose", "desired_pose")}
 """Names of a signal's entries with their units; entries of another signal are numbered."""
+EXPORTED = {"kernel": DEFAULT_KERNEL, "history_source": "commanded", "adaptive_history": False}
+"""Options whose other values the loop of a skill without an environment does not implement."""
 GUIDED = ("kgrl", "skgrl")  # guidance whose data can be exported
 POLICY_FILE, SKILL_FILE, PRIMITIVE_FILE = "policy.onnx", "skill.json", "primitive.npz"
 
@@ -66,6 +69,9 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     assert primitive_config is not None
     if primitive_config.motion is not None or primitive_config.progress is not None:
         raise InputError("constraints of the motion and progress=state cannot be exported: train without them")
+    for option, exported in EXPORTED.items():
+        if (value := config.environment.get(option, exported)) != exported:
+            raise InputError(f"{option}={value} cannot be exported, only {option}={exported}: train with this value")
     moved = primitive_config.explored_outputs
     has_history = config.environment["guidance"] == "skgrl"
     primitive = primitive_config.primitive(history=has_history)

@@ -180,7 +180,7 @@ def test_simulator_and_environment_have_bitwise_equal_results(action_repeat):
         observation, *_, info = env.step(policy(observation))
     commanded, measured = (np.array(rows)[:steps] for rows in (env.trace.commanded, env.trace.measured))
 
-    task = make_env("NarrowPassage", guidance="skgrl", action_repeat=action_repeat).task
+    task = make_env("NarrowPassage", guidance="skgrl", action_repeat=action_repeat).diagram
     builder = DiagramBuilder()
     diagram = builder.AddSystem(task.diagram)
     system = PolicySystem(policy, task.observation_space.shape[0], 2, action_repeat * task.control_period)

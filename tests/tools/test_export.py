@@ -1,6 +1,7 @@
 """Export of skills: the ONNX file computes the policy's actions, and a loop without an environment its commands."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -11,7 +12,13 @@ from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
+from guiderail.models.primitives import (
+    LcNsKmp,
+    LinearConstraints,
+    PrimitiveStepper,
+    ReferenceTrajectory,
+    SquaredExponential,
+)
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
 from guiderail.tools.export import export_skill, policy_to_onnx
@@ -64,7 +71,7 @@ def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
     simulator = env.unwrapped.simulator
     station = simulator.get_system().GetSubsystemByName("station")
     pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
-    stepper = primitive.start(pose, data["gains"])
+    stepper = PrimitiveStepper(primitive, pose, data["gains"])
     outputs = [entry["output"] for entry in skill["action"]]
     for _ in range(3):
         (row,) = session.run(None, {"observation": observation[None].astype(np.float32)})
@@ -93,3 +100,14 @@ def test_export_is_refused_in_one_sentence(tmp_path, capsys):
     image._layers, image.description = [], {"observation_shape": [8, 8, 3]}
     with pytest.raises(InputError, match="observes images"):
         policy_to_onnx(image)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("kernel", "matern52"), ("history_source", "measured"), ("adaptive_history", True)]
+)
+def test_export_refuses_options_that_its_loop_lacks(option, value, tmp_path, monkeypatch):
+    config = RunFolder(find_run("pretrained:passage")).config()
+    config = replace(config, environment={**config.environment, option: value})
+    monkeypatch.setattr(RunFolder, "config", lambda self: config)
+    with pytest.raises(InputError, match=f"{option}={value} cannot be exported"):
+        export_skill("pretrained:passage", tmp_path / "out")

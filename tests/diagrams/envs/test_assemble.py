@@ -53,11 +53,11 @@ def test_prior_is_accepted_when_clock_factor_changes_the_period():
 @pytest.mark.parametrize("turn", [np.pi, -np.pi, 3.1, 4.0])
 def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
     """A measured angle jumps by a full turn at ±180°, so a history of measured angles would command a full turn."""
-    assert make_prior(turn, GantryStation).demonstrations is not None
+    assert make_prior(turn, GantryStation).primitive is not None
     for station in (ArmStation, HardwareStation):
         with pytest.raises(InputError, match="angles jump by a full turn at 180°"):
             make_prior(turn, station)
-        assert make_prior(0.9 * np.copysign(np.pi, turn), station).demonstrations is not None
+        assert make_prior(0.9 * np.copysign(np.pi, turn), station).primitive is not None
 
 
 def test_signal_is_refused_when_the_station_has_no_input():

@@ -457,7 +457,7 @@ def test_step_is_refused_when_the_simulator_is_ahead():
 )
 def test_task_diagram_refuses_arguments_that_do_not_fit(wrong, message):
     with pytest.raises(InputError, match=message):
-        replace(make().task, **wrong)
+        replace(make().diagram, **wrong)
 
 
 def test_multiples_of_a_rounded_period_are_exact():

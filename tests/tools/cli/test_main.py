@@ -346,7 +346,6 @@ def test_as_value_reads_plain_text_as_yaml_does(text):
 @pytest.mark.parametrize(
     "arguments",
     [
-        ["train", "Foreign", "--out", "new"],
         ["visualize", "Foreign", "--policy", "zero", "--html", "new.html"],
         ["visualize", "Foreign", "--policy", "zero", "--image", "new.png"],
         ["teleoperate", "Foreign"],

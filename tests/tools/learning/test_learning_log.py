@@ -144,5 +144,5 @@ def test_train_resumes_a_run_without_its_task(tmp_path):
     train(resume=True, out=tmp_path / "parts", episodes=2, pictures=False)
     train("NarrowPassage", "kgrl", out=tmp_path / "whole", episodes=2, **arguments)
     assert differences(tmp_path / "whole", tmp_path / "parts") == []
-    with pytest.raises(InputError, match="training needs the name of a task or its folder, not None"):
+    with pytest.raises(InputError, match=r"training needs the name of a task or its folder, .* not None"):
         train(out=tmp_path / "other")

@@ -528,8 +528,8 @@ def test_train_refuses_numbers_that_are_not_whole(name, value, trained_config):
         ({"preSets": "a"}, "did you mean preset"),
         ({"wal": 2.0}, "did you mean wall"),
         ({"episode": 3, "task": "NarrowPassage"}, "no argument 'episode': did you mean episodes"),
-        ({"task": gymnasium.Env()}, r"name of a task or its folder, not <gymnasium.* gymnasium.register"),
-        ({"task": None}, "name of a task or its folder, not None"),
+        ({"task": 3}, "name of a task or its folder, an environment, .* not 3"),
+        ({"task": None}, "name of a task or its folder, an environment, .* not None"),
     ],
 )
 def test_train_refuses_wrong_arguments_with_a_hint(options, message, trained_config):
