@@ -1,4 +1,4 @@
-"""Evaluation of a policy on a robot or a simulated driver: `guiderail evaluate RUN --station hardware`."""
+"""Evaluation of a policy on a robot or a simulated driver: `guiderail deploy RUN --episodes N`."""
 
 from __future__ import annotations
 

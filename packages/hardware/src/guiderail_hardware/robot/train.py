@@ -1,4 +1,4 @@
-"""Training on a robot or a simulated driver: `guiderail train TASK --station hardware`."""
+"""Training on a robot or a simulated driver: `guiderail train-on-robot TASK`."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def train_on_robot(
             raise InputError(f"the run in {out} was trained with {hint}, or train again in another folder")
         config = replace(config, environment={**config.environment, **options})
     elif task is None:
-        raise InputError("training needs a task: name a task, such as guiderail train BncConnector --out RUN")
+        raise InputError("training needs a task: name a task, such as guiderail train-on-robot BncConnector --out RUN")
     else:
         folder.refuse_existing()
         config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
