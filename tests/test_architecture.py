@@ -108,5 +108,15 @@ def test_core_imports_no_sibling_and_siblings_import_only_what_they_require():
             assert top_level(target) in allowed, f"{module} imports {target}"
 
 
+def test_core_names_no_module_of_a_sibling():
+    """A plug-in is found by its entry point; the names of the distributions are only in the two named files."""
+    named = re.compile("|".join(name for name in REQUIRED))
+    for folder in MAY_IMPORT:
+        for path in (ROOT / folder).rglob("*.py"):
+            if path.relative_to(ROOT).as_posix() not in ("models/common/plugins.py", "models/common/errors.py"):
+                match = named.search(path.read_text(encoding="utf-8"))
+                assert match is None, f"{path.relative_to(ROOT)} names {match}"
+
+
 def top_level(module):
     return module.partition(".")[0]

@@ -43,7 +43,7 @@ def _check(name: str, kind: object) -> None:
 
 STATIONS: Registry[StationKind] = Registry(
     "station",
-    package=("guiderail.diagrams.stations", "guiderail_hardware.drivers"),
+    package="guiderail.diagrams.stations",
     decorator="register_station",
     plugin="station",
     check=_check,
