@@ -3,7 +3,7 @@
 import pytest
 
 from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.tools.cli.main import main
+from oracles.commands import call
 
 STATION = """
 from guiderail.diagrams.stations.registry import register_station
@@ -13,14 +13,6 @@ from guiderail.diagrams.stations.registry import register_station
 def desk(workcell):
     raise NotImplementedError
 """
-
-
-def call(capsys, *arguments):
-    """Run a command; return its exit code and both outputs."""
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return end.value.code, out, err
 
 
 @pytest.mark.parametrize(

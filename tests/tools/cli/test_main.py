@@ -19,17 +19,10 @@ from guiderail.tools.cli.app import to_json
 from guiderail.tools.cli.main import COMMANDS, load_commands, main
 from guiderail.tools.environments import as_value
 from guiderail.tools.learning.run_folder import RunFolder
+from oracles.commands import call
 from research.studies import study_path
 
 CONNECTOR = str(study_path("connector"))
-
-
-def call(capsys, *arguments):
-    """Run a command; return its exit code, standard output and standard error."""
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return end.value.code, out, err
 
 
 @pytest.mark.parametrize(
