@@ -291,6 +291,16 @@ TrustImports = Annotated[
     ),
 ]
 Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
+Algorithm = Annotated[str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")]
+Preset = Annotated[str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")]
+Settings = Annotated[
+    list[str] | None,
+    option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
+]
+WriteStepLog = Annotated[
+    bool | None,
+    option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
+]
 Baselines = Annotated[
     str | None,
     option(

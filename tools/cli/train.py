@@ -15,21 +15,14 @@ def train(
     task: Annotated[str | None, argument("Task to learn: {tasks}.", "TASK", "tasks")] = None,
     out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
     guidance: cli.Guidance = None,
-    algorithm: Annotated[
-        str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")
-    ] = None,
+    algorithm: cli.Algorithm = None,
     episodes: Annotated[
         int | None,
         option("Total number of episodes; --resume can change it, but not below the episodes done.  [default: 60]"),
     ] = None,
     seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
-    preset: Annotated[
-        str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
-    ] = None,
+    preset: cli.Preset = None,
+    setting: cli.Settings = None,
     num_envs: Annotated[
         int | None,
         option(
@@ -51,10 +44,7 @@ def train(
         str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
     ] = None,
     station: Annotated[str | None, option("Station: {stations}.  [default: the task's]", choices="stations")] = None,
-    step_log: Annotated[
-        bool | None,
-        option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
-    ] = None,
+    step_log: cli.WriteStepLog = None,
     log: Annotated[
         list[str] | None,
         option("Write a learning log into the run's logs/: {log_formats}; repeatable.", choices="log_formats"),

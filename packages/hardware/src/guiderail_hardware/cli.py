@@ -123,18 +123,11 @@ def train_on_robot(
     out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
     station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
     guidance: cli.Guidance = None,
-    algorithm: Annotated[
-        str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")
-    ] = None,
+    algorithm: cli.Algorithm = None,
     episodes: Annotated[int | None, option("Total number of episodes.  [default: 60]")] = None,
     seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
-    preset: Annotated[
-        str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")
-    ] = None,
-    setting: Annotated[
-        list[str] | None,
-        option("Setting of the learner, such as batch_size=128; repeatable.", "--set", metavar="name=value"),
-    ] = None,
+    preset: cli.Preset = None,
+    setting: cli.Settings = None,
     env: cli.Env = None,
     robot_url: RobotUrl = None,
     robot: Robot = None,
@@ -144,10 +137,7 @@ def train_on_robot(
     rate: Rate = None,
     scenario: Scenario = None,
     yes: Yes = False,
-    step_log: Annotated[
-        bool | None,
-        option("Write every control step into the run's steps/.  [default: yes]", "--step-log/--no-step-log"),
-    ] = None,
+    step_log: cli.WriteStepLog = None,
     resume: Annotated[
         bool, option("Resume the run in --out; a run with a simulated driver needs --sim again.", "--resume")
     ] = False,
