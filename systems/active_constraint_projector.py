@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
@@ -87,7 +88,7 @@ class ActiveConstraintProjector(LeafSystem):
         # [last command (6,), pose (6,) measured at the same instant]
         self._last = declare.unset_state(self, 12)
         constraints = [self._state_port, self.frames.ticket]
-        self._command = declare.cache(
+        self._command = declare.cache_entry(
             self, "command", self._calc_command, [*constraints, self._last, self._requested_pose_port]
         )
         declare.part_output(self, "desired_pose", self._command, lambda command: command[:6], 6)
@@ -121,19 +122,19 @@ class ActiveConstraintProjector(LeafSystem):
     def _state(self, context: Context) -> int | None:
         return declare.state_number(self._state_port, context, len(self._template.states))
 
-    def _calc_command(self, context: Context) -> np.ndarray:
-        """Return the command and the fallback flag, (7,)."""
-        value = declare.initialized(self, context, self._last)
-        last, measured = value[:6], value[6:]
+    def _calc_command(self, context: Context, value: AbstractValue) -> None:
+        """Compute the command and the fallback flag, (7,)."""
+        last, measured = np.split(declare.initialized(self, context, self._last), 2)
         number = self._state(context)
         if number is None:
-            return np.append(last, 1.0)
+            value.set_value(np.append(last, 1.0))
+            return
         requested, frames = self._requested_pose_port.Eval(context), self.frames.eval(context)
         state = TemplateState(number, last, measured)
         command, is_fallback = guarded_pose(
             self._template, state, requested, frames, self._period, self._max_tracking_error
         )
-        return np.append(command, float(is_fallback))
+        value.set_value(np.append(command, float(is_fallback)))
 
     def _commanded_violation(self, context: Context) -> float:
         return self._violation(context, self._command.Eval(context)[:6])
