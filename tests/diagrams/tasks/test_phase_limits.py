@@ -89,7 +89,10 @@ def test_limit_changes_with_the_state_at_bounded_rate():
     env.reset(seed=0, options={"offset": (0.0025, 0.0)})
     context = limit.GetMyContextFromRoot(env.simulator.get_context())
     guidance = env.diagram.diagram.GetSubsystemByName("guidance")
-    state, guidance_context = guidance.GetOutputPort("state"), guidance.GetMyContextFromRoot(env.simulator.get_context())
+    state, guidance_context = (
+        guidance.GetOutputPort("state"),
+        guidance.GetMyContextFromRoot(env.simulator.get_context()),
+    )
     bounds, states = [], []
     for _ in range(90):
         env.step(np.array([1.0, 1.0, -1.0]))
