@@ -232,7 +232,13 @@ class Loop:
                 call_checked(task, "template").template, impedance, self.station.control_period
             )
         if limit is not None:
-            add_system(self.builder, "phase_wrench_limit", limit, state=self.guidance.GetOutputPort("state"))
+            if not self.guidance.HasOutputPort("state_max_wrench"):
+                raise InputError(
+                    f"states of the template of {task.name} limit force or torque, and guidance="
+                    f"{task.config.guidance!r} has no output 'state_max_wrench': export max_wrench of its state machine"
+                )
+            state_max_wrench = self.guidance.GetOutputPort("state_max_wrench")
+            add_system(self.builder, "phase_wrench_limit", limit, state_max_wrench=state_max_wrench)
             if bound is not None:
                 self.builder.Connect(bound, limit.get_max_wrench_input_port())
             bound = limit.get_phase_max_wrench_output_port()

@@ -392,7 +392,8 @@ class TemplateGuide(Guide):
         extra: Value for `to_action`, or (name of the state) → value.
 
     Raises:
-        InputError: If the period is missing or not positive, or active constraints of a state contradict each other.
+        InputError: If the period is missing or not positive, active constraints of a state contradict each other, or a
+            state limits force or torque.
     """
 
     num_outputs = POSE_SIZE
@@ -407,6 +408,11 @@ class TemplateGuide(Guide):
         if period is None or not 0.0 < period < np.inf:
             raise InputError("guidance by a template needs the period of the environment [s], positive")
         template.check_consistency()
+        if template.limits_wrench:
+            raise InputError(
+                f"states of template {template.name!r} limit force or torque, and GuidedEnv has no controller that "
+                "could follow the limit: remove max_force_n and max_torque_nm, and bound the force in the environment"
+            )
         self.template, self._frames_of, self._period, self._extra_of = template, frames, period, extra
         self.num_actions = template.inputs
 
