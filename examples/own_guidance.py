@@ -10,7 +10,7 @@ from pydrake.systems.primitives import MatrixGain, PassThrough, ZeroOrderHold
 
 from guiderail import Options, PriorKnowledge, make_env, register_guidance
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.primitive import KgrlGuidance
+from guiderail.diagrams.guidance.primitive import PrimitiveGuidance
 
 
 class AlongOptions(Options):
@@ -27,7 +27,7 @@ class KgrlAlong(Guidance):
         super().__init__()
         builder = DiagramBuilder()
         angle = np.deg2rad(known.options["angle"])
-        kgrl = builder.AddNamedSystem("kgrl", KgrlGuidance(known))
+        kgrl = builder.AddNamedSystem("kgrl", PrimitiveGuidance(known))
         direction = MatrixGain(D=np.array([[np.cos(angle)], [np.sin(angle)]]))
         builder.AddNamedSystem("direction", direction)
         action = builder.AddNamedSystem("action", PassThrough(1))

@@ -16,12 +16,12 @@ from .episode_monitor import TerminationTerm as TerminationTerm
 from .external_torque_sensor import ExternalTorqueSensor as ExternalTorqueSensor
 from .external_torque_sensor import JointTorqueErrors as JointTorqueErrors
 from .force_monitor import ForceMonitor as ForceMonitor
-from .function_guidance_system import FunctionGuidanceSystem as FunctionGuidanceSystem
 from .gripper_command import GripperCommand as GripperCommand
 from .history_buffer import HistoryBuffer as HistoryBuffer
 from .history_length_schedule import HistoryLengthSchedule as HistoryLengthSchedule
 from .image_observation import ImageObservation as ImageObservation
 from .joint_torque_wrench import JointTorqueWrench as JointTorqueWrench
+from .law_system import LawSystem as LawSystem
 from .lc_ns_kmp_system import LcNsKmpSystem as LcNsKmpSystem
 from .mean_force import MeanForce as MeanForce
 from .measured_pose import MeasuredPose as MeasuredPose
@@ -38,7 +38,6 @@ from .relative_poses import RelativePoses as RelativePoses
 from .residual import Residual as Residual
 from .reward_system import RewardSystem as RewardSystem
 from .reward_system import RewardTerm as RewardTerm
-from .safety_filter import SafetyFilter as SafetyFilter
 from .sct_input_mapping import SctInputMapping as SctInputMapping
 from .sct_state_machine import SctStateMachine as SctStateMachine
 from .sensor_disturbance import SensorDisturbance as SensorDisturbance

@@ -1,6 +1,5 @@
 """Projection of requested poses into the active constraints (thesis, equation 2.21)."""
 
-import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -9,8 +8,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
-from guiderail.models.templates.template import INSIDE, SharedControlTemplate, check_template
+from guiderail.models.laws.template import TemplateState, guarded_pose, start_in, violation_of
+from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
@@ -117,9 +116,7 @@ class ActiveConstraintProjector(LeafSystem):
     get_measured_violation_output_port = output_getter("measured_violation", "violation of the measured pose, (1,)")
 
     def _violation(self, context: Context, pose: np.ndarray) -> float:
-        state, X_WE, frames = self._state(context), pose_to_transform(pose), self.frames.eval(context)
-        states = range(len(self._template.states)) if state is None else (state,)
-        return max(self._template.violation(number, X_WE, frames) for number in states)
+        return violation_of(self._template, self._state(context), pose, self.frames.eval(context))
 
     def _state(self, context: Context) -> int | None:
         return declare.state_number(self._state_port, context, len(self._template.states))
@@ -128,33 +125,15 @@ class ActiveConstraintProjector(LeafSystem):
         """Return the command and the fallback flag, (7,)."""
         value = declare.initialized(self, context, self._last)
         last, measured = value[:6], value[6:]
-        requested = self._requested_pose_port.Eval(context)
-        state = self._state(context)
-        if state is None:
+        number = self._state(context)
+        if number is None:
             return np.append(last, 1.0)
-        if np.isfinite(requested).all() and np.isfinite(measured).all():
-            desired = self._constrained(context, state, last, requested)
-            tracking_error = math.dist(last[:3], measured[:3])
-            reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
-            is_waiting = tracking_error > self._max_tracking_error and not reduces_error
-            if not is_waiting and np.isfinite(desired).all():
-                return np.append(desired, 0.0)
-        # Projecting a command that is already inside would move it by rounding errors at every step.
-        if self._violation(context, last) > INSIDE:
-            inside = self._constrained(context, state, last, last)
-            last = inside if np.isfinite(inside).all() else last
-        return np.append(last, 1.0)
-
-    def _constrained(self, context: Context, state: int, last: np.ndarray, requested: np.ndarray) -> np.ndarray:
-        """Return the command (6,) for a requested pose."""
-        command = self._template.command(
-            state,
-            pose_to_transform(last),
-            pose_to_transform(requested),
-            self.frames.eval(context),
-            self._period,
+        requested, frames = self._requested_pose_port.Eval(context), self.frames.eval(context)
+        state = TemplateState(number, last, measured)
+        command, is_fallback = guarded_pose(
+            self._template, state, requested, frames, self._period, self._max_tracking_error
         )
-        return transform_to_pose(command.X_WE)
+        return np.append(command, float(is_fallback))
 
     def _commanded_violation(self, context: Context) -> float:
         return self._violation(context, self._command.Eval(context)[:6])
@@ -164,13 +143,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = declare.start_pose(self._pose_port.Eval(context))
-        X_WE, frames = pose_to_transform(measured), self.frames.eval(context)
         # The state port is not read, because the system that outputs the state is initialized at the same instant.
-        state = self._template.state_at(X_WE, frames)
-        command = transform_to_pose(self._template.command(state, X_WE, X_WE, frames, self._period).X_WE)
-        if not np.isfinite(command).all():
-            raise InputError(f"the frames of the template {self._template.name} must be finite at the start")
-        self._template.check_start(X_WE, frames)
+        _, command = start_in(self._template, measured, self.frames.eval(context), self._period)
         discrete_state.set_value(self._last, np.concatenate([command, measured]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:

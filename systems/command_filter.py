@@ -14,8 +14,9 @@ class CommandFilter(LeafSystem):
 
         safe_pose = law(last safe_pose, desired_pose)
 
-    The law is a `BarrierFilter`, a `TangentSpaceFilter` or a `MotionConstraintFilter`, which uses the last two
-    commands. At initialization, the last command is the measured pose. If the desired pose is not finite, a
+    The law is a `KeepOutFilter`, which projects the line from the measured pose to the desired one, a `BarrierFilter`,
+    a `TangentSpaceFilter`, or a `MotionConstraintFilter`, which uses the last two commands. At initialization, the last
+    command is the measured pose. The measured pose is sampled at control steps. If the desired pose is not finite, a
     `MotionConstraintFilter` brakes, and the other laws repeat the last command. If the result of a law is not finite,
     the last command is repeated.
 
@@ -29,7 +30,7 @@ class CommandFilter(LeafSystem):
         - safe_pose
         - intervention
 
-    ``desired_pose``, ``pose`` (measured, read at initialization) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
+    ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
     if the law intervened (see the class of the law) or the last command is repeated.
 
     Args:
@@ -47,7 +48,9 @@ class CommandFilter(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", outputs)
         self._last = declare.unset_state(self, size)  # state of the law, which begins with the last command
-        self._command = declare.cache(self, "command", self._calc_command, [self._desired_pose_port, self._last])
+        self._measured = declare.sample(self, self._pose_port, period)
+        sources = [self._desired_pose_port, self._last, self._measured]
+        self._command = declare.cache(self, "command", self._calc_command, sources)
         declare.part_output(self, "safe_pose", self._command, lambda command: command[:outputs], outputs)
         declare.part_output(self, "intervention", self._command, lambda command: command[-1])
         declare.update_after_start(self, period, self._update, self._reset)
@@ -66,7 +69,8 @@ class CommandFilter(LeafSystem):
     def _calc_command(self, context: Context) -> np.ndarray:
         """Return the next state, which begins with the safe command, and the intervention flag."""
         last = declare.initialized(self, context, self._last)
-        state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context))
+        measured = context.get_discrete_state().value(self._measured)
+        state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context), measured)
         if not is_finite(state):  # NaN would remain in the state
             state, is_changed = last, True
         return np.append(state, float(is_changed))

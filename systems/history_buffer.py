@@ -5,7 +5,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.full_turns import continued_angles
+from guiderail.models.laws.primitive import appended, continued_pose
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
@@ -82,15 +82,9 @@ class HistoryBuffer(LeafSystem):
         initial = self._initial_output_port.Eval(context)
         if not is_finite(initial):
             raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
-        discrete_state.set_value(self._state, np.tile(self._continued(initial, self._near), self._shape[0]))
+        discrete_state.set_value(self._state, np.tile(continued_pose(initial, self._near), self._shape[0]))
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
-        stored, size = declare.initialized(self, context, self._state), self._shape[1]
-        newest = self._continued(self._output_port.Eval(context), stored[-size:])
-        discrete_state.set_value(self._state, np.concatenate([stored[size:], newest]))
-
-    def _continued(self, output: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-        """Return the output with its angles on the full turns nearest to those of `last`."""
-        if self._near is None or last is None:
-            return output
-        return np.concatenate([output[:3], continued_angles(output[None, 3:], last[3:])[0]])
+        stored = declare.initialized(self, context, self._state).reshape(self._shape)
+        history = appended(stored, self._output_port.Eval(context), is_pose=self._near is not None)
+        discrete_state.set_value(self._state, history.ravel())

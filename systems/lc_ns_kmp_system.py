@@ -9,7 +9,8 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.primitives import LcNsKmp, UnsolvableError
+from guiderail.models.laws.primitive import output_or_nearest, predict
+from guiderail.models.primitives import LcNsKmp
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -19,7 +20,7 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class _Prediction:
     step: int
     output: np.ndarray
-    fallback: float
+    fallback: bool
 
 
 class LcNsKmpSystem(LeafSystem):
@@ -192,21 +193,10 @@ class LcNsKmpSystem(LeafSystem):
         history = None
         if self._history_port is not None:
             history = self._history_port.Eval(context).reshape(-1, primitive.num_outputs)[-length:]
-        try:
-            if not self._reference_window_port.HasValue(context):
-                prediction = primitive.predict(step, action, history)
-            else:
-                window = self._reference_window_port.Eval(context)
-                means, covariances = np.split(window, [(primitive.horizon + 1) * primitive.num_outputs])
-                means = means.reshape(-1, primitive.num_outputs)
-                covariances = covariances.reshape(*means.shape, primitive.num_outputs)
-                prediction = primitive.predict_window(step, means, covariances, action, history)
-            output, fallback = prediction.output, 0.0
-        except UnsolvableError:
-            # The last command may violate the constraints of this step, which can differ from those of its own step.
-            last_command = context.get_discrete_state().value(self._last_command)
-            output, fallback = self.primitive.constraints.nearest(last_command, step), 1.0
-        return _Prediction(step, output, fallback)
+        window = self._reference_window_port.Eval(context) if self._reference_window_port.HasValue(context) else None
+        output = predict(primitive, step, action, history, window)
+        last_command = context.get_discrete_state().value(self._last_command)
+        return _Prediction(step, *output_or_nearest(primitive.constraints, step, output, last_command))
 
     def _violation(self, prediction: _Prediction) -> float:
         violation = self.primitive.constraints.violation(prediction.output, prediction.step)

@@ -2,7 +2,7 @@
 
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.primitives.stepper import StateProgress
+from guiderail.models.laws import StateProgress
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 

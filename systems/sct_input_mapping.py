@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
+from guiderail.models.laws.template import requested_pose
 from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import check_period, input_getter, output_getter
@@ -70,10 +70,6 @@ class SctInputMapping(LeafSystem):
     get_requested_pose_output_port = output_getter("requested_pose", "requested pose H^im, (6,), not constrained")
 
     def _requested_pose(self, context: Context) -> np.ndarray:
-        action = self._action_port.Eval(context)
         state = declare.state_number(self._state_port, context, len(self._template.states))
-        if state is None or not np.isfinite(action).all():
-            return np.full(6, np.nan)
-        X_WE = pose_to_transform(self._pose_port.Eval(context))
-        displacement = self._template.map(state, action, X_WE, self.frames.eval(context), self._period)
-        return transform_to_pose(self._template.displace(X_WE, displacement))
+        action, pose = self._action_port.Eval(context), self._pose_port.Eval(context)
+        return requested_pose(self._template, state, action, pose, self.frames.eval(context), self._period)

@@ -13,9 +13,11 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
+from guiderail.models.laws.skill import PRIMITIVE_FILE, SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
 from guiderail.tools.files import check_new, write_atomically
@@ -30,7 +32,7 @@ NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in
 EXPORTED = {"kernel": DEFAULT_KERNEL, "history_source": "commanded", "adaptive_history": False}
 """Options whose other values the loop of a skill without an environment does not implement."""
 GUIDED = ("kgrl", "skgrl")  # guidance whose data can be exported
-POLICY_FILE, SKILL_FILE, PRIMITIVE_FILE = "policy.onnx", "skill.json", "primitive.npz"
+POLICY_FILE = "policy.onnx"
 
 
 def export_skill(run: Path | str, out: Path) -> list[Path]:
@@ -72,21 +74,20 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     for option, exported in EXPORTED.items():
         if (value := config.environment.get(option, exported)) != exported:
             raise InputError(f"{option}={value} cannot be exported, only {option}={exported}: train with this value")
-    moved = primitive_config.explored_outputs
-    has_history = config.environment["guidance"] == "skgrl"
-    primitive = primitive_config.primitive(history=has_history)
+    law = make_law(prior, history=config.environment["guidance"] == "skgrl")
+    primitive = law.primitive
     buffer = io.BytesIO()
     constraints = primitive.constraints
     np.savez(
         buffer, times=primitive.reference.times, means=primitive.reference.means,
         covariances=primitive.reference.covariances, G=constraints.G, c=constraints.c,
-        gains=primitive_config.null_space_gains(primitive),
+        gains=law.gain,
     )  # fmt: skip
     files[PRIMITIVE_FILE] = buffer.getvalue()
     skill["primitive"] = {
         "file": PRIMITIVE_FILE, "lambda_": primitive_config.lambda_, "beta": primitive_config.beta,
         "horizon": primitive_config.horizon, "history": primitive.history,
-        "history_variance": primitive_config.history_variance, "history_source": primitive_config.history_source,
+        "history_variance": primitive_config.history_variance, "history_source": law.history_source,
         "kernel": config.environment["kernel"], "length_scale": config.environment["length_scale"],
     }  # fmt: skip
     skill["control_period_s"] = prior.period
@@ -94,7 +95,7 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     skill["action"] = [
         {"name": f"null-space action of {POSE_NAMES[output]}", "output": output,
          "low": low[i], "high": high[i]}
-        for i, output in enumerate(moved)
+        for i, output in enumerate(law.outputs)
     ]  # fmt: skip
     files[SKILL_FILE] = json.dumps(skill, indent=2, default=_plain).encode() + b"\n"
     out.mkdir(parents=True)

@@ -42,9 +42,9 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
+from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.reference import pass_through
-from guiderail.models.primitives.stepper import StateProgress
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
 from guiderail.systems.reward_system import RewardSystem, RewardTerm

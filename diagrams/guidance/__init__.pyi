@@ -1,5 +1,5 @@
-from .guidance import FunctionGuidance as FunctionGuidance
 from .guidance import Guidance as Guidance
+from .guidance import LawGuidance as LawGuidance
 from .prior import PlacedTemplate as PlacedTemplate
 from .prior import PrimitiveConfig as PrimitiveConfig
 from .prior import PriorKnowledge as PriorKnowledge

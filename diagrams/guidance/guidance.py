@@ -1,4 +1,4 @@
-"""Ports of all guidance, from a policy's action to the commanded pose, and guidance by a function.
+"""Ports of all guidance, from a policy's action to the commanded pose, and guidance by a law.
 
 =================  =====  ==========================================================================================
 input              size   meaning
@@ -32,8 +32,9 @@ from pydrake.systems.framework import Context, Diagram, DiagramBuilder, System
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
+from guiderail.models.laws.law import Law
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.function_guidance_system import FunctionGuidanceSystem, GuidanceFunction
+from guiderail.systems.law_system import LawSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 INPUTS = ("action", "pose", "wrench")
@@ -79,26 +80,29 @@ class Guidance(Diagram):
     )
 
 
-class FunctionGuidance(Guidance):
-    """Guidance that commands law(action, pose, wrench) once per control step; see `FunctionGuidanceSystem`.
+class LawGuidance(Guidance):
+    """Guidance by a law, once per control step; see `LawSystem`.
 
     The command is not constrained; ``constraint_violation`` is its violation of the prior knowledge's `constraints`.
     """
 
-    def __init__(self, prior: PriorKnowledge, law: GuidanceFunction, action_size: int):
+    def __init__(self, prior: PriorKnowledge, law: Law):
         """Construct the guidance.
 
         Args:
-            prior: Prior knowledge, for the control period, the station's sizes and the linear constraints.
-            law: Pure function from an action (A,), the measured pose (O,) and wrench (W,) to a desired pose (O,).
-            action_size: A, at least 1.
+            prior: Prior knowledge, for the control period, the size of the wrench and the linear constraints.
+            law: Law whose outputs are those of the station's pose.
 
         Raises:
-            InputError: If a size or the period is out of range, or `law` is no function of three arguments.
+            InputError: If `law` is not a law, or has another number of outputs.
         """
         super().__init__()
         builder = DiagramBuilder()
-        system = FunctionGuidanceSystem(law, action_size, prior.pose_size, prior.wrench_size, prior.period)
+        system = LawSystem(law, prior.wrench_size, prior.period)
+        if law.num_outputs != prior.pose_size:
+            raise InputError(
+                f"the pose has size {prior.pose_size}: give the law as many outputs, not {law.num_outputs}"
+            )
         builder.AddNamedSystem("law", system)
         violation = ConstraintViolation(prior.constraints, prior.period)
         add_system(builder, "violation", violation, pose=system.get_desired_pose_output_port())

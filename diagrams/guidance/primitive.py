@@ -1,26 +1,90 @@
-"""Guidance by a movement primitive: the demonstrations alone (KMP), KGRL and sKGRL."""
+"""Guidance by a movement primitive: the demonstrations alone (KMP), KGRL, sKGRL and residual RL."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from typing import Any, Literal
 
 import numpy as np
-from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation, ZeroOrderHold
 
+from guiderail.diagrams.envs.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import POSE_SIZE
+from guiderail.models.control.command_filters import BarrierFilter, CommandLaw, KeepOutFilter, TangentSpaceFilter
+from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.motion_constraints import MotionConstraintFilter
+from guiderail.models.laws.primitive import PrimitiveLaw
+from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.constraint_violation import ConstraintViolation
+from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history_length_schedule import HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.progress_clock import ProgressClock
+from guiderail.systems.residual import Residual
+
+MakeFilter = Callable[[PrimitiveConfig, KeepOut], CommandLaw]
+"""Function of the primitive's configuration and the keep-out walls that returns the filter of a residual's commands."""
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
     """Return the configuration of the prior's primitive; the prior must have demonstrations."""
     assert prior.primitive is not None
     return prior.primitive
+
+
+def make_law(
+    prior: PriorKnowledge,
+    *,
+    action: Literal["null_space", "residual", "none"] = "null_space",
+    constrained: bool = True,
+    history: bool = False,
+    make_filter: MakeFilter | None = None,
+) -> PrimitiveLaw:
+    """Return the law of a kind of guidance with a movement primitive.
+
+    Args:
+        prior: Prior knowledge with demonstrations.
+        action: Effect of the action: a null-space action (KGRL), a displacement of the command (residual RL), or none
+            (the demonstrations alone).
+        constrained: Enforce the linear constraints at every future point.
+        history: True if the motion passes through the last outputs (sKGRL).
+        make_filter: Function that returns the filter of a residual's commands; by default none.
+
+    Raises:
+        InputError: If limits of the motion are given, for guidance that does not enforce them, or the motion of a
+            residual waits for the robot (``progress=state``).
+    """
+    config = primitive_config_of(prior)
+    period, motion = config.control_period, config.motion
+    if action == "residual" and config.progress is not None:
+        raise InputError("residual guidance is driven by the clock: choose kgrl, skgrl or kmp for progress=state")
+    command_filter: CommandLaw | None = None
+    if make_filter is not None:
+        assert config.keep_out is not None
+        command_filter = make_filter(config, config.keep_out)
+    if action == "none" or constrained:
+        command_filter = MotionConstraintFilter(motion, period) if motion is not None else None
+    elif motion is not None:
+        refuse_limits(config)
+    primitive = config.primitive(history=history, constrained=constrained)
+    return PrimitiveLaw(
+        primitive,
+        config.null_space_gains(primitive) if action == "null_space" else np.zeros(config.num_outputs),
+        residual=config.residual_gains() if action == "residual" else None,
+        outputs=config.explored_outputs,
+        history_source=config.history_source,  # type: ignore[arg-type]
+        # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
+        near=primitive.reference.means[0] if config.num_outputs == POSE_SIZE else None,
+        command_filter=command_filter,
+        progress=config.progress,
+        checked=motion or config.constraints,
+    )
 
 
 def refuse_limits(config: PrimitiveConfig) -> None:
@@ -37,8 +101,8 @@ def refuse_limits(config: PrimitiveConfig) -> None:
         raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
-class PrimitiveGuidance(Guidance):
-    """Base class of guidance around a movement primitive.
+class DemonstratedGuidance(Guidance):
+    """Base class of guidance with demonstrations.
 
     ``action`` has one entry per explored output. ``constraint_violation`` is the command's violation of the
     constraints, even if this kind of guidance does not enforce them.
@@ -58,32 +122,6 @@ class PrimitiveGuidance(Guidance):
         self._held_action = hold.get_output_port()
         return action, pose.get_output_port()
 
-    def _constrain(
-        self, builder: DiagramBuilder, config: PrimitiveConfig, kmp: LcNsKmpSystem, pose: OutputPort
-    ) -> tuple[OutputPort, OutputPort]:
-        """Return the ports of the command and the fallback flag, after the motion constraints if there are any.
-
-        The primitive's progress waits for the robot if the configuration has a progress rule.
-        """
-        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
-        if config.motion is not None:
-            from guiderail.models.control.motion_constraints import MotionConstraintFilter
-            from guiderail.systems.command_filter import CommandFilter
-
-            motion = CommandFilter(MotionConstraintFilter(config.motion, config.control_period), config.control_period)
-            add_system(builder, "motion_constraints", motion, desired_pose=command, pose=pose)
-            count = add_system(builder, "fallbacks", Adder(2, 1), fallback, motion.get_intervention_output_port())
-            flag = add_system(builder, "fallback", Saturation(np.zeros(1), np.ones(1)), count.get_output_port())
-            command, fallback = motion.get_safe_pose_output_port(), flag.get_output_port()
-        if config.progress is not None:
-            from guiderail.systems.progress_clock import ProgressClock
-
-            clock = ProgressClock(config.progress, config.num_outputs, config.control_period)
-            add_system(builder, "progress", clock, command=command, pose=pose)
-            builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
-            builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
-        return command, fallback
-
     def _finish(
         self, builder: DiagramBuilder, config: PrimitiveConfig, desired_pose: OutputPort, fallback: OutputPort
     ) -> None:
@@ -97,134 +135,146 @@ class PrimitiveGuidance(Guidance):
         builder.BuildInto(self)
 
 
-def add_demonstration(
-    builder: DiagramBuilder, config: PrimitiveConfig, action: OutputPort, *, takes_window: bool = False
-) -> LcNsKmpSystem:
-    """Add a primitive that commands the mean of the reference, without actions, constraints or history.
+class PrimitiveGuidance(DemonstratedGuidance):
+    """Guidance around a movement primitive: the systems of a `PrimitiveLaw`, one for each of its parts.
 
-    The reference is fitted to the demonstrations, or is the input ``reference_window`` if `takes_window` is True.
-    """
-    primitive = config.primitive(history=False, constrained=False)
-    kmp = builder.AddNamedSystem("kmp", LcNsKmpSystem(primitive, None, config.control_period))
-    if takes_window:
-        builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-    # Not a ConstantVectorSource: Drake assumes that its output depends on time, so the primitive would be computed
-    # again at every step of the plant.
-    zero = add_system(builder, "no_action", MatrixGain(D=np.zeros((config.num_outputs, config.num_outputs))), action)
-    builder.Connect(zero.get_output_port(), kmp.get_null_space_action_input_port())
-    return kmp
-
-
-@register_guidance(
-    "kmp",
-    needs=(("demonstrations",),),
-    label="demonstration alone",
-    color="#333333",
-    demonstrates=True,
-    displaces=True,
-    ignores_actions=True,
-)
-class KmpGuidance(PrimitiveGuidance):
-    """Guidance that commands the demonstrations' mean; the action has no effect.
-
-    The linear constraints are enforced only together with shapes or limits of the motion.
+    With an adaptive history, sKGRL's motion passes through fewer past outputs during contact, so that it reacts to
+    forces as quickly as KGRL. With the shortest history, the motion passes through the last output only.
     """
 
-    def __init__(self, prior: PriorKnowledge):
-        super().__init__()
-        config, builder = primitive_config_of(prior), DiagramBuilder()
-        action, pose = self._export_inputs(builder, config)
-        kmp = add_demonstration(builder, config, action)
-        self._finish(builder, config, *self._constrain(builder, config, kmp, pose))
+    def __init__(self, prior: PriorKnowledge, *, takes_window: bool = False, **kind: Any):
+        """Construct the guidance.
 
-
-@register_guidance(
-    "kgrl",
-    needs=(("demonstrations",),),
-    label="KGRL",
-    color="#1f77b4",
-    demonstrates=True,
-    displaces=True,
-)
-class KgrlGuidance(PrimitiveGuidance):
-    """KGRL: actions displace the command where the demonstrations vary, and commands satisfy the constraints."""
-
-    def __init__(self, prior: PriorKnowledge, *, constrained: bool = True, takes_window: bool = False):
-        """Construct the guidance; without constraints it is the guidance `residual_covariance`.
-
-        With `takes_window`, mean and covariance come from the input ``reference_window``, not from the demonstrations.
+        Args:
+            prior: Prior knowledge with demonstrations.
+            takes_window: True if the reference is the input ``reference_window`` instead of the demonstrations.
+            **kind: Parameters of `make_law`; KGRL by default.
 
         Raises:
-            InputError: If there are limits of speed, acceleration or joints, but `constrained` is False.
+            InputError: As `make_law`.
         """
         super().__init__()
-        given_config, builder = primitive_config_of(prior), DiagramBuilder()
-        config = given_config if constrained else replace(given_config, motion=None)
-        if not constrained:
-            refuse_limits(given_config)
+        config, law, builder = primitive_config_of(prior), make_law(prior, **kind), DiagramBuilder()
         action, pose = self._export_inputs(builder, config)
-        primitive = config.primitive(history=False, constrained=constrained)
-        kmp = LcNsKmpSystem(primitive, config.null_space_gains(primitive), config.control_period)
+        is_adaptive = law.primitive.history > 0 and config.adaptive_history
+        shorter = [
+            (short, config.null_space_gains(short))
+            for short in (map(config.primitive_of_length, config.shorter_histories) if is_adaptive else ())
+        ]
+        kmp = LcNsKmpSystem(law.primitive, law.gain, config.control_period, shorter)
         add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
         if takes_window:
             builder.ExportInput(kmp.get_reference_window_input_port(), "reference_window")
-        self._finish(builder, given_config, *self._constrain(builder, config, kmp, pose))
-
-
-@register_guidance(
-    "residual_covariance",
-    needs=(("demonstrations",),),
-    label="residual RL scaled by covariance",
-    color="#e377c2",
-    demonstrates=True,
-    displaces=True,
-)
-def residual_covariance(prior: PriorKnowledge) -> KgrlGuidance:
-    """Build KGRL without constraints: a residual that is scaled by the covariance of the demonstrations."""
-    return KgrlGuidance(prior, constrained=False)
-
-
-@register_guidance(
-    "skgrl",
-    needs=(("demonstrations",),),
-    label="sKGRL",
-    color="#2ca02c",
-    demonstrates=True,
-    displaces=True,
-)
-class SkgrlGuidance(PrimitiveGuidance):
-    """Guidance by sKGRL: null-space actions with a history of outputs, so that exploration is smooth.
-
-    With an adaptive history, the motion passes through fewer past outputs during contact, so that it reacts to forces
-    as quickly as KGRL. With the shortest history, the motion passes through the last output only.
-    """
-
-    def __init__(self, prior: PriorKnowledge):
-        from guiderail.systems.history_buffer import HistoryBuffer
-
-        super().__init__()
-        config, builder = primitive_config_of(prior), DiagramBuilder()
-        action, pose = self._export_inputs(builder, config)
-        primitive = config.primitive(history=True)
-        gains = config.null_space_gains(primitive)
-        shorter_primitives = map(config.primitive_of_length, config.shorter_histories)
-        shorter = [(short, config.null_space_gains(short)) for short in shorter_primitives]
-        kmp = LcNsKmpSystem(primitive, gains, config.control_period, shorter)
-        add_system(builder, "lc_ns_kmp", kmp, null_space_action=action)
+        command, fallback = kmp.get_command_output_port(), kmp.get_fallback_output_port()
+        if law.residual is not None:
+            residual = add_system(builder, "residual", Residual(law.residual), reference=command, action=action)
+            command = residual.get_desired_pose_output_port()
+        if law.command_filter is not None:
+            safety = CommandFilter(law.command_filter, config.control_period)
+            add_system(builder, "command_filter", safety, desired_pose=command, pose=pose)
+            command, flag = safety.get_safe_pose_output_port(), safety.get_intervention_output_port()
+            if law.primitive.constraints.num_constraints:  # otherwise the primitive has no fallback
+                count = add_system(builder, "fallbacks", Adder(2, 1), fallback, flag)
+                either = Saturation(np.zeros(1), np.ones(1))
+                flag = add_system(builder, "fallback", either, count.get_output_port()).get_output_port()
+            fallback = flag
+        if law.progress is not None:
+            clock = ProgressClock(law.progress, config.num_outputs, config.control_period)
+            add_system(builder, "progress", clock, command=command, pose=pose)
+            builder.Connect(clock.get_motion_time_output_port(), kmp.get_motion_time_input_port())
+            builder.ExportOutput(clock.get_motion_time_output_port(), "motion_time")
+        if law.primitive.history:
+            history = HistoryBuffer(config.num_outputs, config.history, config.control_period, law.near)
+            past = command if law.history_source == "commanded" else pose
+            add_system(builder, "history", history, initial_output=pose, output=past)
+            builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
         if shorter:
-            from guiderail.systems.history_length_schedule import HistoryLengthSchedule
-
             lengths = (config.history, *config.shorter_histories)
             schedule = HistoryLengthSchedule(lengths, config.control_period, wrench_size=config.wrench_size)
             builder.AddNamedSystem("history_length", schedule)
             builder.ConnectInput("wrench", schedule.get_wrench_input_port())
             builder.Connect(schedule.get_history_length_output_port(), kmp.get_history_length_input_port())
-        # Commanded and measured histories both start at the robot's pose, so that the first command does not jump.
-        near = primitive.reference.means[0] if config.num_outputs == 6 else None  # a pose, with angles
-        history = HistoryBuffer(config.num_outputs, config.history, config.control_period, near)
-        add_system(builder, "history", history, initial_output=pose)
-        command, fallback = self._constrain(builder, config, kmp, pose)
-        past = command if config.history_source == "commanded" else pose
-        builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
-        builder.Connect(past, history.get_output_input_port())
         self._finish(builder, config, command, fallback)
+
+
+RESIDUAL: dict[str, Any] = {"action": "residual", "constrained": False}
+
+
+@register_guidance(
+    "kmp", needs=(("demonstrations",),), label="demonstration alone", color="#333333",
+    demonstrates=True, displaces=True, ignores_actions=True,
+)  # fmt: skip
+def kmp(prior: PriorKnowledge) -> Diagram:
+    """Build guidance that commands the demonstrations' mean; the action has no effect.
+
+    The linear constraints are enforced only together with shapes or limits of the motion.
+    """
+    return PrimitiveGuidance(prior, action="none", constrained=False)
+
+
+@register_guidance(
+    "kgrl", needs=(("demonstrations",),), label="KGRL", color="#1f77b4", demonstrates=True, displaces=True
+)
+def kgrl(prior: PriorKnowledge) -> Diagram:
+    """Build KGRL: actions displace the command where the demonstrations vary, and commands satisfy the constraints."""
+    return PrimitiveGuidance(prior)
+
+
+@register_guidance(
+    "residual_covariance", needs=(("demonstrations",),), label="residual RL scaled by covariance", color="#e377c2",
+    demonstrates=True, displaces=True,
+)  # fmt: skip
+def residual_covariance(prior: PriorKnowledge) -> Diagram:
+    """Build KGRL without constraints: a residual that is scaled by the covariance of the demonstrations."""
+    return PrimitiveGuidance(prior, constrained=False)
+
+
+@register_guidance(
+    "skgrl", needs=(("demonstrations",),), label="sKGRL", color="#2ca02c", demonstrates=True, displaces=True
+)
+def skgrl(prior: PriorKnowledge) -> Diagram:
+    """Build sKGRL: null-space actions with a history of outputs, so that exploration is smooth."""
+    return PrimitiveGuidance(prior, history=True)
+
+
+@register_guidance(
+    "residual", needs=(("demonstrations",), ("approach", "template")), label="residual RL", color="#d62728",
+    demonstrates=True, displaces=True,
+)  # fmt: skip
+def residual(prior: PriorKnowledge) -> Diagram:
+    """Build residual RL with demonstrations, or with a scripted approach and active constraints."""
+    from guiderail.diagrams.guidance.sct import ResidualDescent
+
+    return PrimitiveGuidance(prior, **RESIDUAL) if prior.primitive is not None else ResidualDescent(prior)
+
+
+@register_guidance(
+    "safe_residual", needs=(("demonstrations", "keep_out"),), label="safe residual RL", color="#ff7f0e",
+    demonstrates=True, displaces=True,
+)  # fmt: skip
+def safe_residual(prior: PriorKnowledge) -> Diagram:
+    """Build residual RL with a filter that projects the command and stops it at walls; see `KeepOutFilter`."""
+    return PrimitiveGuidance(prior, **RESIDUAL, make_filter=lambda config, walls: KeepOutFilter(walls))
+
+
+@register_guidance(
+    "residual_cbf", needs=(("demonstrations", "keep_out"),), label="residual RL, barrier function", color="#bcbd22",
+    demonstrates=True, displaces=True, options=BarrierOptions,
+)  # fmt: skip
+def residual_cbf(prior: PriorKnowledge) -> Diagram:
+    """Build residual RL with a control barrier function on the command; see `BarrierFilter`."""
+    decay = prior.options["barrier_decay"]
+    return PrimitiveGuidance(prior, **RESIDUAL, make_filter=lambda config, walls: BarrierFilter(walls, decay))
+
+
+@register_guidance(
+    "residual_tangent", needs=(("demonstrations", "keep_out"),), label="residual RL, tangent space", color="#7f7f7f",
+    demonstrates=True, displaces=True, options=TangentOptions,
+)  # fmt: skip
+def residual_tangent(prior: PriorKnowledge) -> Diagram:
+    """Build residual RL in the tangent space of the constraints; see `TangentSpaceFilter`."""
+
+    def make_filter(config: PrimitiveConfig, walls: KeepOut) -> CommandLaw:
+        return TangentSpaceFilter(walls, prior.options["slack_width"] * float(config.residual_gains().max()))
+
+    return PrimitiveGuidance(prior, **RESIDUAL, make_filter=make_filter)

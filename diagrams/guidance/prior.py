@@ -12,18 +12,16 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
+from guiderail.models.laws.primitive import HISTORY_SOURCES
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
-from guiderail.models.primitives.lc_ns_kmp import get_shared_primitive
+from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON, get_shared_primitive
 
 if TYPE_CHECKING:
     from guiderail.models.control.keep_out import KeepOut
     from guiderail.models.control.motion_constraints import MotionConstraints
-    from guiderail.models.primitives.stepper import StateProgress
+    from guiderail.models.laws import StateProgress
     from guiderail.models.templates import SharedControlTemplate
-
-
-HISTORY_SOURCES = ("commanded", "measured")
 
 
 def limits_per_output(name: str, limits: Sequence[float], outputs: int) -> np.ndarray:
@@ -79,11 +77,11 @@ class PrimitiveConfig:
     reference: ReferenceTrajectory
     constraints: LinearConstraints
     control_period: float
-    history: int = 10
+    history: int = HISTORY
     history_variance: float = 1e-6
     history_source: str = "commanded"
     adaptive_history: bool = False
-    horizon: int = 40
+    horizon: int = HORIZON
     lambda_: float = 6.0
     beta: float = 6.0
     kernel: Kernel = SquaredExponential()  # noqa: RUF009 (it is immutable)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import Registry, check_callable
+from guiderail.models.laws.law import Law
 
 if TYPE_CHECKING:
     from pydrake.systems.framework import Diagram
 
     from guiderail.diagrams.envs.options import Options
     from guiderail.diagrams.guidance.prior import PriorKnowledge
+
+Builder = TypeVar("Builder", bound="Callable[[PriorKnowledge], Diagram | Law] | type[Law]")
 
 REQUIREMENTS = {
     "demonstrations": "demonstrations",
@@ -30,7 +33,8 @@ class GuidanceKind:
 
     Attributes:
         name: Value of the option `guidance`.
-        build: Function from prior knowledge to a diagram with the ports of `Guidance`.
+        build: Function from prior knowledge to a diagram with the ports of `Guidance`, or to a `Law`; or a subclass of
+            `Law`, which is called with the size of the pose and `known`.
         needs: Alternative tuples of names in `REQUIREMENTS`; the task must provide all names of one alternative.
         label: Label in figures.
         color: Color in figures, "#rrggbb".
@@ -44,7 +48,7 @@ class GuidanceKind:
     """
 
     name: str
-    build: Callable[[PriorKnowledge], Diagram]
+    build: Callable[[PriorKnowledge], Diagram | Law] | type[Law]
     needs: tuple[tuple[str, ...], ...]
     label: str
     color: str
@@ -90,8 +94,8 @@ def register_guidance(
     displaces: bool = False,
     options: type[Options] | None = None,
     ignores_actions: bool = False,
-) -> Callable[[Callable[[PriorKnowledge], Diagram]], Callable[[PriorKnowledge], Diagram]]:
-    """Return a decorator that registers a function or a class; its argument is a `PriorKnowledge`.
+) -> Callable[[Builder], Builder]:
+    """Return a decorator that registers a subclass of `Law`, or a function of a `PriorKnowledge`.
 
     The decorator raises an `InputError` if another kind of guidance has this name, or an argument or the decorated
     object has the wrong type.
@@ -117,7 +121,7 @@ def register_guidance(
             f"(('template',),), not {brief(needs)}"
         )
 
-    def add(build: Callable[[PriorKnowledge], Diagram]) -> Callable[[PriorKnowledge], Diagram]:
+    def add(build: Builder) -> Builder:
         kind = GuidanceKind(name, build, needs, label or name, color, demonstrates, displaces, options, ignores_actions)
         GUIDANCE.register(name, kind)
         return build
@@ -168,7 +172,8 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
         task: Name of the task, for the error message.
 
     Raises:
-        InputError: If there is no such kind, a requirement is missing, or its builder returns no diagram.
+        InputError: If there is no such kind, a requirement is missing, or its builder returns neither a diagram nor a
+            law.
     """
     from pydrake.systems.framework import System
 
@@ -177,10 +182,14 @@ def build_guidance(name: str, prior: PriorKnowledge, task: str = "this task") ->
         fields = kind.options.model_fields.items()
         defaults = {option: field.get_default() for option, field in fields if not field.is_required()}
         prior = replace(prior, options=defaults | dict(prior.options))
-    guidance = kind.build(prior)
+    build: Any = kind.build
+    is_law_class = isinstance(build, type) and issubclass(build, Law)
+    guidance = build(prior.pose_size, known=prior) if is_law_class else build(prior)
+    if isinstance(guidance, Law):
+        from guiderail.diagrams.guidance.guidance import LawGuidance
+
+        guidance = LawGuidance(prior, guidance)
     if not isinstance(guidance, System):
-        raise InputError(
-            f"the builder of guidance '{name}' must return a diagram, such as FunctionGuidance, not {brief(guidance)}"
-        )
+        raise InputError(f"the builder of guidance '{name}' must return a diagram or a Law, not {brief(guidance)}")
     guidance.set_name("guidance")
     return guidance

@@ -7,15 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder
-from pydrake.systems.primitives import ConstantVectorSource, PassThrough, ZeroOrderHold
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, PassThrough, TrajectorySource, ZeroOrderHold
+from pydrake.trajectories import PiecewisePolynomial
 
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.transforms import WRENCH_SIZE
+from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.systems.active_constraint_projector import ActiveConstraintProjector
+from guiderail.systems.residual import Residual
 from guiderail.systems.sct_input_mapping import SctInputMapping
 from guiderail.systems.sct_state_machine import SctStateMachine
 
@@ -160,6 +162,41 @@ class SctGuidance(Guidance):
         self._filter.set_frames(root_context, frames)
         mapped = {name: X_WF for name, X_WF in frames.items() if name in self._mapping.frames.names}
         self._mapping.frames.set(self._mapping.GetMyMutableContextFromRoot(root_context), mapped)
+
+
+class ResidualDescent(Guidance):
+    """Residual RL without demonstrations: p̂_t = p_t + Δp_t, where p_t is a straight descent.
+
+    ``action`` is (3,); the command also respects the template's speed limits. In addition to the ports of all guidance
+    there are ``state``, ``transition_distance``, ``progress`` and ``measured_violation``, all (1,).
+    """
+
+    def __init__(self, prior: PriorKnowledge):
+        """Construct the guidance from an approach and the active constraints of a template.
+
+        All poses are in the frame of the template's only object.
+        """
+        super().__init__()
+        assert prior.template is not None
+        assert prior.approach is not None
+        placed, approach, period = prior.template, prior.approach, prior.period
+        template = placed.template if placed.is_constrained(True) else placed.template.without_active_constraints()
+        builder = DiagramBuilder()
+        hold = builder.AddNamedSystem("action_hold", ZeroOrderHold(period, 3))
+        times = [0.0, (approach.heights[0] - approach.heights[1]) / approach.speed]
+        corners = np.zeros((POSE_SIZE, 2))
+        corners[2] = approach.heights
+        line = builder.AddNamedSystem("descent", TrajectorySource(PiecewisePolynomial.FirstOrderHold(times, corners)))
+        # Without this hold, all systems after it would be computed again at every step of the plant.
+        descent = add_system(builder, "descent_hold", ZeroOrderHold(period, POSE_SIZE), line.get_output_port())
+        spread = add_system(builder, "spread", MatrixGain(D=np.eye(POSE_SIZE, 3)), hold.get_output_port())
+        residual = Residual(np.array([approach.reach] * 3 + [0.0] * 3))
+        add_system(builder, "residual", residual, reference=descent.get_output_port(), action=spread.get_output_port())
+        constraints = ActiveConstraintFilter(template, placed.frames, period)
+        requested_pose = residual.get_desired_pose_output_port()
+        add_system(builder, "active_constraints", constraints, requested_pose=requested_pose)
+        constraints.export_ports(builder, hold)
+        builder.BuildInto(self)
 
 
 def _build_sct(

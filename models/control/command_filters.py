@@ -1,8 +1,8 @@
-"""Filters of commanded positions relative to the last command: a control barrier function, and ATACOM.
+"""Filters of commanded positions: projection, a control barrier function, and ATACOM.
 
-Each filter bounds the change of a command from one control step to the next by constraints with rows of unit norm,
-h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. If a desired command is
-not finite, the last command is repeated.
+The barrier and ATACOM bound the change of a command from one control step to the next by constraints with rows of unit
+norm, h(y) = G y − c ≥ 0. If the constraints hold at the first command, they hold at every later one. If a desired
+command is not finite, the last command is repeated.
 """
 
 from typing import Protocol
@@ -22,22 +22,53 @@ class CommandLaw(Protocol):
     """Law that computes a safe command from the last and the desired command."""
 
     num_outputs: int
+    needs_pose: bool  # True if `apply` uses the measured pose
 
     def start(self, pose: np.ndarray) -> np.ndarray:
         """Return the initial state (S,) of a motion from a pose (O,); a state begins with the last command (O,)."""
         ...
 
-    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Return the state (S,) after the state `last`, for a desired command (O,), and True if the law intervened."""
+    def apply(self, last: np.ndarray, desired: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the state (S,) after the state `last`, for a desired command (O,), and True if the law intervened.
+
+        `pose` (O,) is the pose measured in this control step.
+        """
         ...
 
 
 class _LastCommand:
     """Law whose state is the last command."""
 
+    needs_pose = False
+
     def start(self, pose: np.ndarray) -> np.ndarray:
         """Return the initial state, a copy of the pose (O,) at which a motion begins."""
         return pose.copy()
+
+
+class KeepOutFilter(_LastCommand):
+    """Projection of commands by active constraints, from the measured pose (thesis, section 4.4.1).
+
+    `KeepOut.project` moves a command out of boxes and into linear constraints. It intervenes if a box changes the
+    command, but not if only the linear constraints do.
+
+    Args:
+        keep_out: Boxes and constraints, with their margin.
+
+    Attributes:
+        num_outputs: Number of outputs O.
+    """
+
+    needs_pose = True
+
+    def __init__(self, keep_out: KeepOut):
+        self._keep_out, self.num_outputs = keep_out, keep_out.num_outputs
+
+    def apply(self, last: np.ndarray, desired: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Return the safe command (O,), and True if a box changed it or the last command is repeated."""
+        if not (is_finite(desired) and is_finite(pose)):
+            return last.copy(), True
+        return self._keep_out.project(pose, desired)
 
 
 class BarrierFilter(_LastCommand):
@@ -67,7 +98,7 @@ class BarrierFilter(_LastCommand):
         self._keep_out, self._decay = keep_out, decay
         self.num_outputs = keep_out.num_outputs
 
-    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+    def apply(self, last: np.ndarray, desired: np.ndarray, pose: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if it differs from the desired one.
 
         If no allowed command is found, the last command is repeated. This can happen while the last command is not
@@ -116,7 +147,7 @@ class TangentSpaceFilter(_LastCommand):
         self._keep_out, self._width = keep_out, width
         self.num_outputs = keep_out.num_outputs
 
-    def apply(self, last: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+    def apply(self, last: np.ndarray, desired: np.ndarray, pose: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
         """Return the safe command (O,), and True if the step was shortened or the last command repeated.
 
         The projection does not count as an intervention, because it changes every step towards a constraint. The

@@ -143,6 +143,8 @@ class MotionConstraintFilter:
         constraints: Constraints.
     """
 
+    needs_pose = False
+
     def __init__(self, constraints: MotionConstraints, period: float):
         if not isinstance(constraints, MotionConstraints):
             raise InputError(f"a filter needs MotionConstraints, not {brief(constraints)}")
@@ -171,10 +173,10 @@ class MotionConstraintFilter:
             share = safe
         return np.concatenate([pose, share * displacement])
 
-    def apply(self, state: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, bool]:
+    def apply(self, state: np.ndarray, desired: np.ndarray, pose: np.ndarray | None = None) -> tuple[np.ndarray, bool]:
         """Return the next state (2 O,), which begins with the command, and True if only braking was safe.
 
-        The motion brakes if the desired command (O,) is not finite.
+        The motion brakes if the desired command (O,) is not finite. The measured pose is not used.
         """
         last, velocity = state[: self.num_outputs], state[self.num_outputs :]
         share, rest_share = self._braking(velocity)

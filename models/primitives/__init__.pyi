@@ -14,8 +14,6 @@ from .poses import pose_rotation as pose_rotation
 from .promp import ProMp as ProMp
 from .qp import UnsolvableError as UnsolvableError
 from .reference import ReferenceTrajectory as ReferenceTrajectory
-from .stepper import Command as Command
-from .stepper import PrimitiveStepper as PrimitiveStepper
 from .window import BatchPrediction as BatchPrediction
 from .window import Modification as Modification
 from .window import Prediction as Prediction

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     pass
 
 
+HISTORY, HORIZON = 10, 40
+"""Default numbers of past outputs P of sKGRL, and of future points H with constraints."""
+
+
 class LcNsKmp:
     """Movement primitive that follows demonstrations, null-space actions and linear constraints.
 
@@ -70,7 +74,7 @@ class LcNsKmp:
         kernel: Kernel | None = None,
         lambda_: float = 6.0,
         beta: float = 6.0,
-        horizon: int = 40,
+        horizon: int = HORIZON,
         history: int = 0,
         history_variance: float = 1e-6,
         constraints: LinearConstraints | None = None,

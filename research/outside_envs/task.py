@@ -155,7 +155,7 @@ class OutsideTask:
         guided: gymnasium.Env = GuidedEnv(
             env, demonstrations=None if is_fitted else segments, action_dims=None if is_fitted else self.action_dims,
             guidance=guidance, pose=self.pose, to_action=self.to_action, period=self.period,
-            action_repeat=ACTION_REPEAT,
+            action_repeat=ACTION_REPEAT, history=4, horizon=20,  # as in the stored results
         )  # fmt: skip
         if self.decisions:
             guided = HeldAction(guided, self.decisions)

@@ -9,8 +9,8 @@ from .diagrams.envs.observation import ObservationTerm as ObservationTerm
 from .diagrams.envs.options import Options as Options
 from .diagrams.envs.options import ResetOptions as ResetOptions
 from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
-from .diagrams.guidance.guidance import FunctionGuidance as FunctionGuidance
 from .diagrams.guidance.guidance import Guidance as Guidance
+from .diagrams.guidance.guidance import LawGuidance as LawGuidance
 from .diagrams.guidance.prior import PlacedTemplate as PlacedTemplate
 from .diagrams.guidance.prior import PrimitiveConfig as PrimitiveConfig
 from .diagrams.guidance.prior import PriorKnowledge as PriorKnowledge
@@ -24,6 +24,11 @@ from .diagrams.tasks.task import Task as Task
 from .diagrams.tasks.task import Threshold as Threshold
 from .models.common.arrays import round_period as round_period
 from .models.common.errors import InputError as InputError
+from .models.laws import Command as Command
+from .models.laws import Law as Law
+from .models.laws import PrimitiveLaw as PrimitiveLaw
+from .models.laws import Stepper as Stepper
+from .models.laws import TemplateLaw as TemplateLaw
 from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp

@@ -15,7 +15,8 @@ from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.control.shapes import Sphere, linearize
-from guiderail.models.primitives import LcNsKmp, PrimitiveStepper
+from guiderail.models.laws import PrimitiveLaw, Stepper
+from guiderail.models.primitives import LcNsKmp
 from guiderail.models.templates.schema import parse_template
 
 KINDS = ("reference", "command", "command, smooth", "speed", "speed and acceleration", "template")
@@ -124,7 +125,7 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
     for _ in range(EPISODES):
         style, action = int(rng.integers(5)), np.zeros(2)
         start = reference.means[0] + rng.normal(0.0, 0.02, 2)
-        stepper = PrimitiveStepper(primitive, start, gain, motion=motion)
+        stepper = Stepper(PrimitiveLaw(primitive, gain, command_filter=motion), start)
         commands, outside = [start] if motion else [], -np.inf
         for n in range(reference.num_steps):
             if style == 0:  # action for which the unconstrained primitive commands the center of the obstacle
@@ -134,9 +135,9 @@ def attack_primitive(rng: np.random.Generator, config: object, kind: str, radius
             if style or history:
                 action = pushing_action(rng, style, commands[-1] if commands else start, sphere.center, action)
             command = stepper.step(action)
-            commands.append(command.output)
-            result.fallbacks += command.is_fallback
-            outside = max(outside, command.output[0] - 0.6)
+            commands.append(command.pose)
+            result.fallbacks += command.fallback
+            outside = max(outside, command.pose[0] - 0.6)
         result.add(np.array(commands), sphere.center, radius, config.control_period, outside)
 
 

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.command_filters import BarrierFilter, TangentSpaceFilter
+from guiderail.models.control.command_filters import BarrierFilter, KeepOutFilter, TangentSpaceFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
@@ -121,7 +121,7 @@ class PassThrough:
 
     num_outputs = 2
 
-    def apply(self, last, desired):
+    def apply(self, last, desired, pose):
         return desired.copy(), False
 
     def start(self, pose):
@@ -179,3 +179,60 @@ def test_measured_pose_at_initialization_must_be_finite():
     system.get_pose_input_port().FixValue(simulator.get_mutable_context(), [np.inf, 0.0])
     with pytest.raises(InputError, match="measured pose must be finite"):
         simulator.Initialize()
+
+
+@pytest.fixture
+def projection():
+    """Return a filter by projection with a wall at 1 < x < 2 and a margin of 0.1."""
+    wall = KeepOut([[1.0, -9.0]], [[2.0, 9.0]], LinearConstraints.none(2), margin=0.1)
+    return CommandFilter(KeepOutFilter(wall), period=0.1)
+
+
+def start(system, desired, pose):
+    """Return an initialized simulator, its context, and the values of the desired and the measured pose."""
+    simulator = Simulator(system)
+    context = simulator.get_mutable_context()
+    ports = (
+        system.get_desired_pose_input_port().FixValue(context, desired),
+        system.get_pose_input_port().FixValue(context, pose),
+    )
+    simulator.Initialize()
+    return simulator, context, *ports
+
+
+def test_measured_pose_has_no_direct_feedthrough(projection):
+    feedthrough = [[projection.HasDirectFeedthrough(i, o) for o in range(2)] for i in range(2)]
+    assert feedthrough == [[True, True], [False, False]]
+
+
+def test_safe_command_is_passed_through(projection):
+    _, context, _, _ = start(projection, [0.5, 0.3], [0.0, 0.0])
+    np.testing.assert_array_equal(projection.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
+    assert projection.get_intervention_output_port().Eval(context) == [0.0]
+
+
+def test_command_into_the_wall_is_projected_onto_its_margin(projection):
+    _, context, _, _ = start(projection, [3.0, 0.0], [0.0, 0.0])
+    np.testing.assert_allclose(projection.get_safe_pose_output_port().Eval(context), [0.9, 0.0], atol=1e-5)
+    assert projection.get_intervention_output_port().Eval(context) == [1.0]
+
+
+def test_measured_pose_takes_effect_at_the_next_control_step(projection):
+    simulator, context, _, pose = start(projection, [3.0, 1.0], [0.0, 0.0])
+    simulator.AdvanceTo(0.05)
+    before = projection.get_safe_pose_output_port().Eval(context).copy()
+    pose.GetMutableData().set_value([0.8, 0.9])
+    simulator.AdvanceTo(0.1)
+    np.testing.assert_array_equal(projection.get_safe_pose_output_port().Eval(context), before)
+    simulator.AdvanceTo(0.15)
+    assert projection.get_safe_pose_output_port().Eval(context)[1] > 0.9
+
+
+def test_last_command_is_repeated_when_a_pose_is_not_finite(projection):
+    simulator, context, desired, pose = start(projection, [0.5, 0.3], [0.0, 0.0])
+    simulator.AdvanceTo(0.15)
+    for port, value in ((desired, [np.nan, 0.0]), (pose, [np.nan, 0.0])):
+        port.GetMutableData().set_value(value)
+        simulator.AdvanceTo(context.get_time() + 0.1)
+        np.testing.assert_array_equal(projection.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
+        assert projection.get_intervention_output_port().Eval(context) == [1.0]

@@ -21,8 +21,8 @@ from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import WrenchBound
+from guiderail.models.laws import Law, StateProgress
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.models.primitives.stepper import StateProgress
 from guiderail.models.templates import load_template
 from oracles.prerequisites import changed_outputs
 from oracles.systems import RULES, check_source, classes, system_names
@@ -35,6 +35,13 @@ BOX = LinearConstraints.box([-1.0, -1.0], [1.0, 1.0])
 
 
 NAMES = [name for path in FILES for name in system_names(path)]
+
+
+class Repeat(Law):
+    """Law that repeats the measured pose."""
+
+    def command(self, state, action, pose, wrench):
+        return pose
 
 
 def primitive(history):
@@ -67,11 +74,11 @@ def system_by_name():
         systems.PhaseWrenchLimit(np.ones(8), np.ones(8), period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),
-        systems.FunctionGuidanceSystem(lambda action, pose, wrench: pose, 1, 2, 3, PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
         systems.HistoryLengthSchedule([1, 2], PERIOD),
         systems.ForceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
+        systems.LawSystem(Repeat(2, 1), 3, PERIOD),
         systems.LcNsKmpSystem(primitive(2), None, PERIOD, [(primitive(1), np.ones(2))]),
         systems.MeanForce(2, 4, PERIOD),
         systems.MeasuredPose(plant, body, RigidTransform()),
@@ -88,7 +95,6 @@ def system_by_name():
         systems.SpatialForceFromWrench(),
         systems.WrenchFromSpatialForce(),
         systems.RewardSystem([term]),
-        systems.SafetyFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0), PERIOD),
         systems.SctInputMapping(template, frames, PERIOD),
         systems.SctStateMachine(template, frames, PERIOD),
         systems.SensorDisturbance(PERIOD, np.ones(2), delay=1, configuration_size=2),

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.stepper import StateProgress
+from guiderail.models.laws import StateProgress
 from guiderail.systems.progress_clock import ProgressClock
 
 PERIOD = 0.125

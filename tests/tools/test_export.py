@@ -11,14 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.laws import Stepper, load_law
 from guiderail.models.policy import Policy
-from guiderail.models.primitives import (
-    LcNsKmp,
-    LinearConstraints,
-    PrimitiveStepper,
-    ReferenceTrajectory,
-    SquaredExponential,
-)
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
 from guiderail.tools.export import export_skill, policy_to_onnx
@@ -58,27 +52,17 @@ def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
     config = RunFolder(find_run(f"pretrained:{name}")).config()
     env = make_environment(config.task, config.environment)
     session = onnxruntime.InferenceSession(tmp_path / "skill/policy.onnx", providers=["CPUExecutionProvider"])
-    data, settings = np.load(tmp_path / "skill/primitive.npz"), skill["primitive"]
-    primitive = LcNsKmp(
-        ReferenceTrajectory(data["times"], data["means"], data["covariances"]),
-        kernel=SquaredExponential(length_scale=settings["length_scale"]),
-        constraints=LinearConstraints(data["G"], data["c"]),
-        **{key: settings[key] for key in ("lambda_", "beta", "horizon", "history", "history_variance")},
-    )
     policy = Policy.load(find_run(f"pretrained:{name}"))
     observation, _ = env.reset(seed=1_000_000)
     assert len(skill["observation"]) == len(observation)
     simulator = env.unwrapped.simulator
     station = simulator.get_system().GetSubsystemByName("station")
     pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
-    stepper = PrimitiveStepper(primitive, pose, data["gains"])
-    outputs = [entry["output"] for entry in skill["action"]]
+    stepper = Stepper(load_law(tmp_path / "skill"), pose)
     for _ in range(3):
         (row,) = session.run(None, {"observation": observation[None].astype(np.float32)})
         np.testing.assert_allclose(row[0], policy(observation), rtol=1e-4, atol=1e-5)
-        null_space_action = np.zeros(primitive.num_outputs)
-        null_space_action[outputs] = row[0]
-        commands = [stepper.step(null_space_action).output for _ in range(skill["action_repeat"])]
+        commands = [stepper.step(row[0]).pose for _ in range(skill["action_repeat"])]
         observation, _, terminated, truncated, _ = env.step(row[0])
         assert (terminated, truncated) == (False, False)
         np.testing.assert_allclose(env.unwrapped.trace.commanded[-len(commands) :], commands, atol=1e-6)
@@ -111,3 +95,11 @@ def test_export_refuses_options_that_its_loop_lacks(option, value, tmp_path, mon
     monkeypatch.setattr(RunFolder, "config", lambda self: config)
     with pytest.raises(InputError, match=f"{option}={value} cannot be exported"):
         export_skill("pretrained:passage", tmp_path / "out")
+
+
+@pytest.mark.parametrize("content", [None, "{", "{}"])
+def test_law_is_refused_without_an_exported_skill(content, tmp_path):
+    if content is not None:
+        (tmp_path / "skill.json").write_text(content)
+    with pytest.raises(InputError, match="is no exported skill"):
+        load_law(tmp_path)

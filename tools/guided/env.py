@@ -16,8 +16,10 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.laws.law import Law
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.full_turns import Orientation
+from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
 from guiderail.tools.contract import check_reset_result, check_step_result, check_values, naming_wrong_counts
@@ -26,9 +28,10 @@ from guiderail.tools.guided.guide import (
     Guide,
     GuideCommand,
     GuideSettings,
+    LawGuide,
     PrimitiveGuide,
     TemplateGuide,
-    predict,
+    predict_request,
 )
 from guiderail.tools.guided.segment import Constraints, Segment
 
@@ -64,9 +67,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             segment's discrete output, such as a gripper command.
         guidance: "kgrl", "skgrl", "kmp" (the demonstrated motion alone), "residual" (the action is added to the motion,
             without constraints), "clipped_residual" (as "residual", moved to the nearest point within the linear
-            constraints), "template", or a `Guide`. A guide replaces the arguments about the motion: settings such as
-            `horizon` are ignored, and the others are refused. Each environment needs its own guide, which stores the
-            state of an episode: give `Guide.copy()` to another environment.
+            constraints), "template", a `Law`, or a `Guide`. A law or a guide replaces the arguments about the motion:
+            settings such as `horizon` are ignored, and the others are refused. Each environment needs its own guide,
+            which stores the state of an episode: give `Guide.copy()` to another environment.
         constraints: Constraints of a single motion without segments, as in `Segment`.
         frame: Frame of a single motion without segments, as in `Segment`.
         template: Template, or the name or file of one, for guidance="template".
@@ -106,7 +109,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         demonstrations: Demonstrations | Sequence[Segment] | str | Path | None = None,
         pose: Callable[[Any, Any], np.ndarray],
         to_action: Callable[[Any, Any, np.ndarray, Any], Any],
-        guidance: str | Guide = "skgrl",
+        guidance: str | Law | Guide = "skgrl",
         constraints: Constraints | Callable[[Any, Any], Constraints] | None = None,
         frame: Callable[[Any, Any], Any] | None = None,
         template: SharedControlTemplate | str | Path | None = None,
@@ -115,9 +118,9 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         action_repeat: int = 5,
         action_scale: float = 1.0,
         action_dims: Sequence[int] | None = None,
-        history: int = 4,
+        history: int = HISTORY,
         history_variance: float = 1e-6,
-        horizon: int = 20,
+        horizon: int = HORIZON,
         orientation: Orientation | None = None,
         observe: Sequence[str] = OBSERVED,
         check_env: bool = False,
@@ -139,6 +142,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
         if orientation is not None:
             check_orientation(orientation)
+        if isinstance(guidance, Law):
+            guidance = LawGuide(guidance)
         if isinstance(guidance, Guide):
             unused = {
                 "demonstrations": demonstrations, "constraints": constraints, "frame": frame, "template": template,
@@ -202,7 +207,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         self.begin_action(action)
         while not self.is_action_complete:
-            self.advance(predict(self.request()))
+            self.advance(predict_request(self.request()))
         return self.end_action()
 
     def begin_action(self, action: Any) -> None:
@@ -431,7 +436,7 @@ def _predict_batch(requests: list[Any]) -> list[np.ndarray | None]:
             groups[id(request[0])].append(i)
     for rows in groups.values():
         if len(rows) == 1:
-            outputs[rows[0]] = predict(requests[rows[0]])
+            outputs[rows[0]] = predict_request(requests[rows[0]])
             continue
         primitive, _, _, history = requests[rows[0]]
         _, steps, raw, histories = zip(*(requests[i] for i in rows), strict=True)

@@ -17,11 +17,15 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
-from guiderail.models.primitives import LcNsKmp, LinearConstraints, PrimitiveStepper, UnsolvableError
+from guiderail.models.laws.law import Command, Law, check_law, safe_command
+from guiderail.models.laws.primitive import PrimitiveLaw, Request, predict
+from guiderail.models.laws.template import TemplateLaw
+from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import LONG, MIN_DEMONSTRATIONS, Selection, fit
 from guiderail.models.primitives.full_turns import Orientation, orientation_of_names
 from guiderail.models.primitives.gains import authority_gains, check_action_scale, deviation, residual_gains
+from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate
 from guiderail.tools.guided.segment import Frame, Segment, as_bool
@@ -31,9 +35,6 @@ GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 
 # Scale of the observed command of a template [m, rad]; a template has no demonstrations that define a range.
 _COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
-
-Request = tuple[LcNsKmp, int, np.ndarray, np.ndarray | None]
-"""Primitive, and the arguments of its `predict`."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class Guide(ABC):
 
     num_outputs: int
     num_actions: int
+    _law: Law
+    _last: Command | None  # command of the last control step; None at the start of `_law`
 
     def copy(self) -> Guide:
         """Return a guide for another environment, which shares the fitted parts but not the episode."""
@@ -68,9 +71,14 @@ class Guide(ABC):
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
         """Begin an episode at a measured pose (O,)."""
 
-    @abstractmethod
+    def _begin(self, law: Law, pose: np.ndarray) -> None:
+        """Begin with the commands of a law at a measured pose (O,), or after the last outputs (n, O)."""
+        self._law, self._state, self._last = law, law.start(pose), None
+
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
         """Begin a control step; return the request for the prediction that `finish` needs, or None.
+
+        Until `finish`, a second call begins the same control step again.
 
         Args:
             env: Environment, for the callables of segments and templates.
@@ -78,6 +86,21 @@ class Guide(ABC):
             action: Policy's action (A,), finite; the guide clips it to [−1, 1].
             pose: Measured pose (O,).
         """
+        self._action, self._pose = np.clip(action, -1.0, 1.0), pose
+        last = self._last
+        self._now = self._state if last is None else self._law.next(self._state, last, pose)
+        return self._law.request(self._now, self._action) if isinstance(self._law, PrimitiveLaw) else None
+
+    def _finish(self, output: np.ndarray | None) -> Command:
+        """Return the law's command for the predicted output, and complete the control step."""
+        law, last = self._law, self._last
+        if isinstance(law, PrimitiveLaw):
+            command = law.finish(self._now, self._action, self._pose, output)
+        else:
+            returned = law.command(self._now, self._action, self._pose, np.zeros(0))
+            command = safe_command(returned, self._pose if last is None else last.pose)
+        self._state, self._last = self._now, command
+        return command
 
     @abstractmethod
     def finish(self, output: np.ndarray | None) -> GuideCommand:
@@ -183,9 +206,9 @@ class GuideSettings:
     # κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
     action_dims: Sequence[int] | None = None  # outputs that an action moves, one entry each; all by default
-    history: int = 4  # P, number of past outputs that the motion of sKGRL passes through
+    history: int = HISTORY  # P, number of past outputs that the motion of sKGRL passes through
     history_variance: float = 1e-6  # ρ, variance of the past outputs [output²]
-    horizon: int = 20  # H, number of future points at which the constraints are satisfied
+    horizon: int = HORIZON  # H, number of future points at which the constraints are satisfied
     # Representation of the last three of six outputs; None: by the demonstrations' names, otherwise "rotation_vector".
     orientation: Orientation | None = None
 
@@ -221,7 +244,7 @@ class PrimitiveGuide(Guide):
             if (number := segment.recorded.num_demonstrations) < MIN_DEMONSTRATIONS:
                 raise InputError(
                     f"guidance by demonstrations needs at least {MIN_DEMONSTRATIONS} in each segment, and segment "
-                    f"{segment.name or index} has {number}: record more, or step a primitive with LcNsKmp.start "
+                    f"{segment.name or index} has {number}: record more, or give a PrimitiveLaw of your own "
                     "(ReferenceTrajectory.from_demonstrations takes two, or one with prior_std)"
                 )
         sizes = {segment.recorded.num_outputs for segment in segments}
@@ -245,9 +268,9 @@ class PrimitiveGuide(Guide):
         """
         self._recent = [np.array(pose, dtype=float)]
         self._is_ended = False
-        self._begin(0, env, observation)
+        self._begin_segment(0, env, observation)
 
-    def _begin(self, index: int, env: Any, observation: Any) -> None:
+    def _begin_segment(self, index: int, env: Any, observation: Any) -> None:
         self._index, self._step = index, 0
         fitted = self.segments[index]
         segment = fitted.segment
@@ -257,13 +280,22 @@ class PrimitiveGuide(Guide):
         constraints = constraints(env, observation) if callable(constraints) else constraints
         self.constraints = fitted.as_linear(constraints)
         is_enforced = "residual" not in self.guidance
-        self._motion, motion_filter = constraints if isinstance(constraints, MotionConstraints) else None, None
-        if self._motion is not None and is_enforced:
+        motion, motion_filter = constraints if isinstance(constraints, MotionConstraints) else None, None
+        if motion is not None and is_enforced:
             if self._period is None:
                 raise InputError("constraints of the motion need the period of the environment [s]")
-            motion_filter = MotionConstraintFilter(self._motion, self._period)
+            motion_filter = MotionConstraintFilter(motion, self._period)
         primitive, gains = fitted.primitive_for(
             self.constraints if is_enforced else LinearConstraints.none(self.num_outputs)
+        )
+        law = PrimitiveLaw(
+            primitive,
+            gains if is_enforced else np.zeros(self.num_outputs),
+            residual=None if is_enforced else gains,
+            outputs=self._dims,
+            command_filter=motion_filter,
+            checked=motion or self.constraints,
+            clip=self.constraints if self.guidance == "clipped_residual" else None,
         )
         length = max(primitive.history, 1 if motion_filter is None else 2)  # a filter continues the last velocity
         recent = self._recent[-length:]
@@ -271,11 +303,10 @@ class PrimitiveGuide(Guide):
         for output in recent[-2::-1]:  # each orientation is near the next, without jumps by a full turn
             past.insert(0, self.frame.to_frame(output, self._orientation, past[0]))
         past = [past[0]] * (length - len(past)) + past
-        start = past[-1] if primitive.history == 0 and motion_filter is None else np.array(past)
-        self._stepper: PrimitiveStepper = PrimitiveStepper(primitive, start, gains, motion=motion_filter)
-        self._last = past[-1]
+        self._begin(law, past[-1] if primitive.history == 0 and motion_filter is None else np.array(past))
+        self._last_output = past[-1]
 
-    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request:
+    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
         """Begin a control step, and the next segment if the current one has ended."""
         fitted = self.segments[self._index]
         segment = fitted.segment
@@ -283,31 +314,20 @@ class PrimitiveGuide(Guide):
         if not is_over and segment.until is not None and self._step > 0:
             is_over = as_bool(segment.until(env, observation), "until of a segment")
         if is_over and self._index + 1 < len(self.segments):
-            self._begin(self._index + 1, env, observation)
+            self._begin_segment(self._index + 1, env, observation)
         elif is_over:
             self._is_ended = True
-        spread = np.zeros(self.num_outputs)
-        spread[self._dims] = np.clip(action, -1.0, 1.0)
-        self._residual = self._stepper.gain * spread if "residual" in self.guidance else None
-        if self._residual is not None:
-            spread = np.zeros(self.num_outputs)
-        return self._stepper.primitive, *self._stepper.request(spread)
+        return super().request(env, observation, action, pose)
 
     def finish(self, output: np.ndarray | None) -> GuideCommand:
         """Complete the control step."""
-        step = self._stepper.num_steps
-        if self._residual is not None and output is not None:
-            output = output + self._residual
-            if self.guidance == "clipped_residual":
-                output = self.constraints.nearest(output, step)
         extra = self._extra(self._step)  # may call a function of the user, whose error must not skip a command
-        command = self._stepper.finish(output)
-        self._last = command.output
-        world = self.frame.to_world(command.output, self._orientation)
+        command = self._finish(output)
+        self._last_output = command.pose
+        world = self.frame.to_world(command.pose, self._orientation)
         self._recent = [*self._recent, world][-max(self.settings.history, 2) :]
         self._step += 1
-        violation = (self._motion or self.constraints).violation(command.output, step)
-        return GuideCommand(world, violation, command.is_fallback, extra)
+        return GuideCommand(world, command.violation, command.fallback, extra)
 
     def _extra(self, step: int) -> Any:
         fitted = self.segments[self._index]
@@ -339,7 +359,7 @@ class PrimitiveGuide(Guide):
     def scaled_command(self) -> np.ndarray:
         """Return the last command (O,) in the segment's frame, scaled to ±1 over the range of its demonstrations."""
         fitted = self.segments[self._index]
-        return (self._last - fitted.center) / fitted.half_range
+        return (self._last_output - fitted.center) / fitted.half_range
 
 
 def _refuse_limits(motion: MotionConstraints) -> None:
@@ -405,9 +425,7 @@ class TemplateGuide(Guide):
         period: float | None,
         extra: Any = None,
     ):
-        if period is None or not 0.0 < period < np.inf:
-            raise InputError("guidance by a template needs the period of the environment [s], positive")
-        template.check_consistency()
+        TemplateLaw(template, {}, period)  # refuses invalid arguments before an episode
         if template.limits_wrench:
             raise InputError(
                 f"states of template {template.name!r} limit force or torque, and GuidedEnv has no controller that "
@@ -433,31 +451,14 @@ class TemplateGuide(Guide):
             if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
                 raise InputError(f"the frame {name} is a RigidTransform, as of Drake, not {brief(X_WF)}")
         self._frames = {name: RigidTransform(X_WF) for name, X_WF in frames.items()}
-        X_WE = pose_to_transform(pose)
-        self._state = self.template.state_at(X_WE, self._frames)
-        self._X = self.template.command(self._state, X_WE, X_WE, self._frames, self._period).X_WE
-        if not np.isfinite(transform_to_pose(self._X)).all():
-            raise InputError(f"the pose and the frames of the template {self.template.name} must be finite at a reset")
-        self.template.check_start(X_WE, self._frames)
-        self._has_begun = False
-
-    def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> None:
-        """Make the transition to the next state if it is due, and apply the input mapping."""
-        if self._has_begun:
-            self._state = self.template.next_state(self._state, self._X, self._frames, self._period)
-        self._has_begun = True
-        displacement = self.template.map(self._state, action, self._X, self._frames, self._period)
-        self._request = self.template.displace(self._X, displacement)
+        self._begin(TemplateLaw(self.template, self._frames, self._period), pose)
+        self._now = self._state
 
     def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Project the request into the active constraints; repeat the last command if the result is not finite."""
+        """Complete the control step."""
         extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
-        X = self.template.command(self._state, self._X, self._request, self._frames, self._period).X_WE
-        is_fallback = not np.isfinite(transform_to_pose(X)).all()
-        if not is_fallback:
-            self._X = X
-        violation = self.template.violation(self._state, self._X, self._frames)
-        return GuideCommand(transform_to_pose(self._X), violation, is_fallback, extra)
+        command = self._finish(output)
+        return GuideCommand(command.pose, command.violation, command.fallback, extra)
 
     @property
     def is_finished(self) -> bool:
@@ -467,26 +468,55 @@ class TemplateGuide(Guide):
     @property
     def phase(self) -> float:
         """Index of the current state, scaled to the range from 0 to 1."""
-        return self._state / max(len(self.template.states) - 1, 1)
+        return self._now.number / max(len(self.template.states) - 1, 1)
 
     @property
     def segment_name(self) -> str:
         """Name of the template's state."""
-        return self.template.states[self._state].name
+        return self.template.states[self._now.number].name
 
     def scaled_command(self) -> np.ndarray:
         """Return the last command (6,) in the template's first frame, in units of 0.2 m and π."""
         X_WF = self._frames[self.template.frames[0]] if self.template.frames else None
-        X_FE = self._X if X_WF is None else X_WF.inverse() @ self._X
+        X_WE = pose_to_transform(self._state.last if self._last is None else self._last.pose)
+        X_FE = X_WE if X_WF is None else X_WF.inverse() @ X_WE
         return transform_to_pose(X_FE) / _COMMAND_SCALE
 
 
-def predict(request: Request | None) -> np.ndarray | None:
+class LawGuide(Guide):
+    """Guide by a law, whose commands are in the world.
+
+    Args:
+        law: Law.
+
+    Raises:
+        InputError: If `law` is not a law.
+    """
+
+    def __init__(self, law: Law):
+        check_law(law)
+        self._law, self.num_outputs, self.num_actions = law, law.num_outputs, law.num_actions
+
+    def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
+        """Begin an episode at a measured pose (O,)."""
+        self._begin(self._law, pose)
+        self._command = pose
+
+    def finish(self, output: np.ndarray | None) -> GuideCommand:
+        """Complete the control step."""
+        command = self._finish(output)
+        self._command = command.pose
+        return GuideCommand(command.pose, command.violation, command.fallback, None)
+
+    is_finished = False
+    phase = 0.0
+    segment_name = "0"
+
+    def scaled_command(self) -> np.ndarray:
+        """Return the last command (O,), which has no range to be scaled to."""
+        return self._command
+
+
+def predict_request(request: Request | None) -> np.ndarray | None:
     """Return the output (O,) of a requested prediction; None if there is no request or it has no solution."""
-    if request is None:
-        return None
-    primitive, step, raw, history = request
-    try:
-        return primitive.predict(step, raw, history).output
-    except UnsolvableError:
-        return None
+    return None if request is None else predict(*request)

@@ -17,9 +17,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
+from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.models.primitives.gains import authority
-from guiderail.models.primitives.stepper import StateProgress
 
 PERIOD, STEPS = 0.02, 60
 PRIMITIVE_GUIDANCE = ("kmp", "residual", "safe_residual", "kgrl", "skgrl", "residual_covariance")

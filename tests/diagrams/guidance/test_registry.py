@@ -6,9 +6,24 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import PassThrough
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.guidance.guidance import FunctionGuidance, Guidance
+from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.models.common.errors import InputError
+from guiderail.models.laws import Law
+
+
+class Offset(Law):
+    """Law that displaces the measured pose by the sum of the action."""
+
+    def command(self, last, action, pose, wrench):
+        return pose + 0.001 * action.sum()
+
+
+class Incomplete(Law):
+    """Law whose command lacks parameters."""
+
+    def command(self, action, pose):
+        return pose
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -17,7 +32,7 @@ def test_symmetry_is_absent_when_actions_do_not_displace(size, monkeypatch):
 
     @register_guidance("own")
     def build(prior):
-        return FunctionGuidance(prior, lambda action, pose, wrench: pose + 0.001 * action.sum(), action_size=size)
+        return Offset(prior.pose_size, size)
 
     env = make_env("BncConnector", guidance="own")
     assert env.action_space.shape == (size,)
@@ -73,16 +88,14 @@ def test_name_is_refused_when_blank():
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda prior: None, "the builder of guidance 'wrong' must return a diagram, .*, not None"),
-        (lambda prior: np.zeros, "the builder of guidance 'wrong' must return a diagram, .*, not <"),
+        (lambda prior: None, "the builder of guidance 'wrong' must return a diagram or a Law, not None"),
+        (lambda prior: np.zeros, "the builder of guidance 'wrong' must return a diagram or a Law, not <"),
         (
-            lambda prior: FunctionGuidance(prior, lambda action, pose: pose, action_size=2),
-            r"a function of action, pose and wrench, and this one has the parameters \(action, pose\)$",
+            lambda prior: Incomplete(prior.pose_size),
+            r"command of Incomplete must have the parameters .*, not \(self, action, pose\)$",
         ),
-        (
-            lambda prior: FunctionGuidance(prior, lambda action, pose, wrench: pose, action_size=1.5),
-            "action_size must be a whole number of at least 1, not 1.5$",
-        ),
+        (lambda prior: Offset(2, 1.5), "num_actions of a law must be a whole number of at least 1, not 1.5$"),
+        (lambda prior: Offset(3), "the pose has size 2: give the law as many outputs, not 3"),
     ],
 )
 def test_builder_is_refused_when_returning_no_guidance(build, message, monkeypatch):
@@ -90,3 +103,22 @@ def test_builder_is_refused_when_returning_no_guidance(build, message, monkeypat
     register_guidance("wrong")(build)
     with pytest.raises(InputError, match=message):
         make_env("NarrowPassage", guidance="wrong")
+
+
+def test_law_with_memory_runs_as_registered_class(monkeypatch):
+    monkeypatch.setitem(GUIDANCE._entries, "integrator", None)
+
+    @register_guidance("integrator")
+    class Integrator(Law):
+        def command(self, last, action, pose, wrench):
+            return last + 0.01 * action / (1.0 + self.known.period)
+
+    env = make_env("NarrowPassage", guidance="integrator", action_repeat=5)
+    for _ in range(2):
+        env.reset(seed=0)
+        for _ in range(4):
+            env.step(np.array([0.0, 0.5]))
+        moved = np.ptp(env.trace.commanded, axis=0)
+        assert moved[0] == 0.0
+        np.testing.assert_allclose(np.diff(env.trace.commanded[:, 1], n=2), 0.0, atol=1e-12)
+        assert moved[1] > 0.05

@@ -6,8 +6,8 @@ import pytest
 from guiderail import systems
 from guiderail.models.control.command_filters import BarrierFilter
 from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
-from guiderail.models.primitives.stepper import StateProgress
 from oracles.systems import check_start_time
 
 PERIOD = 0.02

@@ -73,10 +73,11 @@ class OffsetOptions(gr.Options):
 
 
 @gr.register_guidance("peglab_offset", label="offset", options=OffsetOptions)
-def offset(prior: gr.PriorKnowledge) -> gr.Guidance:
-    """Command the measured pose plus the action."""
-    reach = prior.options["reach"]
-    return gr.FunctionGuidance(prior, lambda action, pose, wrench: pose + reach * action, action_size=2)
+class Offset(gr.Law):
+    """Law that commands the measured pose plus the action."""
+
+    def command(self, last: np.ndarray, action: np.ndarray, pose: np.ndarray, wrench: np.ndarray) -> np.ndarray:
+        return pose + self.known.options["reach"] * action
 
 
 class RationalQuadratic:

@@ -455,7 +455,7 @@ def test_scaled_command_of_a_template_is_in_its_frame():
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: {"mug_tip": X_WF}, 0.02)
     X_FE = pose_to_transform(np.array([-0.1, -0.2, 0.15, 0.3, 0.1, -0.2]))
     template_guide.reset(None, None, transform_to_pose(X_WF @ X_FE))
-    template_guide.request(None, None, np.zeros(3), None)
+    template_guide.request(None, None, np.zeros(3), np.zeros(6))
     command = pose_to_transform(template_guide.finish(None).output)
     scaled = template_guide.scaled_command()
     np.testing.assert_allclose(
@@ -574,7 +574,7 @@ def test_step_raises_before_a_reset():
 def test_template_guide_refuses_nan_in_frame_or_start(x_of_frame, x):
     frames = {"mug_tip": RigidTransform([x_of_frame, 0.0, 0.0])}
     template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, observation: frames, 0.02)
-    with pytest.raises(InputError, match="must be finite at a reset"):
+    with pytest.raises(InputError, match="must be finite at the start"):
         template_guide.reset(None, None, np.array([x, 0.0, 0.0, 0.0, 0.0, 0.0]))
 
 
@@ -717,12 +717,12 @@ def test_error_skips_no_command_of_a_template():
         template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.0, 0.0, 0.0]))
         for k in range(6):
             is_failing = k == failing_step
-            template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+            template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
             if is_failing:
                 with pytest.raises(OSError, match="connection"):
                     template_guide.finish(None)
                 is_failing = False
-                template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+                template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
             command = template_guide.finish(None)
         outputs.append(command.output)
     np.testing.assert_array_equal(*outputs)
@@ -754,7 +754,7 @@ def test_template_frames_may_be_drake_transforms():
     for X_WF in (RigidTransform([0.6, 0.0, 0.3]), drake.RigidTransform([0.6, 0.0, 0.3])):
         template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, o, X=X_WF: {"mug_tip": X}, 0.02)
         template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.1, 0.0, 0.0]))
-        template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), None)
+        template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
         output = template_guide.finish(None).output
         scaled.append(np.concatenate([output, template_guide.scaled_command()]))
     np.testing.assert_array_equal(*scaled)

@@ -8,10 +8,9 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 from pydrake.systems.primitives import ConstantVectorSource, MatrixGain
 
-from guiderail.diagrams.guidance.primitive import KgrlGuidance, PrimitiveGuidance, primitive_config_of
+from guiderail.diagrams.guidance.primitive import RESIDUAL, DemonstratedGuidance, PrimitiveGuidance, primitive_config_of
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import register_guidance
-from guiderail.diagrams.guidance.residual import ResidualGuidance
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail_lerobot.base_policy import find_base_policy
@@ -63,7 +62,7 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
     return velocity, jerk
 
 
-class ChunkExecutionGuidance(PrimitiveGuidance):
+class ChunkExecutionGuidance(DemonstratedGuidance):
     """Guidance that commands chunks, with a guard by default; the action has no effect.
 
     With a guard there is the output ``rate`` (1,) of `ChunkSafetyLimiter`. Without a guard (``guard=none``), the linear
@@ -132,7 +131,7 @@ def _chunk_reference(prior: PriorKnowledge, source: str | None, observation_size
     )
 
 
-class _ChunkGuidance:
+class _BasePolicyReference:
     """Mixin of guidance that takes its reference from a base policy."""
 
     def __init__(self, prior: PriorKnowledge, **arguments: Any):
@@ -143,15 +142,11 @@ class _ChunkGuidance:
         return _chunk_reference(self._prior, self._prior.options["base_policy"], observation_size)
 
 
-class KgrlBasePolicyGuidance(_ChunkGuidance, KgrlGuidance):
-    """KGRL with the chunks of a base policy as its mean; their variance is added to the covariance."""
+class BasePolicyPrimitiveGuidance(_BasePolicyReference, PrimitiveGuidance):
+    """Guidance by a primitive with the chunks of a base policy as its mean."""
 
 
-class ResidualBasePolicyGuidance(_ChunkGuidance, ResidualGuidance):
-    """Bounded residual on a base policy (Policy Decorator; Yuan et al., 2024): p̂_t = p_t^base + Δp_t."""
-
-
-class BasePolicyGuidance(_ChunkGuidance, ChunkExecutionGuidance):
+class BasePolicyGuidance(_BasePolicyReference, ChunkExecutionGuidance):
     """Guidance that commands the chunks of a base policy, with a guard by default."""
 
 
@@ -178,8 +173,11 @@ def base_policy(prior: PriorKnowledge) -> Diagram:
     options=BasePolicyOptions,
 )
 def kgrl_base_policy(prior: PriorKnowledge) -> Diagram:
-    """Build KGRL around a base policy; no symmetry is used, because a base policy is not symmetric."""
-    return KgrlBasePolicyGuidance(prior) if prior.options["base_policy"] else KgrlGuidance(prior)
+    """Build KGRL around a base policy; no symmetry is used, because a base policy is not symmetric.
+
+    The variance of the chunks is added to the covariance of the demonstrations.
+    """
+    return BasePolicyPrimitiveGuidance(prior) if prior.options["base_policy"] else PrimitiveGuidance(prior)
 
 
 @register_guidance(
@@ -191,5 +189,6 @@ def kgrl_base_policy(prior: PriorKnowledge) -> Diagram:
     options=BasePolicyOptions,
 )
 def residual_base_policy(prior: PriorKnowledge) -> Diagram:
-    """Build residual RL around a base policy, without constraints."""
-    return ResidualBasePolicyGuidance(prior) if prior.options["base_policy"] else ResidualGuidance(prior)
+    """Build residual RL around a base policy (Policy Decorator; Yuan et al., 2024), without constraints."""
+    kind = BasePolicyPrimitiveGuidance if prior.options["base_policy"] else PrimitiveGuidance
+    return kind(prior, **RESIDUAL)

@@ -1,0 +1,7 @@
+from .law import Command as Command
+from .law import Law as Law
+from .law import Stepper as Stepper
+from .primitive import PrimitiveLaw as PrimitiveLaw
+from .primitive import StateProgress as StateProgress
+from .skill import load_law as load_law
+from .template import TemplateLaw as TemplateLaw

@@ -1,0 +1,166 @@
+"""Law of a shared control template (thesis, section 2.3), and the functions of its parts."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
+from guiderail.models.laws.law import Command, Law
+from guiderail.models.templates.geometry import Frames
+from guiderail.models.templates.template import INSIDE, SharedControlTemplate
+
+
+def requested_pose(
+    template: SharedControlTemplate,
+    state: int | None,
+    action: np.ndarray,
+    pose: np.ndarray,
+    frames: Frames,
+    period: float,
+) -> np.ndarray:
+    """Return the requested pose H^im = displace_q(H, map_q(u)), (6,) (equations 2.19 and 2.20).
+
+    It is NaN if an input u (n,) is not finite, or the state is None. `pose` (6,) is H.
+    """
+    if state is None or not np.isfinite(action).all():
+        return np.full(POSE_SIZE, np.nan)
+    X_WE = pose_to_transform(pose)
+    return transform_to_pose(template.displace(X_WE, template.map(state, action, X_WE, frames, period)))
+
+
+def allowed_pose(
+    template: SharedControlTemplate, state: int, last: np.ndarray, requested: np.ndarray, frames: Frames, period: float
+) -> np.ndarray:
+    """Return the pose (6,) of `SharedControlTemplate.command` for a requested pose (6,) after the last command (6,)."""
+    X_WLast, X_WRequest = pose_to_transform(last), pose_to_transform(requested)
+    return transform_to_pose(template.command(state, X_WLast, X_WRequest, frames, period).X_WE)
+
+
+def violation_of(template: SharedControlTemplate, state: int | None, pose: np.ndarray, frames: Frames) -> float:
+    """Return the largest violation of an active constraint by a pose (6,) [m or rad]; for None, over all states."""
+    X_WE = pose_to_transform(pose)
+    states = range(len(template.states)) if state is None else (state,)
+    return max(template.violation(number, X_WE, frames) for number in states)
+
+
+def start_in(
+    template: SharedControlTemplate, pose: np.ndarray, frames: Frames, period: float
+) -> tuple[int, np.ndarray]:
+    """Return the first state at a measured pose (6,), and the pose (6,) moved towards its constraints for one period.
+
+    Raises:
+        InputError: If the pose or a frame is not finite, or the pose is more than 0.2 m or 1 rad outside of the active
+            constraints.
+    """
+    X_WE = pose_to_transform(pose)
+    state = template.state_at(X_WE, frames)
+    command = allowed_pose(template, state, pose, pose, frames, period)
+    if not np.isfinite(command).all():
+        raise InputError(f"the pose and the frames of the template {template.name} must be finite at the start")
+    template.check_start(X_WE, frames)
+    return state, command
+
+
+class TemplateState(NamedTuple):
+    """State of a `TemplateLaw`."""
+
+    number: int  # number of the template's state
+    last: np.ndarray  # last command (6,)
+    measured: np.ndarray  # pose (6,) measured at the same instant
+
+
+class TemplateLaw(Law):
+    """Law of a shared control template: input mapping and active constraints of the template's current state.
+
+    The command is a pose [x y z Rz Ry Rx] in meters and radians. If the requested or the measured pose is not finite,
+    the last command is repeated as a fallback. It is also repeated if the tracking error exceeds its limit and the new
+    command would not reduce it. A repeated command outside of the constraints is projected into them.
+
+    Args:
+        template: Template with n inputs.
+        frames: Poses X_WF of the template's objects by name.
+        period: Control period [s], positive.
+        input_mapping: Second template, whose initial state maps the inputs instead of `template`.
+        max_tracking_error: Distance between robot and command beyond which the last command is repeated, unless the new
+            one is closer to the robot [m].
+
+    Raises:
+        InputError: If active constraints of a state contradict each other, or the period is missing or not positive.
+
+    Attributes:
+        template, frames, period: Arguments.
+    """
+
+    def __init__(
+        self,
+        template: SharedControlTemplate,
+        frames: Frames,
+        period: float | None,
+        *,
+        input_mapping: SharedControlTemplate | None = None,
+        max_tracking_error: float = np.inf,
+    ):
+        super().__init__(POSE_SIZE, (input_mapping or template).inputs)
+        if period is None or not 0.0 < period < np.inf:
+            raise InputError(f"guidance by a template needs the control period [s], positive, not {period}")
+        template.check_consistency()
+        self.template, self.frames, self.period = template, frames, period
+        self._input_mapping, self._max_tracking_error = input_mapping, max_tracking_error
+        self.needs_pose = max_tracking_error < np.inf
+
+    def start(self, pose: np.ndarray) -> TemplateState:
+        """Return the state at a measured pose (6,).
+
+        Raises:
+            InputError: As `start_in`.
+        """
+        return TemplateState(*start_in(self.template, pose, self.frames, self.period), pose)
+
+    def default_state(self) -> TemplateState:
+        """Return a state; see `Law.default_state`."""
+        return TemplateState(self.template.initial_state, np.zeros(POSE_SIZE), np.zeros(POSE_SIZE))
+
+    def command(self, state: TemplateState, action: np.ndarray, pose: np.ndarray, wrench: np.ndarray) -> Command:
+        """Return the command for an action (A,), a measured pose (O,) and a wrench (W,); see `Law.command`."""
+        mapping = self._input_mapping
+        number = state.number if mapping is None else mapping.initial_state
+        requested = requested_pose(mapping or self.template, number, action, state.last, self.frames, self.period)
+        command, is_fallback = guarded_pose(
+            self.template, state, requested, self.frames, self.period, self._max_tracking_error
+        )
+        violation = violation_of(self.template, state.number, command, self.frames)
+        return Command(command, violation, is_fallback)
+
+    def next(self, state: TemplateState, command: Command, pose: np.ndarray) -> TemplateState:
+        """Return the state after a command, at a measured pose (O,); see `Law.next`."""
+        X_WE = pose_to_transform(command.pose)
+        number = self.template.next_state(state.number, X_WE, self.frames, self.period)
+        return TemplateState(number, command.pose, pose)
+
+
+def guarded_pose(
+    template: SharedControlTemplate,
+    state: TemplateState,
+    requested: np.ndarray,
+    frames: Frames,
+    period: float,
+    max_tracking_error: float,
+) -> tuple[np.ndarray, bool]:
+    """Return the command (6,) for a requested pose (6,) and False, or the repeated last command and True."""
+    number, last, measured = state
+    if np.isfinite(requested).all() and np.isfinite(measured).all():
+        desired = allowed_pose(template, number, last, requested, frames, period)
+        tracking_error = math.dist(last[:3], measured[:3])
+        reduces_error = math.dist(desired[:3], measured[:3]) < tracking_error
+        is_waiting = tracking_error > max_tracking_error and not reduces_error
+        if not is_waiting and np.isfinite(desired).all():
+            return desired, False
+    # Projecting a command that is already inside would move it by rounding errors at every step.
+    if violation_of(template, number, last, frames) > INSIDE:
+        inside = allowed_pose(template, number, last, last, frames, period)
+        last = inside if np.isfinite(inside).all() else last
+    return last, True

@@ -1,0 +1,114 @@
+"""Guidance by a law, which is evaluated once per control period."""
+
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+
+from guiderail.models.laws.law import Command, Law, check_command, check_law, safe_command
+from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+
+
+class LawSystem(LeafSystem):
+    """Evaluate a law of guidance (`Law`) once per control period.
+
+        desired_pose[k] = law.command(state[k], action[k], pose[k], wrench[k])
+        state[k + 1] = law.next(state[k], desired_pose[k], pose[k + 1])
+
+    If the law does not command O finite numbers, the previous desired pose is repeated (initially the measured pose)
+    and ``fallback`` is 1, so that NaN is never commanded.
+
+    .. pydrake_system::
+
+        name: LawSystem
+        input_ports:
+        - action
+        - pose
+        - wrench
+        output_ports:
+        - desired_pose
+        - held_action
+        - fallback
+
+    ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,).
+    ``held_action`` is the action of the present control step. The inputs are sampled at control steps, and the state of
+    the law is discrete state: there is no direct feedthrough, so that feedback of the measured pose causes no algebraic
+    loop.
+
+    Args:
+        law: Law with A actions and O outputs.
+        wrench_size: Size W of the wrench, at least 1.
+        period: Control period [s], positive.
+
+    Raises:
+        InputError: If an argument is out of range, or `law` is not a law. At initialization, if the measured pose is
+            not finite, or the law does not command O numbers.
+    """
+
+    def __init__(self, law: Law, wrench_size: int, period: float):
+        super().__init__()
+        check_law(law)
+        self._law = law
+        self._action_port = self.DeclareVectorInputPort("action", law.num_actions)
+        self._pose_port = self.DeclareVectorInputPort("pose", law.num_outputs)
+        self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
+        self._example = law.default_state()
+        self._state = self.DeclareDiscreteState(_flat(self._example))
+        self._last = declare.unset_state(self, law.num_outputs)
+        declare.update_after_start(self, period, self._advance, self._start)
+        self._held_action, pose, wrench = (
+            declare.sample(self, port, period) for port in (self._action_port, self._pose_port, self._wrench_port)
+        )
+        self._inputs = (self._held_action, pose, wrench)
+        sources = [self._state, self._last, *self._inputs]
+        self._command = declare.cache(self, "command", self._calc_command, sources)
+        declare.part_output(self, "desired_pose", self._command, lambda command: command.pose, law.num_outputs)
+        self.DeclareStateOutputPort("held_action", self._held_action)
+        declare.part_output(self, "fallback", self._command, lambda command: command.fallback)
+
+    get_action_input_port = input_getter("action", "policy's action in [−1, 1], (A,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (O,)")
+    get_wrench_input_port = input_getter("wrench", "measured wrench, (W,)")
+    get_desired_pose_output_port = output_getter("desired_pose", "desired pose, (O,)")
+    get_held_action_output_port = output_getter("held_action", "action of the present control step, (A,)")
+    get_fallback_output_port = output_getter("fallback", "flag that the previous desired pose is repeated, (1,)")
+
+    def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
+        pose = declare.start_pose(self._pose_port.Eval(context))
+        state = self._law.start(pose.copy())
+        inputs = (port.Eval(context) for port in (self._action_port, self._pose_port, self._wrench_port))
+        check_command(self._law.command(state, *inputs), len(pose))
+        discrete_state.set_value(self._state, _flat(state))
+        discrete_state.set_value(self._last, pose)
+
+    def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
+        command = self._command.Eval(context)
+        state = self._law.next(self._law_state(context), command, self._pose_port.Eval(context))
+        discrete_state.set_value(self._state, _flat(state))
+        discrete_state.set_value(self._last, command.pose)
+
+    def _calc_command(self, context: Context) -> Command:
+        last = declare.initialized(self, context, self._last)
+        inputs = (context.get_discrete_state().value(index).copy() for index in self._inputs)
+        return safe_command(self._law.command(self._law_state(context), *inputs), last.copy())
+
+    def _law_state(self, context: Context) -> Any:
+        return _like(self._example, context.get_discrete_state().value(self._state).copy())
+
+
+def _flat(state: Any) -> np.ndarray:
+    """Return the numbers of a law's state."""
+    parts = state if isinstance(state, tuple) else (state,)
+    return np.concatenate([np.ravel(part).astype(float) for part in parts])
+
+
+def _like(example: Any, numbers: np.ndarray) -> Any:
+    """Return the state of the type and the shapes of `example` with the given numbers."""
+    if not isinstance(example, tuple):
+        return numbers.reshape(np.shape(example))
+    sizes = [np.size(part) for part in example]
+    parts = zip(example, np.split(numbers, np.cumsum(sizes)[:-1]), strict=True)
+    return type(example)(
+        *(part.reshape(e.shape) if isinstance(e, np.ndarray) else type(e)(part[0]) for e, part in parts)
+    )
