@@ -10,7 +10,6 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from pydrake.systems.primitives import MatrixGain, TrajectorySource, ZeroOrderHold
 from pydrake.trajectories import PiecewisePolynomial
 
-from guiderail.diagrams.envs.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.primitive import (
     PrimitiveGuidance,
@@ -29,6 +28,11 @@ from guiderail.models.control.keep_out import KeepOut
 from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.residual import Residual
 from guiderail.systems.safety_filter import SafetyFilter
+
+BARRIER_DECAY = 0.2  # γ of `residual_cbf`, largest fraction of the distance to a constraint that one step may cover
+# Distance to a constraint at which `residual_tangent` halves the motion towards it, as a multiple of the displacement
+# by an action of 1.
+SLACK_WIDTH = 0.5
 
 
 class ResidualDescent(Guidance):
@@ -142,13 +146,11 @@ def safe_residual(prior: PriorKnowledge) -> Diagram:
     color="#bcbd22",
     demonstrates=True,
     displaces=True,
-    options=BarrierOptions,
 )
 def residual_cbf(prior: PriorKnowledge) -> Diagram:
     """Build residual RL with a control barrier function on the command; see `BarrierFilter`."""
-    decay = prior.options["barrier_decay"]
     return ResidualGuidance(
-        prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, decay), config.control_period)
+        prior, lambda config, keep_out: CommandFilter(BarrierFilter(keep_out, BARRIER_DECAY), config.control_period)
     )
 
 
@@ -159,13 +161,12 @@ def residual_cbf(prior: PriorKnowledge) -> Diagram:
     color="#7f7f7f",
     demonstrates=True,
     displaces=True,
-    options=TangentOptions,
 )
 def residual_tangent(prior: PriorKnowledge) -> Diagram:
     """Build residual RL in the tangent space of the constraints; see `TangentSpaceFilter`."""
 
     def make_filter(config: PrimitiveConfig, keep_out: KeepOut) -> CommandFilter:
-        width = prior.options["slack_width"] * float(config.residual_gains().max())
+        width = SLACK_WIDTH * float(config.residual_gains().max())
         return CommandFilter(TangentSpaceFilter(keep_out, width), config.control_period)
 
     return ResidualGuidance(prior, make_filter)

@@ -9,7 +9,7 @@ from typing import Any
 
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import check_environment, task_content
+from guiderail.tools.environments import check_environment, flat_environment, task_content
 from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
@@ -75,7 +75,8 @@ def resumed_config(
     stored |= {"step_log": config.step_log, "human_in_the_loop": config.human_in_the_loop} | config.environment
     if environment:
         resolved = check_environment(config.task, environment)
-        environment = {key: resolved.get(key, value) for key, value in environment.items()}
+        given_options = flat_environment(config.task, environment)
+        environment = {key: resolved.get(key, value) for key, value in given_options.items()}
     arguments = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in arguments.items():
         if key == "episodes" and value < config.episodes and value < (done := folder.num_saved_episodes()):

@@ -27,7 +27,13 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
+from guiderail.tools.environments import (
+    changed_environment,
+    check_reset,
+    flat_environment,
+    make_environment,
+    task_content,
+)
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.evaluate import evaluate_run
@@ -100,7 +106,8 @@ class Job:
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings
-        environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
+        of_study, of_method = (flat_environment(study.task, env) for env in (study.env, method.env))
+        environment, given = {**of_study, **of_method}, with_defaults(study.task, given)
         given |= {"imports": study.imports, "seed": self.seed}
         config = configure(study.task, environment, episodes=max(episodes, 1), **given)
         if config.learner.stop_after_successes:
