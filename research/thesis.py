@@ -204,7 +204,6 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
         lambda p: p.base_motion_steps > 0,
         "actions other than zero become certain over {base_motion_steps} transitions",
     ),
-    ("n_steps", lambda p: p.n_steps > 1, "{n_steps}-step returns"),
 )
 _COMPARED = ("learning_rate", "tau", "train_freq", "gradient_steps", "ent_coef", "net_arch", "buffer_size")
 # Settings that only table 3.2 has.

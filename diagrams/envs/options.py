@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import fields
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
@@ -55,8 +56,10 @@ class Options(BaseModel):
 
 PRIMARY = {
     "base_policy": "policy",
+    "gamma": "value",
     "history": "length",
     "kernel": "name",
+    "net_arch": "units",
     "progress": "mode",
     "sensing": "profile",
 }
@@ -68,19 +71,20 @@ def entries_of(option: str, *fields: str) -> dict[str, str]:
     return {field: f"{option}.{field}" for field in fields}
 
 
-def option_fields(model: type[BaseModel]) -> dict[str, str]:
-    """Return the fields of a model by the names of their options, such as "action_scale" and "history.variance"."""
+def option_fields(model: Any) -> dict[str, str]:
+    """Return the fields of a model or a dataclass by the names of their options, such as "history.variance"."""
     entries = getattr(model, "entries", {})
-    return {entries.get(field, field): field for field in model.model_fields}
+    names = model.model_fields if hasattr(model, "model_fields") else (field.name for field in fields(model))
+    return {entries.get(field, field): field for field in names}
 
 
-def flat_options(models: Iterable[type[BaseModel]], options: Mapping[str, Any]) -> dict[str, Any]:
+def flat_options(models: Iterable[Any], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return options with the entries of every structured option as options of their own.
 
     A mapping as the value of `history`, for example, becomes the options "history", "history.variance", ….
 
     Args:
-        models: Models that declare the options.
+        models: Models, or dataclasses, that declare the options.
         options: Options by name. A name that no model declares remains as it is.
 
     Raises:

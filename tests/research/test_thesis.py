@@ -186,7 +186,6 @@ def test_history_is_not_compared_when_guidance_is_kgrl():
         ({"selection_window": 8}, "checkpoint selection"),
         ({"learning_rate": 3e-4}, "learning rate 0.0003 (thesis: 0.001)"),
         ({"gamma": 0.99}, "gamma of a control step 0.99 (thesis: 0.995)"),
-        ({"n_steps": 3}, "3-step returns"),
     ],
 )
 def test_learner_setting_difference_is_described(setting, words):

@@ -11,7 +11,14 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import check_environment, flat_environment, task_content
 from guiderail.tools.evaluation.episode import check_seed
-from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
+from guiderail.tools.learning.config import (
+    check_episodes,
+    config_values,
+    default_preset,
+    flat_settings,
+    make_config,
+    resolve_preset,
+)
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
@@ -57,7 +64,7 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
-    settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
+    settings = flat_settings(learner.get("settings")) | flat_settings(given.get("settings"))
     return {**learner, **given} | ({"settings": settings} if settings else {})
 
 
@@ -86,7 +93,7 @@ def resumed_config(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
                 "again in another folder"
             )
-    values = config_values(config.learner) | dict(settings or {})
+    values = config_values(config.learner) | flat_settings(settings)
     algorithm = values.pop("algorithm")
     if make_config(algorithm, values) != config.learner:
         raise InputError(

@@ -57,7 +57,7 @@ SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "al
 @example("tqc_contact", [("ent_coef", "inf")])
 @example("tqc_contact", [("net_arch", "1000000,1000000")])
 @example("tqc_contact", [("batch_size", "1e20")])
-@example("tqc_contact", [("layer_norm", "7")])
+@example("tqc_contact", [("net_arch.layer_norm", "7")])
 def test_configure_accepts_or_refuses_any_learner_setting(preset, pairs):
     arguments = dict(pairs)
     config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=arguments))

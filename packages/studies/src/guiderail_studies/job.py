@@ -43,6 +43,7 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
+from guiderail.tools.learning.config import flat_settings
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
@@ -102,7 +103,7 @@ class Job:
         choices = [study.learner, method.learner]
         chosen = {k: getattr(c, k) for c in choices for k in ("algorithm", "preset") if k in c.model_fields_set}
         given: dict[str, Any] = {k: v for k, v in chosen.items() if v is not None}
-        settings = {**study.learner.settings, **method.learner.settings}
+        settings = flat_settings(study.learner.settings) | flat_settings(method.learner.settings)
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings
