@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUTSIDE := .venv-outside
+ALONE := .venv-alone
 # Distributions of this repository, installed together: the core and its siblings require each other.
 SIBLINGS := hardware parts studies data lerobot mujoco
 EDITABLE := $(SIBLINGS:%=-e packages/%)
@@ -11,7 +12,7 @@ EDITABLE := $(SIBLINGS:%=-e packages/%)
 export DRAKE_ALLOW_NETWORK := meshcat:lcm
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling adversary fci lerobot motions outside newest clean
+.PHONY: help demo test lint docs build bench gallery results pretrained kills fuzz mutants forces injections scaling adversary fci lerobot motions outside siblings newest clean
 .DEFAULT_GOAL := help
 
 help:  ## print this help
@@ -102,12 +103,22 @@ outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, i
 	for task in peg assembly nut; do $$learn $$task --method baselines --out runs/outside; done
 	$(OUTSIDE)/bin/python -m research.outside_envs.learn table --out runs/outside
 
+siblings:  ## each sibling's tests with the core and that sibling alone, in an environment of its own, minutes
+	$(PYTHON) -m venv --clear $(ALONE)
+	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,osqp,piqp,onnx]" \
+	  pytest pytest-xdist hypothesis psutil mpmath colorednoise rosbags ruckig ur-rtde
+	for sibling in $(SIBLINGS); do \
+	  $(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e packages/$$sibling && \
+	  $(ALONE)/bin/python -m pytest -q -n 2 --dist loadfile packages/$$sibling/tests || exit 1; \
+	  $(ALONE)/bin/python -m pip uninstall -qq -y guiderail-$$sibling || exit 1; \
+	done
+
 newest:  ## the tests with the newest dependencies on Python 3.12 and 3.13
 	.ci/newest python3.12
 	.ci/newest python3.13
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) $(OUTSIDE) .venv-fci .venv-lerobot build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
+	rm -rf $(VENV) $(OUTSIDE) $(ALONE) .venv-fci .venv-lerobot build dist docs/_build docs/reference *.egg-info .pytest_cache .ruff_cache .mypy_cache
 
 $(VENV)/.docs: $(VENV)/.ready
 	$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[docs]"

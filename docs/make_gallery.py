@@ -308,7 +308,7 @@ PICTURES: dict[str, tuple[Callable[[], list[Panel]], tuple[int, int], int | None
             )
             for title, guidance in (
                 ("scripted, through KGRL", {"guidance": "kgrl"}),
-                ("scripted, through sKGRL", {"guidance": "skgrl", "adaptive_history": True}),
+                ("scripted, through sKGRL", {"guidance": "skgrl", "history.adaptive": True}),
                 ("scripted, residual RL", {"guidance": "residual", "action_scale": 1.85}),
             )
         ],

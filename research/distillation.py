@@ -32,8 +32,8 @@ MEASURED = 300  # number of timed actions
 # Options of each way to execute the student. The teacher has the options of its own run.
 VARIANTS: dict[str, dict[str, Any]] = {
     "teacher": {},
-    "student": {"guidance": "base_policy", "guard": "none"},
-    "student, guarded": {"guidance": "base_policy", "guard": "projection"},
+    "student": {"guidance": "base_policy", "base_policy.guard": "none"},
+    "student, guarded": {"guidance": "base_policy", "base_policy.guard": "projection"},
     "student in KGRL's projection": {"guidance": "kgrl_base_policy"},
 }
 
@@ -49,7 +49,7 @@ def options_of(variant: str, task: str, environment: Mapping[str, Any], student:
         repeat: Control steps of an action, after which the student predicts again.
     """
     arguments = VARIANTS[variant]
-    further = {"base_policy": str(student), "replan_steps": repeat} if arguments else {}
+    further = {"base_policy": str(student), "base_policy.replan_steps": repeat} if arguments else {}
     return beyond_defaults(task, environment) | arguments | further
 
 

@@ -69,8 +69,8 @@ def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd
         episodes: Number of episodes.
         seed: Seed of the first episode.
     """
-    options = {"guidance": "base_policy", "difficulty": "hard", "base_policy": base_policy, "guard": guard}
-    limits = {} if guard == "none" else {"max_speed": MAX_SPEED, "max_jerk": MAX_JERK}
+    options = {"guidance": "base_policy", "difficulty": "hard", "base_policy": base_policy, "base_policy.guard": guard}
+    limits = {} if guard == "none" else {"max_speed": MAX_SPEED, "base_policy.max_jerk": MAX_JERK}
     env: Any = make_environment(TASK, {**options, "horizon": 15, **limits})
     try:
         bound = env.unwrapped.diagram.task.options.bound

@@ -25,8 +25,10 @@ POLICIES: dict[str, dict[str, Any]] = {
         "task": "NarrowPassage", "guidance": "skgrl", "episodes": 120, "seed": 180, "difficulty": "hard",
         "reward": "shaped", "preset": "tqc_contact",
         "settings": {
-            "demonstration_episodes": 10, "constant_episodes": 0, "greedy_episode_fraction": 0.5, "gamma": 0.998,
-            "ez_greedy": 0.02, "ez_greedy_longest": 30,
+            "demonstration_episodes": 10, "gamma": 0.998,
+            "exploration": {
+                "constant_episodes": 0, "greedy_episode_fraction": 0.5, "ez_greedy": 0.02, "ez_greedy_longest": 30
+            },
         },
     },
     "connector": {

@@ -124,10 +124,10 @@ def methods() -> list[Method]:
     listed = [Method(ALONE, "kmp", lambda rng, steps, size: lambda observation: np.zeros(size))]
     listed.append(Method("KGRL", "kgrl", repeated[1]))
     for history, variance in ((10, 1e-8), (10, 1e-10), (10, 1e-11), (10, 1e-12), (2, 1e-11), (20, 1e-11)):
-        settings = {"history": history, "history_variance": variance}
+        settings = {"history": history, "history.variance": variance}
         listed.append(Method(f"sKGRL P={history} ρ={variance:.0e}", "skgrl", repeated[1], 1, settings))
-    defaults = {"history": 10, "history_variance": HISTORY_VARIANCE}
-    listed.append(Method("sKGRL adaptive", "skgrl", repeated[1], 1, defaults | {"adaptive_history": True}))
+    defaults = {"history": 10, "history.variance": HISTORY_VARIANCE}
+    listed.append(Method("sKGRL adaptive", "skgrl", repeated[1], 1, defaults | {"history.adaptive": True}))
     listed.append(Method(f"KGRL repeat {ACTION_REPEAT}", "kgrl", repeated[ACTION_REPEAT], ACTION_REPEAT))
     listed += [Method(f"sKGRL repeat {n}", "skgrl", repeated[n], n, defaults) for n in (ACTION_REPEAT, SLOW)]
     residual: dict[str, Explore] = {"white": repeated[1], f"repeat {ACTION_REPEAT}": repeated[ACTION_REPEAT]}
@@ -231,7 +231,7 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
     if method.guidance == "kmp":
         return {}
     # The prior knowledge of the same environment, but with an action scale of 1.
-    histories = {key: value for key, value in method.environment.items() if key in ("history", "history_variance")}
+    histories = {key: value for key, value in method.environment.items() if key in ("history", "history.variance")}
     config = make_prior_knowledge(TASK, guidance=method.guidance, action_dims=None, **histories).primitive
     assert config is not None
     indices = np.array(action_dims)
@@ -239,7 +239,7 @@ def _gains(method: Method, action_dims: tuple[int, ...], action_scale: float) ->
         reached = RMS * (config.residual_gains() / deviation(config.reference))[indices]
         return {"action_scale": action_scale / float(np.sqrt(np.mean(reached**2)))}
     primitive = config.primitive(history=method.guidance == "skgrl")
-    if not method.environment.get("adaptive_history"):
+    if not method.environment.get("history.adaptive"):
         return {"gains": tuple(rms_gains(primitive, action_scale, method.action_repeat, indices).tolist())}
     # An adaptive history has several lengths, but one action scale. It is computed for the full length, which is the
     # length in free space.

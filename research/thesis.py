@@ -19,11 +19,10 @@ from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.tools.learning.config import PRESETS, OffPolicyConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig
 
-HISTORY = ("history", "history_variance", "history_source", "adaptive_history")
+HISTORY = ("history", "history.variance", "history.source", "history.adaptive")
 NEUTRAL = {
     "guidance": "the method, which is named next to the differences",
-    "solver": "all solvers return the same solution",
-    "kernel_parameters": "parameters of a kernel other than the thesis's",
+    "kernel.parameters": "parameters of a kernel other than the thesis's",
     "driver": "the program that drives a robot",
     "robot_url": "the address of a robot's messages",
     "robot_timeout": "the time without messages after which the connection to a robot counts as lost",
@@ -63,8 +62,8 @@ _PRIMITIVE = {
     "action_repeat": (1,),  # algorithms 2 and 3: an action at every time step
     "action_dims": (None,),
     "history": (10,),
-    "history_source": ("measured",),  # algorithm 3, line 18
-    "adaptive_history": (False,),
+    "history.source": ("measured",),  # algorithm 3, line 18
+    "history.adaptive": (False,),
     "horizon": (40,),
     "lambda_": (6.0,),
     "beta": (6.0,),
@@ -89,7 +88,7 @@ THESIS = {
             **_PRIMITIVE,
             "reward": ("sparse",),
             "observation": ("state", "image"),
-            "history_variance": (1e-6,),
+            "history.variance": (1e-6,),
         },
         "table_4_1_simulation",
         ("tqc",),
@@ -106,7 +105,7 @@ THESIS = {
             **_PRIMITIVE,
             "reward": ("sparse",),
             "observation": ("state",),
-            "history_variance": (1e-8,),
+            "history.variance": (1e-8,),
             "bound": (2.0 * MM,),  # equation 4.26
             "fixture_offset": ("per_run",),
             "station": ("arm",),
@@ -205,7 +204,6 @@ _ADDITIONS: tuple[tuple[str, Callable[[OffPolicyConfig], bool], str], ...] = (
         lambda p: p.base_motion_steps > 0,
         "actions other than zero become certain over {base_motion_steps} transitions",
     ),
-    ("n_steps", lambda p: p.n_steps > 1, "{n_steps}-step returns"),
 )
 _COMPARED = ("learning_rate", "tau", "train_freq", "gradient_steps", "ent_coef", "net_arch", "buffer_size")
 # Settings that only table 3.2 has.
@@ -308,9 +306,9 @@ _NAMES = {
     "action_repeat": "control steps of an action",
     "action_dims": "action dims",
     "history": "P =",
-    "history_variance": "ρ =",
-    "history_source": "history of poses:",
-    "adaptive_history": "adaptive history:",
+    "history.variance": "ρ =",
+    "history.source": "history of poses:",
+    "history.adaptive": "adaptive history:",
     "horizon": "H =",
     "lambda_": "λ =",
     "beta": "β =",
@@ -320,7 +318,7 @@ _NAMES = {
 
 
 def _words(name: str) -> str:
-    return _NAMES.get(name, name.replace("_", " "))
+    return _NAMES.get(name, name.rpartition(".")[2].replace("_", " "))
 
 
 def _format(value: Any, none: str = "all") -> str:

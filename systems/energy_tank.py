@@ -112,6 +112,10 @@ class EnergyTank(LeafSystem):
     get_admitted_wrench_output_port = output_getter("admitted_wrench", "bound that the tank admits, (8,)")
     get_energy_output_port = output_getter("energy", "energy in the tank, (1,) [J]")
 
+    def refill(self, context: Context) -> None:
+        """Fill the tank to its capacity, for a new motion; `context` is the context of this system."""
+        context.get_mutable_discrete_state().set_value(self._content, [self._capacity])
+
     def _calc_admitted(self, context: Context, value: AbstractValue) -> None:
         pose, desired = self._pose_port.Eval(context), self._desired_pose_port.Eval(context)
         states = context.get_discrete_state()

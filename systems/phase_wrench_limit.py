@@ -1,5 +1,7 @@
 """Wrench limits that change with the state of a shared control template."""
 
+from contextlib import suppress
+
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
@@ -8,6 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, approach_bound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.required_output import ReadFlag
 
 
 class PhaseWrenchLimit(LeafSystem):
@@ -15,63 +18,69 @@ class PhaseWrenchLimit(LeafSystem):
 
         b_k = b_{k-1} + s (B_q - b_{k-1}),  with the largest s <= 1 such that |b_k - b_{k-1}| <= r h
 
-    B_q is the limit of state q, r the largest rate and h the period. The rate of decreases is bounded as well, because
-    the force would jump after a sudden decrease of the limit. An episode begins with the limit of its first state. If
-    ``state`` is not the number of a state, B_q is the element-wise minimum of the limits of all states.
+    B_q is the element-wise minimum of the bound of the robot and the limit of state q, r the largest rate and h the
+    period. The rate of decreases is bounded as well, because the force would jump after a sudden decrease of the limit.
+    An episode begins with the limit of its first state. While a number of the limit is NaN or negative, that of b is
+    constant, or 0 before the first valid number.
 
     .. pydrake_system::
 
         name: PhaseWrenchLimit
         input_ports:
-        - state
+        - state_max_wrench
         - max_wrench (optional)
         output_ports:
         - phase_max_wrench
 
-    ``state`` is (1,), the number of the state. ``max_wrench`` and ``phase_max_wrench`` are (8,), the limits of
-    [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque [N, Nm]. ``max_wrench`` is the limit of
-    the task, whose changes apply at once. The output is the element-wise minimum of b and ``max_wrench``.
+    All ports are (8,), the limits of [fx fy fz tx ty tz], of the norm of the force and of the norm of the torque
+    [N, Nm]. ``state_max_wrench`` is the limit of the state, the output ``max_wrench`` of an `SctStateMachine`.
+    ``max_wrench`` is the limit of the task, whose changes apply at once. The output is the element-wise minimum of b
+    and ``max_wrench``.
 
     Args:
-        limits: Limits of the n states (n, 8) [N, Nm], finite and not negative.
+        bound: Bound of the robot (8,) [N, Nm], finite and not negative, which applies in states without limits.
         max_rate: Largest rates of change (8,) [N/s, Nm/s], positive, finite.
         period: Sampling period [s], positive.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If an argument is out of range. Two periods after the initialization, if nothing has read
+            ``phase_max_wrench``.
     """
 
-    def __init__(self, limits: np.ndarray, max_rate: np.ndarray, *, period: float):
+    def __init__(self, bound: np.ndarray, max_rate: np.ndarray, *, period: float):
         super().__init__()
         declare.check_period(period)
-        self._limits, rate = as_numbers(limits, "limits"), as_numbers(max_rate, "max_rate")
-        if self._limits.ndim != 2 or not len(self._limits) or self._limits.shape[1] != MAX_WRENCH_SIZE:
+        self._max_bound, rate = as_numbers(bound, "bound"), as_numbers(max_rate, "max_rate")
+        is_allowed = (self._max_bound >= 0.0) & (self._max_bound < np.inf)
+        if self._max_bound.shape != (MAX_WRENCH_SIZE,) or not is_allowed.all():
             raise InputError(
-                f"the wrench limits of n states must have the shape (n, {MAX_WRENCH_SIZE}), not {self._limits.shape}"
+                f"the bound of a robot's wrench must be {MAX_WRENCH_SIZE} finite numbers, none negative, not {bound}"
             )
-        if not ((self._limits >= 0.0) & (self._limits < np.inf)).all():
-            raise InputError("the wrench limits of states must be finite and not negative")
         if rate.shape != (MAX_WRENCH_SIZE,) or not ((rate > 0.0) & (rate < np.inf)).all():
             raise InputError(
                 f"the rates of wrench limits must be {MAX_WRENCH_SIZE} positive, finite numbers, not {max_rate}"
             )
         self._max_change = rate * period
-        self._state_port = self.DeclareVectorInputPort("state", 1)
+        self._limit_port = self.DeclareVectorInputPort("state_max_wrench", MAX_WRENCH_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
-        # NaN until the first update: the state at the port is initialized at the same instant as this system.
+        # NaN until the first update: the source of the limit is initialized at the same instant as this system.
         self._bound = self.DeclareDiscreteState(np.full(MAX_WRENCH_SIZE, np.nan))
-        sources = [self._state_port, self._max_wrench_port, self._bound]
+        self._read = ReadFlag(self)
+        sources = [self._limit_port, self._max_wrench_port, self._bound]
         declare.output(self, "phase_max_wrench", MAX_WRENCH_SIZE, self._phase_max_wrench, sources)
-        declare.update(self, period, self._update, declare.reset_to_default(self))
+        declare.update(self, period, self._update, self._reset)
 
-    get_state_input_port = input_getter("state", "number of the template's state, (1,)")
+    get_state_max_wrench_input_port = input_getter("state_max_wrench", "limit of the template's state, (8,)")
     get_max_wrench_input_port = input_getter("max_wrench", "wrench limit of the task, (8,); optional")
     get_phase_max_wrench_output_port = output_getter("phase_max_wrench", "limit in the present state, (8,)")
 
     def _limit(self, context: Context) -> np.ndarray:
-        """Return the limit of the state at the port, (8,)."""
-        state = declare.state_number(self._state_port, context, len(self._limits))
-        return self._limits.min(axis=0) if state is None else self._limits[state]
+        """Return the limit B_q at the port, (8,)."""
+        limit = self._limit_port.Eval(context)
+        if not (is_valid := limit >= 0.0).all():  # False for NaN
+            last = context.get_discrete_state().value(self._bound)
+            limit = np.where(is_valid, limit, np.where(np.isnan(last), 0.0, last))
+        return np.minimum(self._max_bound, limit)
 
     def _present(self, context: Context) -> np.ndarray:
         bound = context.get_discrete_state().value(self._bound)
@@ -81,8 +90,21 @@ class PhaseWrenchLimit(LeafSystem):
         bound = self._present(context)
         if self._max_wrench_port.HasValue(context):
             bound = np.minimum(bound, self._max_wrench_port.Eval(context))
-        return bound
+        return self._read.marked(context, bound)
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        # A state machine requires that its limit is read, which systems after this one may do only later. All systems
+        # initialize at once, and the source of the limit may have no start yet.
+        with suppress(InputError):
+            self._limit_port.Eval(context)
+        discrete_state.set_value(self._bound, np.full(MAX_WRENCH_SIZE, np.nan))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        is_first = np.isnan(context.get_discrete_state().value(self._bound)).any()
+        if not is_first and not self._read.is_set(context):
+            raise InputError(
+                f"no controller follows the limit of '{self.get_name()}': connect its output phase_max_wrench to the "
+                "controller's input max_wrench"
+            )
         bound = approach_bound(self._present(context), self._limit(context), self._max_change)
         discrete_state.set_value(self._bound, bound)

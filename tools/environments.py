@@ -22,7 +22,9 @@ from guiderail.diagrams.envs.options import (
     PrimitiveOptions,
     TemplateOptions,
     check_choice,
+    flat_options,
     kernel_from_options,
+    option_fields,
     validate_options,
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE
@@ -133,6 +135,11 @@ def declared_models(task: str) -> list[type[Options]]:
     return list(dict.fromkeys(model for model in models if model is not None))
 
 
+def flat_environment(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a task's environment with entries of structured options as options; see `flat_options`."""
+    return flat_options(declared_models(task), options) if task in TASKS.names() else dict(options)
+
+
 def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
     """Check single options quickly, before Drake is imported; `EnvConfig.resolve` checks all of them together.
 
@@ -151,10 +158,11 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
         if option in options and TASKS.declares(task, choices):
             check_choice(option, options[option], list(TASKS.declared(task, choices)), task)
     models = declared_models(task)
+    options = flat_options(models, options)
     for option in options:
-        option_models = [model for model in models if option in model.model_fields]
+        option_models = [model for model in models if option in option_fields(model)]
         if not option_models:
-            known = {name for model in models for name in model.model_fields}
+            known = {name for model in models for name in option_fields(model)}
             raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
         checked = KERNEL_OPTIONS if option in KERNEL_OPTIONS else (option,)  # kernel options are validated together
         values = {name: options[name] for name in checked if name in options}
@@ -210,7 +218,9 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
     Raises:
         InputError: If the task, guidance, station or difficulty is unknown.
     """
-    chosen = {key: environment[key] for key in ("guidance", "station", "difficulty") if key in environment}
+    environment = flat_environment(task, environment)
+    names: tuple[str, ...] = ("guidance", "station", "difficulty")
+    chosen = {key: environment[key] for key in names if key in environment}
     defaults = check_environment(task, chosen) | {key: check_environment(task, {}).get(key) for key in chosen}
     missing = object()
     return {key: value for key, value in environment.items() if defaults.get(key, missing) != value}
@@ -225,6 +235,7 @@ def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapp
     Raises:
         InputError: If the difficulty changes and the resulting arguments are not valid.
     """
+    environment, changes = flat_environment(task, environment), flat_environment(task, changes)
     removed = _options_of_station_only(environment.get("station"), changes.get("station"))
     environment = {key: value for key, value in environment.items() if key not in removed}
     own = environment.get("difficulty")
@@ -237,7 +248,7 @@ def _options_of_station_only(own: Any, other: Any) -> set[str]:
     """Return the options that the station `own` has and `other` does not have."""
     if other in (None, own) or not {own, other} <= {*STATIONS.names()}:
         return set()
-    own_options, other_options = ((STATIONS.get(name).options or Options).model_fields for name in (own, other))
+    own_options, other_options = (option_fields(STATIONS.get(name).options or Options) for name in (own, other))
     return {*own_options} - {*other_options}
 
 

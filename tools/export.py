@@ -29,7 +29,7 @@ NAMES = {"time": ("time [s]",), "phase": ("phase",), "wrench": WRENCH_NAMES}
 NAMES["center_of_pressure"] = ("center of pressure x [m]", "center of pressure y [m]")
 NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in ("pose", "desired_pose")}
 """Names of a signal's entries with their units; entries of another signal are numbered."""
-EXPORTED = {"kernel": DEFAULT_KERNEL, "history_source": "commanded", "adaptive_history": False}
+EXPORTED = {"kernel": DEFAULT_KERNEL, "history.source": "commanded", "history.adaptive": False}
 """Options whose other values the loop of a skill without an environment does not implement."""
 GUIDED = ("kgrl", "skgrl")  # guidance whose data can be exported
 POLICY_FILE = "policy.onnx"

@@ -21,7 +21,7 @@ from guiderail.diagrams.envs.observation import (
     ObservationTerm,
     affine,
 )
-from guiderail.diagrams.envs.options import KERNEL_OPTIONS, kernel_from_options, validate_options
+from guiderail.diagrams.envs.options import PrimitiveOptions, kernel_from_options, validate_options
 from guiderail.diagrams.envs.scene import (
     Camera,
     add_meshcat,
@@ -62,7 +62,7 @@ def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
     constraints = call_checked(task, "constraints") or LinearConstraints.none(station.pose_size)
     if "demonstrations" in provides:
         options = task.config.part("primitive")
-        kernel = kernel_from_options(options)
+        kernel = kernel_from_options({PrimitiveOptions.entries.get(name, name): options[name] for name in options})
         reference = pass_through(call_checked(task, "reference"), options.get("via_points", ()), kernel)
         options = {name: value for name, value in options.items() if name not in _CONVERTED_OPTIONS}
         _check_clock(reference.times, station.nominal_period)
@@ -95,7 +95,7 @@ _LIMITS = ("max_speed", "max_acceleration")
 _PROGRESS = ("progress", "progress_tolerance", "max_lag")
 _JOINTS = ("joint_margin", "min_singular_value")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
-_CONVERTED_OPTIONS = (*KERNEL_OPTIONS, "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
+_CONVERTED_OPTIONS = ("kernel", "length_scale", "kernel_parameters", "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
 
 
 def _state_progress(task: Task, period: float) -> StateProgress | None:
@@ -232,7 +232,13 @@ class Loop:
                 call_checked(task, "template").template, impedance, self.station.control_period
             )
         if limit is not None:
-            add_system(self.builder, "phase_wrench_limit", limit, state=self.guidance.GetOutputPort("state"))
+            if not self.guidance.HasOutputPort("state_max_wrench"):
+                raise InputError(
+                    f"states of the template of {task.name} limit force or torque, and guidance="
+                    f"{task.config.guidance!r} has no output 'state_max_wrench': export max_wrench of its state machine"
+                )
+            state_max_wrench = self.guidance.GetOutputPort("state_max_wrench")
+            add_system(self.builder, "phase_wrench_limit", limit, state_max_wrench=state_max_wrench)
             if bound is not None:
                 self.builder.Connect(bound, limit.get_max_wrench_input_port())
             bound = limit.get_phase_max_wrench_output_port()

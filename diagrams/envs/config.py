@@ -13,6 +13,8 @@ from guiderail.diagrams.envs.options import (
     PrimitiveOptions,
     TemplateOptions,
     check_choice,
+    flat_options,
+    option_fields,
     validate_options,
 )
 from guiderail.diagrams.envs.settings import EnvSettings
@@ -130,30 +132,32 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     if not guidance:
         raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
-    merged = {
+    settings = task.defaults, task.difficulties[difficulty], options
+    chosen: dict[str, Any] = {
         # The default is a station of this package, so that another package's registration changes no environment.
         "station": min(stations, key=lambda station: not STATIONS.is_packaged(station)),
         "reward": task.rewards[0],
         "observation": task.observations[0],
-        **task.defaults,
-        **task.difficulties[difficulty],
-        **options,
     }
-    if "guidance" not in merged:
-        merged["guidance"] = default_guidance(guidance)
-    if merged["station"] in [*STATIONS.broken]:
-        STATIONS.get(merged["station"])  # raises an InputError
-    check_choice("station", merged["station"], stations, name)
-    check_choice("reward", merged["reward"], list(task.rewards), name)
-    check_choice("observation", merged["observation"], list(task.observations), name)
+    for given in settings:
+        chosen |= {key: given[key] for key in ("guidance", *chosen) if key in given}
+    if "guidance" not in chosen:
+        chosen["guidance"] = default_guidance(guidance)
+    if chosen["station"] in [*STATIONS.broken]:
+        STATIONS.get(chosen["station"])  # raises an InputError
+    check_choice("station", chosen["station"], stations, name)
+    check_choice("reward", chosen["reward"], list(task.rewards), name)
+    check_choice("observation", chosen["observation"], list(task.observations), name)
 
-    models = option_models(task, merged["guidance"], merged["station"])
-    known = {option for model in models.values() for option in model.model_fields}
+    models = option_models(task, chosen["guidance"], chosen["station"])
+    known = {option for model in models.values() for option in option_fields(model)}
     _check_declared_options(task, known)
+    defaults, preset, options = (flat_options(models.values(), given) for given in settings)
     _check_given_options(task, stations, options, known)
+    merged = {**defaults, **preset, **options, **chosen}
     parts: dict[str, Any] = {
         part: validate_options(
-            model, {option: merged[option] for option in model.model_fields if option in merged}, name
+            model, {option: merged[option] for option in option_fields(model) if option in merged}, name
         )
         for part, model in models.items()
     }
@@ -166,13 +170,14 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
 def _check_declared_options(task: type[Task], known: set[str]) -> None:
     """Refuse defaults and difficulties with an option that no guidance and no station of the task has."""
     for context, settings in {"defaults": task.defaults, **task.difficulties}.items():
-        for option in set(settings) - known:
+        for option in {*settings} - known:
             anywhere = {
                 name
                 for guidance in possible_guidance(task.provides())
                 for station in task.stations()
                 for model in option_models(task, guidance, station).values()
-                for name in model.model_fields
+                for entry in option_fields(model)
+                for name in (entry, entry.partition(".")[0])
             }
             if option not in anywhere:
                 raise InputError(
@@ -186,6 +191,6 @@ def _check_given_options(task: type[Task], stations: list[str], options: Mapping
     unknown = sorted(set(options) - known, key=str)
     if not unknown:
         return
-    elsewhere = [name for name in stations if unknown[0] in (STATIONS.get(name).options or Options).model_fields]
+    elsewhere = [name for name in stations if unknown[0] in option_fields(STATIONS.get(name).options or Options)]
     remedy = f"it is an option of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
     raise InputError(f"{task.name} has no option {brief(unknown[0])} here: {remedy}")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import fields
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
 from annotated_types import Len
@@ -34,9 +35,15 @@ def check_options_class(owner: str, attribute: str, given: object, kind: type[Op
 
 
 class Options(BaseModel):
-    """Base class of option models: immutable; refuses undeclared names, NaN and infinite numbers."""
+    """Base class of option models: immutable; refuses undeclared names, NaN and infinite numbers.
+
+    Attributes:
+        entries: Names of the fields that are entries of a structured option, by field. The field `history_variance`
+            with the name "history.variance" is the entry "variance" of the option `history`.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+    entries: ClassVar[Mapping[str, str]] = {}
 
     @classmethod
     def diagram_key(cls, options: Mapping[str, Any]) -> Hashable:
@@ -45,6 +52,57 @@ class Options(BaseModel):
         Files that an option names are part of the key of every diagram.
         """
         return None
+
+
+PRIMARY = {
+    "base_policy": "policy",
+    "gamma": "value",
+    "history": "length",
+    "kernel": "name",
+    "net_arch": "units",
+    "progress": "mode",
+    "sensing": "profile",
+}
+"""Entry that a structured option sets if its value is no mapping: history=4 is history={length: 4}."""
+
+
+def entries_of(option: str, *fields: str) -> dict[str, str]:
+    """Return names of fields that are entries of a structured option, such as "sensing.tare" of the field `tare`."""
+    return {field: f"{option}.{field}" for field in fields}
+
+
+def option_fields(model: Any) -> dict[str, str]:
+    """Return the fields of a model or a dataclass by the names of their options, such as "history.variance"."""
+    entries = getattr(model, "entries", {})
+    names = model.model_fields if hasattr(model, "model_fields") else (field.name for field in fields(model))
+    return {entries.get(field, field): field for field in names}
+
+
+def flat_options(models: Iterable[Any], options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options with the entries of every structured option as options of their own.
+
+    A mapping as the value of `history`, for example, becomes the options "history", "history.variance", ….
+
+    Args:
+        models: Models, or dataclasses, that declare the options.
+        options: Options by name. A name that no model declares remains as it is.
+
+    Raises:
+        InputError: If an option is given both in a mapping and by its own name, with different values.
+    """
+    structured = {name.partition(".")[0] for model in models for name in option_fields(model) if "." in name}
+    flat: dict[str, Any] = {}
+    for name, value in options.items():
+        entries = {name: value}
+        if name in structured and isinstance(value, Mapping):
+            entries = {f"{name}.{entry}": content for entry, content in value.items()}
+        for entry, content in entries.items():
+            group, _, last = str(entry).partition(".")
+            key = group if last and PRIMARY.get(group) == last else entry
+            if key in flat and flat[key] != content:
+                raise InputError(f"{key} is given as {brief(flat[key])} and as {brief(content)}: give it once")
+            flat[key] = content
+    return flat
 
 
 def _split_list(value: Any) -> Any:
@@ -107,6 +165,15 @@ class CommonOptions(Options):
 class PrimitiveOptions(Options):
     """Options of every guidance built from demonstrations; see `PrimitiveConfig`."""
 
+    entries: ClassVar[Mapping[str, str]] = {
+        "history_variance": "history.variance",
+        "history_source": "history.source",
+        "adaptive_history": "history.adaptive",
+        "progress_tolerance": "progress.tolerance",
+        "max_lag": "progress.max_lag",
+        "kernel_parameters": "kernel.parameters",
+    }
+
     action_scale: Number = Field(
         1.0, gt=0, description="κ: a constant action of ±1 moves the outputs by √3 κ standard deviations"
     )
@@ -165,17 +232,17 @@ class PrimitiveOptions(Options):
         description="deviation of position [m] and angles [rad] from the command beyond which the motion waits",
     )
     max_lag: Number = Field(3.0, ge=0, le=60, description="largest total time for which the motion waits [s]")
-    solver: Literal["daqp", "osqp", "piqp"] = Field("daqp", description="solver of the constrained primitive's QP")
 
     @field_validator("kernel_parameters")
     @classmethod
     def _check_kernel(cls, parameters: dict[str, float], info: ValidationInfo) -> dict[str, float]:
         if all(name in info.data for name in ("kernel", "length_scale")):
-            kernel_from_options({**info.data, "kernel_parameters": parameters})
+            make_kernel(info.data["kernel"], info.data["length_scale"], parameters)
         return parameters
 
 
-KERNEL_OPTIONS = ("kernel", "length_scale", "kernel_parameters")
+KERNEL_OPTIONS = {"kernel": DEFAULT_KERNEL, "length_scale": DEFAULT_LENGTH_SCALE, "kernel.parameters": None}
+"""Options of the kernel, with their defaults."""
 
 
 def kernel_from_options(options: Mapping[str, Any]) -> Kernel:
@@ -184,7 +251,7 @@ def kernel_from_options(options: Mapping[str, Any]) -> Kernel:
     Raises:
         InputError: As `make_kernel`.
     """
-    return make_kernel(*(options.get(name, PrimitiveOptions.model_fields[name].default) for name in KERNEL_OPTIONS))
+    return make_kernel(*(options.get(name, default) for name, default in KERNEL_OPTIONS.items()))
 
 
 class TemplateOptions(Options):
@@ -194,25 +261,6 @@ class TemplateOptions(Options):
         None,
         description="keep commands inside the template's active constraints; default: true, but false with guidance "
         "none",
-    )
-
-
-class BarrierOptions(Options):
-    """Options of `residual_cbf`."""
-
-    barrier_decay: Number = Field(
-        0.2, gt=0, le=1, description="γ, largest fraction of the distance to a constraint that one step may cover"
-    )
-
-
-class TangentOptions(Options):
-    """Options of `residual_tangent`."""
-
-    slack_width: Number = Field(
-        0.5,
-        gt=0,
-        description="distance to a constraint at which motion towards it is halved, as a multiple of the "
-        "displacement by an action of 1",
     )
 
 
@@ -235,11 +283,12 @@ def validate_options(model: type[Model], values: Mapping[str, Any], context: str
     Raises:
         InputError: If a name is unknown, or a value has the wrong type or is out of range.
     """
-    unknown = [name for name in values if name not in model.model_fields]
+    fields = option_fields(model)
+    unknown = [name for name in values if name not in fields]
     if unknown:
-        raise InputError(f"{context} has no option {brief(unknown[0])}: {did_you_mean(unknown[0], model.model_fields)}")
+        raise InputError(f"{context} has no option {brief(unknown[0])}: {did_you_mean(unknown[0], fields)}")
     try:
-        return model(**values)
+        return model(**{fields[name]: value for name, value in values.items()})
     except ValidationError as error:
         raise InputError(_format_error(model, error.errors()[0], values, context)) from None
 
@@ -257,8 +306,8 @@ def describe_options(model: type[BaseModel] | None) -> list[dict[str, Any]]:
         return []
     properties = model.model_json_schema()["properties"]
     rows = []
-    for name, field in model.model_fields.items():
-        schema = properties[name]
+    for name, key in option_fields(model).items():
+        field, schema = model.model_fields[key], properties[key]
         bounds = {
             key: schema[key] for key in ("minimum", "maximum", "exclusiveMinimum", "exclusiveMaximum") if key in schema
         }
@@ -321,9 +370,9 @@ def _locate(
         if isinstance(part, int) and models:
             name, value = f"{name}[{part}]", value[part]
         elif models and part in models[0].model_fields:
-            field = models[0].model_fields[str(part)]
-            value = value.get(part) if isinstance(value, Mapping) else getattr(value, str(part), None)
-            name, models = f"{name}.{part}" if name else str(part), _models_of(field)
+            field, option = models[0].model_fields[str(part)], getattr(models[0], "entries", {}).get(part, part)
+            value = value.get(option) if isinstance(value, Mapping) else getattr(value, str(part), None)
+            name, models = f"{name}.{option}" if name else str(option), _models_of(field)
         else:
             break
     return name, field, value

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from guiderail.diagrams.envs.options import CommonOptions, Options
+from guiderail.diagrams.envs.options import CommonOptions, Options, option_fields
 from guiderail.diagrams.guidance.registry import GUIDANCE, GuidanceKind
 from guiderail.diagrams.stations.registry import STATIONS, StationKind
 
@@ -31,10 +31,13 @@ class EnvSettings:
     def options(self) -> dict[str, Any]:
         """All options by name, as `gymnasium.make` takes them."""
         common = {name: getattr(self, name) for name in CommonOptions.model_fields}
-        return common | {name: value for part in self.parts for name, value in self.part(part).items()}
+        parts = (
+            (part, name, field) for part in self.parts.values() for name, field in option_fields(type(part)).items()
+        )
+        return common | {name: getattr(part, field) for part, name, field in parts}
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return the options of a part, a key of `parts`, as a dictionary from name to value."""
+        """Return the options of a part, a key of `parts`, as a dictionary from field to value."""
         model = self.parts[name]
         return {option: getattr(model, option) for option in type(model).model_fields}
 

@@ -9,7 +9,6 @@ import numpy as np
 from pydrake.systems.framework import Diagram, DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Adder, MatrixGain, PassThrough, Saturation, ZeroOrderHold
 
-from guiderail.diagrams.envs.options import BarrierOptions, TangentOptions
 from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge
 from guiderail.diagrams.guidance.registry import register_guidance
@@ -30,6 +29,11 @@ from guiderail.systems.residual import Residual
 
 MakeFilter = Callable[[PrimitiveConfig, KeepOut], CommandLaw]
 """Function of the primitive's configuration and the keep-out walls that returns the filter of a residual's commands."""
+
+BARRIER_DECAY = 0.2  # γ of `residual_cbf`, largest fraction of the distance to a constraint that one step may cover
+# Distance to a constraint at which `residual_tangent` halves the motion towards it, as a multiple of the displacement
+# by an action of 1.
+SLACK_WIDTH = 0.5
 
 
 def primitive_config_of(prior: PriorKnowledge) -> PrimitiveConfig:
@@ -259,22 +263,21 @@ def safe_residual(prior: PriorKnowledge) -> Diagram:
 
 @register_guidance(
     "residual_cbf", needs=(("demonstrations", "keep_out"),), label="residual RL, barrier function", color="#bcbd22",
-    demonstrates=True, displaces=True, options=BarrierOptions,
+    demonstrates=True, displaces=True,
 )  # fmt: skip
 def residual_cbf(prior: PriorKnowledge) -> Diagram:
     """Build residual RL with a control barrier function on the command; see `BarrierFilter`."""
-    decay = prior.options["barrier_decay"]
-    return PrimitiveGuidance(prior, **RESIDUAL, make_filter=lambda config, walls: BarrierFilter(walls, decay))
+    return PrimitiveGuidance(prior, **RESIDUAL, make_filter=lambda config, walls: BarrierFilter(walls, BARRIER_DECAY))
 
 
 @register_guidance(
     "residual_tangent", needs=(("demonstrations", "keep_out"),), label="residual RL, tangent space", color="#7f7f7f",
-    demonstrates=True, displaces=True, options=TangentOptions,
+    demonstrates=True, displaces=True,
 )  # fmt: skip
 def residual_tangent(prior: PriorKnowledge) -> Diagram:
     """Build residual RL in the tangent space of the constraints; see `TangentSpaceFilter`."""
 
     def make_filter(config: PrimitiveConfig, walls: KeepOut) -> CommandLaw:
-        return TangentSpaceFilter(walls, prior.options["slack_width"] * float(config.residual_gains().max()))
+        return TangentSpaceFilter(walls, SLACK_WIDTH * float(config.residual_gains().max()))
 
     return PrimitiveGuidance(prior, **RESIDUAL, make_filter=make_filter)

@@ -40,6 +40,7 @@ class ActiveConstraintFilter(Diagram):
         - progress
         - commanded_violation
         - measured_violation
+        - state_max_wrench
     """
 
     def __init__(
@@ -77,6 +78,7 @@ class ActiveConstraintFilter(Diagram):
         ):
             for name in names:
                 builder.ExportOutput(system.GetOutputPort(name), name)
+        builder.ExportOutput(self._machine.get_max_wrench_output_port(), "state_max_wrench")
         builder.BuildInto(self)
 
     def export_ports(self, builder: DiagramBuilder, hold: ZeroOrderHold) -> None:
@@ -90,7 +92,7 @@ class ActiveConstraintFilter(Diagram):
             builder.ExportInput(self.GetInputPort("frame_poses"), "frame_poses")
         builder.ExportOutput(hold.get_output_port(), "held_action")
         names = ("desired_pose", "fallback", "state", "transition_distance", "progress", "measured_violation")
-        for name in names:
+        for name in (*names, "state_max_wrench"):
             builder.ExportOutput(self.GetOutputPort(name), name)
         builder.ExportOutput(self.GetOutputPort("commanded_violation"), "constraint_violation")
 
@@ -106,8 +108,10 @@ class SctGuidance(Guidance):
     ``action`` is (n,), the n inputs of the template, from a policy or a user's input device. ``constraint_violation``
     is the command's largest violation of an active constraint [m] or [rad]; it is 0 inside the constraints, or if they
     are not enforced. In addition to the ports of all guidance there are ``state``, ``transition_distance``,
-    ``progress`` and ``measured_violation``, all (1,). The optional input ``frame_poses`` (6·k,) has the poses of the
-    template's k frames, for objects that move; it is the one source of all subsystems.
+    ``progress`` and ``measured_violation``, all (1,), and ``state_max_wrench`` (8,), the limits of force and torque of
+    the state; connect it to the station's ``max_wrench`` if the template has such limits. The optional input
+    ``frame_poses`` (6·k,) has the poses of the template's k frames, for objects that move; it is the one source of all
+    subsystems.
     """
 
     def __init__(

@@ -12,7 +12,6 @@ from guiderail.diagrams.stations.station import (
     Impedance,
     command_timeout,
     export_station_ports,
-    max_wrench,
     to_wrench_order,
 )
 from guiderail.diagrams.wiring import add_system
@@ -93,7 +92,7 @@ def add_energy_tank(
 def make_phase_wrench_limit(
     template: SharedControlTemplate, impedance: Impedance | None, period: float
 ) -> PhaseWrenchLimit | None:
-    """Return the system that limits the wrench by the template's current state; None if no state has a limit.
+    """Return the system that bounds the rate of the template's wrench limits; None if no state has a limit.
 
     Args:
         template: Shared control template.
@@ -103,21 +102,16 @@ def make_phase_wrench_limit(
     Raises:
         InputError: If a state has a limit, and the impedance is not bounded.
     """
-    limited = [state.name for state in template.states if state.limits_wrench]
-    if not limited:
+    if not template.limits_wrench:
         return None
     if impedance is None or impedance.bound is None:
+        limited = [state.name for state in template.states if state.limits_wrench]
         raise InputError(
             f"state {limited[0]!r} of template {template.name!r} limits force or torque, and the impedance of this "
             "station has no bound that can change: choose another station or bounded_force=true, or remove the limit"
         )
     # A state without limits has the station's bound, so that the ramp to another state's limits starts there.
-    bounds = [impedance.bound.numbers] * len(template.states)
-    for number, state in enumerate(template.states):
-        if state.limits_wrench:
-            limits = [np.inf if limit is None else limit for limit in (state.max_force_n, state.max_torque_nm)]
-            bounds[number] = np.minimum(bounds[number], max_wrench(*limits))
-    return PhaseWrenchLimit(np.array(bounds), WRENCH_RATE, period=period)
+    return PhaseWrenchLimit(impedance.bound.numbers, WRENCH_RATE, period=period)
 
 
 def add_impedance_control(

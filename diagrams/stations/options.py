@@ -18,12 +18,13 @@ errors of each arm.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 
-from guiderail.diagrams.envs.options import Integer, Number, Options, Pair, increases, satisfies
+from guiderail.diagrams.envs.options import Integer, Number, Options, Pair, entries_of, increases, satisfies
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.transforms import MM
 from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
@@ -177,15 +178,25 @@ CalibrationError = Annotated[
 
 
 def _sensor_error(description: str) -> Any:
-    return Field(None, description=f"{description}; default: set by sensing")
+    return Field(None, description=f"{description}; default: set by the profile")
 
 
 class Disturbances(Options):
     """Options of environments with a workcell: constant disturbances, and ranges that every episode samples from.
 
     A policy can be trained with one range and evaluated with another. `sensing` names a setting of all sensor errors.
-    An option of a single error replaces this error of the setting.
+    An entry for a single error replaces this error of the setting.
     """
+
+    entries: ClassVar[Mapping[str, str]] = entries_of(
+        "sensing",
+        "wrench_scale", "wrench_bias", "wrench_drift", "wrench_noise", "wrench_delay", "calibration_error", "tare",
+        "pose_bias",
+    ) | entries_of(
+        "disturbances",
+        "friction_factor", "modulus_factor", "stiffness_factor", "lost_commands", "late_commands", "clock_factor",
+        "payload",
+    )  # fmt: skip
 
     sensing: Sensing = Field(
         "exact",
@@ -209,7 +220,7 @@ class Disturbances(Options):
     )
     wrench_noise: Magnitudes | None = _sensor_error("standard deviation of the measured wrench: force [N], torque [Nm]")
     wrench_delay: Integer | None = Field(
-        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: set by sensing"
+        None, ge=0, le=50, description="delay of the measured wrench in control steps; default: set by the profile"
     )
     calibration_error: CalibrationError | None = _sensor_error(
         "largest error of the robot's kinematics, sampled every episode: position [m], orientation [rad]"

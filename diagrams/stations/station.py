@@ -54,7 +54,7 @@ from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.models.control.wrench import POSE_ORDER, WrenchBound
+from guiderail.models.control.wrench import FORCE_SHARES, POSE_ORDER, WrenchBound
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
@@ -75,8 +75,6 @@ COMMAND_TIMEOUT = 0.1  # age above which a time-stamped command is stale [s]; at
 
 _FINEST = 2**47  # largest denominator of a time step of which a day's multiples are exact, [1/s]
 
-# Limits of the force along x, y and z as fractions of the limit of its norm. The norm of these fractions is below 1.
-FORCE_SHARES = (0.45, 0.45, 0.75)
 # Largest stiffness of workpiece, grasp and fixture in series for which an impact stays inside the bound [N/m].
 CONTACT_STIFFNESS = 2.5e4
 
@@ -117,23 +115,15 @@ class Impedance:
         return replace(self, limits=tuple(limits.tolist()), bound=WrenchBound(axes, *norms, CONTACT_STIFFNESS))
 
 
-def max_wrench(force: float, torque: float = np.inf) -> np.ndarray:
-    """Return the value (8,) of a station's input `max_wrench` that limits the norms of force [N] and torque [Nm].
-
-    The torque about each axis is limited to `torque` / √3, so that its norm never exceeds `torque`.
+def max_wrench(force: float) -> np.ndarray:
+    """Return the value (8,) of a station's input `max_wrench` that limits the norm of the force [N].
 
     Raises:
-        InputError: If the force or the torque is not positive.
+        InputError: If the force is not positive.
     """
-    if not torque > 0.0:
-        raise InputError(f"the largest torque of an impedance must be positive, not {torque} Nm")
     bound = Impedance().with_max_force(force).bound
     assert bound is not None
-    numbers = bound.numbers
-    if torque < np.inf:
-        numbers[3:6] = np.minimum(numbers[3:6], torque / np.sqrt(3.0))
-        numbers[7] = np.linalg.norm(numbers[3:6])
-    return numbers
+    return bound.numbers
 
 
 def whole_multiple(control_period: float, unit: float) -> float:

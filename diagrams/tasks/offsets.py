@@ -20,7 +20,7 @@ def reference_of_file(
     components: int | None,
     floor: tuple[float, ...],
     count: int | None = None,
-    **fit: Any,
+    prior_std: tuple[float, ...] | None = None,
 ) -> ReferenceTrajectory:
     """Fit a reference trajectory, with the mean duration of the demonstrations, to the demonstrations in a file.
 
@@ -30,7 +30,7 @@ def reference_of_file(
         floor: Repeatability of a demonstrator's hand, as a standard deviation (6,); its square is added to the fitted
             variances.
         count: Number of demonstrations to use, from the first on; None: all.
-        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`; see `ReferenceOptions.fit_arguments`.
+        prior_std: As in `ReferenceTrajectory.from_demonstrations`.
 
     Raises:
         InputError: If there is no such file, or its demonstrations are not poses.
@@ -38,7 +38,7 @@ def reference_of_file(
     if not path.is_file():
         raise InputError(f"there is no file {path}: give a file that guiderail teleoperate --record has written")
     with path.open("rb") as file:
-        key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, *sorted(fit.items())
+        key = hashlib.file_digest(file, "sha256").digest(), components, floor, count, prior_std
     if key in _REFERENCES:
         return _REFERENCES[key]
     demonstrations = Demonstrations.load(path).first(count)
@@ -49,7 +49,7 @@ def reference_of_file(
         )
     num_steps = control_steps(demonstrations)
     fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), **fit
+        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), prior_std=prior_std
     )
     times = CONTROL_PERIOD * np.arange(num_steps)
     _REFERENCES[key] = ReferenceTrajectory(times, fitted.means, fitted.covariances)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
@@ -76,33 +76,9 @@ class FixtureOffsetOptions(Options):
         return value
 
 
-class ReferenceOptions(Options):
-    """Options of a task whose reference trajectory is fitted to demonstrations."""
+class PriorOptions(Options):
+    """Options of a task with recorded demonstrations of poses: several, or only one."""
 
-    reference_model: Literal["gmr", "promp"] = Field(
-        "gmr",
-        description="model of the demonstrations' mean and covariance: Gaussian mixture regression, or a probabilistic "
-        "movement primitive",
-    )
-
-    def fit_arguments(self) -> dict[str, Any]:
-        """Return arguments of `ReferenceTrajectory.from_demonstrations`, for options that differ from their default."""
-        arguments = {"reference_model": "model", "gap_scale": "gap_scale", "prior_std": "prior_std"}
-        fields = type(self).model_fields
-        given = {name: getattr(self, name) for name in arguments if name in fields}
-        return {arguments[name]: value for name, value in given.items() if value != fields[name].default}
-
-
-class PriorOptions(ReferenceOptions):
-    """Options of a task with recorded demonstrations of poses: several, possibly with gaps, or only one."""
-
-    gap_scale: Number = Field(
-        1.0,
-        ge=0.01,
-        le=100,
-        description="factor of the standard deviation where all demonstrations have a gap; below 1, exploration there "
-        "is narrower, above 1 wider",
-    )
     prior_std: PriorStd | None = Field(
         None,
         description="standard deviation around a single demonstration, required for one demonstration: x y z Rz Ry Rx "

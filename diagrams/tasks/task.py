@@ -77,10 +77,10 @@ def terminal_reward(rewards: Mapping[str, float], name: str = "terminal_reward")
 
 
 @lru_cache(maxsize=32)
-def _on_clock(reference: ReferenceTrajectory, period: float, time_scale: float) -> ReferenceTrajectory:
+def _on_clock(reference: ReferenceTrajectory, period: float) -> ReferenceTrajectory:
     """Return `Task.on_clock` for a control period [s]; cached, so that environments share trajectories."""
     is_on_clock = np.abs(np.diff(reference.times) - period).max() <= 1e-6 * period
-    return reference if is_on_clock and time_scale == 1.0 else reference.resampled(period, time_scale)
+    return reference if is_on_clock else reference.resampled(period)
 
 
 class Task(ABC):
@@ -167,15 +167,13 @@ class Task(ABC):
         """Return the number of control steps, at least one, that last as long as `nominal_steps` default periods."""
         return max(round(nominal_steps * self.default_control_period / self.control_period), 1)
 
-    def on_clock(self, reference: ReferenceTrajectory, time_scale: float = 1.0) -> ReferenceTrajectory:
-        """Return a reference trajectory resampled to the control period, and `time_scale` times as long.
-
-        The trajectory itself is returned if it has this period already and `time_scale` is 1.
+    def on_clock(self, reference: ReferenceTrajectory) -> ReferenceTrajectory:
+        """Return a reference trajectory resampled to the control period, or itself if it has this period already.
 
         Raises:
-            InputError: If `time_scale` is not positive, or fewer than two steps remain.
+            InputError: If fewer than two steps remain.
         """
-        return _on_clock(reference, self.control_period, time_scale)
+        return _on_clock(reference, self.control_period)
 
     @abstractmethod
     def workcell(self) -> Any:

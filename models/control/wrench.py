@@ -20,6 +20,10 @@ POSE_ORDER = [0, 1, 2, 5, 4, 3]  # indices of the pose coordinates [x y z Rz Ry 
 MAX_WRENCH_SIZE = 8
 """Size of a bound as a signal: six limits along and about the axes, and the limits of the norms of force and torque."""
 
+# Limits of the force along x, y and z as fractions of the limit of its norm; the norm of these fractions is below 1.
+# They favor z, the direction of insertion.
+FORCE_SHARES = (0.45, 0.45, 0.75)
+
 
 @dataclass(frozen=True, eq=False)  # no `==`, because the comparison of arrays is an array
 class WrenchBound:
@@ -73,6 +77,21 @@ def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
     lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
     lowest.setflags(write=False)
     return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))
+
+
+def norm_limits(force: float = np.inf, torque: float = np.inf) -> np.ndarray:
+    """Return a bound as a signal (8,) that limits the norms of force [N] and torque [Nm]; infinite numbers do not.
+
+    The force along the axes is limited to `FORCE_SHARES` of `force`, and the torque about each axis to `torque` / √3,
+    so that the norms never exceed the limits.
+
+    Raises:
+        InputError: If the force or the torque is not positive.
+    """
+    if not (force > 0.0 and torque > 0.0):
+        raise InputError(f"limits of force and torque must be positive, not {force} N and {torque} Nm")
+    axes = np.concatenate([force * np.array(FORCE_SHARES), np.full(3, torque / math.sqrt(3.0))])
+    return np.array([*axes, norm(axes[:3]), norm(axes[3:])])
 
 
 def approach_bound(bound: np.ndarray, target: np.ndarray, max_change: np.ndarray) -> np.ndarray:

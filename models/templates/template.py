@@ -11,6 +11,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
+from guiderail.models.control.wrench import norm_limits
 from guiderail.models.templates.consistency import describe, find_contradiction
 from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import WORLD, Frames, StatePart, angle_between, between, largest
@@ -116,6 +117,20 @@ class SharedControlTemplate:
     max_speed_m_per_s: float
     max_speed_rad_per_s: float
     parameters: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def limits_wrench(self) -> bool:
+        """True if a state has its own limit of force or torque."""
+        return any(state.limits_wrench for state in self.states)
+
+    def max_wrench(self, state: int) -> np.ndarray:
+        """Return the limits of force and torque of a state as the bound of an impedance, (8,); see `norm_limits`.
+
+        Without a limit, the numbers are infinite.
+        """
+        declared = self.states[state]
+        limits = (declared.max_force_n, declared.max_torque_nm)
+        return norm_limits(*(math.inf if limit is None else limit for limit in limits))
 
     def index(self, state: str) -> int:
         """Return the number of the state with the name `state`.

@@ -82,7 +82,7 @@ def _run(task: str, environment: Mapping[str, Any], cores: int, num_envs: int) -
 
 
 def _settings(num_envs: int) -> dict[str, Any]:
-    return {"num_envs": num_envs, "constant_episodes": 0}  # constant actions end some episodes early
+    return {"num_envs": num_envs, "exploration.constant_episodes": 0}  # constant actions end some episodes early
 
 
 def _time_of_children() -> float:

@@ -48,7 +48,7 @@ PUSHES = ((0.20, -0.10), (0.20, 0.05), (0.54, -0.02), (0.54, 0.02), (0.78, -0.10
 
 def primitive_of(kind: str, variance: float = THESIS_VARIANCE) -> LcNsKmp:
     """Return the primitive of the narrow passage, with a history for sKGRL."""
-    config = make_prior_knowledge("NarrowPassage", guidance=kind, history_variance=variance).primitive
+    config = make_prior_knowledge("NarrowPassage", guidance=kind, history={"variance": variance}).primitive
     assert config is not None
     return config.primitive(history=kind == "skgrl")
 
@@ -129,7 +129,7 @@ def figure_5_3(out: Path) -> dict[str, Any]:
 def figure_5_4(out: Path) -> dict[str, Any]:
     """Draw the recovery from pushes at positions with a large and with a small variance of the demonstrations."""
     env: Any = make_environment(
-        TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history_source": "measured"}
+        TASK, {"guidance": "skgrl", "action_repeat": 1, "history": 1, "history.source": "measured"}
     )
     nominal, _, _ = _run(env, None)
     figure, ((plane, time),) = new_figure(1, 2, (11, 5.6))
@@ -272,7 +272,7 @@ def _explore_in_simulation(
 ) -> list[dict[str, Any]]:
     """Return the rows of episodes of random actions, with gains for an RMS of one standard deviation."""
     gains = tuple(rms_gains(primitive_of(kind, variance), action_repeat=action_repeat).tolist())
-    arguments = {"guidance": kind, "action_repeat": action_repeat, "history_variance": variance, "gains": gains}
+    arguments = {"guidance": kind, "action_repeat": action_repeat, "history.variance": variance, "gains": gains}
     env = make_environment(TASK, arguments)
     episode_rows = [row for seed in seeds for row in random_episodes(env, seed, episodes)]
     env.close()

@@ -36,7 +36,10 @@ from guiderail.models.robots.robot import robot_names
 STEPS = 60  # largest number of environment steps of an episode
 INFO = ("constraint_violation", "measured_violation", "force", "fallback")
 EXTRA_CASES: list[tuple[str, dict[str, Any]]] = [
-    ("BncConnector", {"guidance": "kgrl", "wrench_noise": [0.2, 0.01], "wrench_delay": 2, "action_repeat": 5}),
+    (
+        "BncConnector",
+        {"guidance": "kgrl", "sensing.wrench_noise": [0.2, 0.01], "sensing.wrench_delay": 2, "action_repeat": 5},
+    ),
     ("BncConnector", {"guidance": "skgrl", "reward": "shaped"}),
     ("BncConnector", {"guidance": "skgrl", "observation": "center_of_pressure", "action_repeat": 5}),
     ("NarrowPassage", {"guidance": "kgrl", "observation": "image", "action_repeat": 10}),

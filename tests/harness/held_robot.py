@@ -16,7 +16,7 @@ from guiderail.models.common.arrays import round_period
 
 PROGRESS = {
     # No robot exceeds this tolerance, so progress follows the clock. The episodes are as long as those of "state".
-    "clock": {"progress": "state", "progress_tolerance": (1e3, 1e3)},
+    "clock": {"progress": "state", "progress.tolerance": (1e3, 1e3)},
     "state": {"progress": "state"},
 }
 

@@ -18,7 +18,7 @@ def test_variants_replace_only_the_guidance_of_the_teacher():
     for variant in list(distillation.VARIANTS)[1:]:
         options = distillation.options_of(variant, *arguments)
         assert options["base_policy"] == "student"
-        assert options["replan_steps"] == 10
+        assert options["base_policy.replan_steps"] == 10
         assert options["guidance"] in ("base_policy", "kgrl_base_policy")
         assert options["action_repeat"] == 10
 

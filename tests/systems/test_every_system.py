@@ -71,7 +71,7 @@ def system_by_name():
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
         systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),
-        systems.PhaseWrenchLimit(np.ones((2, 8)), np.ones(8), period=PERIOD),
+        systems.PhaseWrenchLimit(np.ones(8), np.ones(8), period=PERIOD),
         systems.EpisodeMonitor([condition], PERIOD),
         systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),

@@ -16,13 +16,13 @@ LOW = np.array([2.0, 2.0, 3.0, 0.5, 0.5, 0.5, np.linalg.norm([2.0, 2.0, 3.0]), n
 
 
 class Rig:
-    """System with sources of the state and of the task's limit."""
+    """System with sources of the state's and of the task's limit."""
 
-    def __init__(self, state=0.0, task=None, limits=(HIGH, LOW)):
+    def __init__(self, limit=HIGH, task=None, bound=HIGH):
         builder = DiagramBuilder()
-        self.source = builder.AddSystem(ConstantVectorSource([state]))
-        self.system = builder.AddSystem(PhaseWrenchLimit(np.array(limits), RATE, period=PERIOD))
-        builder.Connect(self.source.get_output_port(), self.system.get_state_input_port())
+        self.source = builder.AddSystem(ConstantVectorSource(limit))
+        self.system = builder.AddSystem(PhaseWrenchLimit(bound, RATE, period=PERIOD))
+        builder.Connect(self.source.get_output_port(), self.system.get_state_max_wrench_input_port())
         if task is not None:
             self.task = builder.AddSystem(ConstantVectorSource(task))
             builder.Connect(self.task.get_output_port(), self.system.get_max_wrench_input_port())
@@ -49,25 +49,25 @@ class Rig:
         return np.array(bounds)
 
 
-@pytest.mark.parametrize(("state", "expected"), [(0.0, HIGH), (1.0, LOW)])
-def test_bound_starts_at_the_limit_of_the_first_state(state, expected):
-    rig = Rig(state)
+@pytest.mark.parametrize(("limit", "expected"), [(HIGH, HIGH), (LOW, LOW), (np.full(8, np.inf), HIGH)])
+def test_bound_starts_at_the_limit_of_the_first_state(limit, expected):
+    rig = Rig(limit)
     np.testing.assert_array_equal(rig.bound, expected)
     np.testing.assert_array_equal(rig.run(3), [expected] * 3)
 
 
 def test_first_update_applies_the_limit_of_its_state_at_once():
     """A state machine may set its first state at the same instant at which this system is initialized."""
-    rig = Rig(0.0)
-    rig.set(rig.source, [1.0])
+    rig = Rig(HIGH)
+    rig.set(rig.source, LOW)
     np.testing.assert_array_equal(rig.run(1)[0], LOW)
 
 
 @pytest.mark.parametrize(("first", "last"), [(HIGH, LOW), (LOW, HIGH)])
 def test_bound_changes_at_the_largest_rate(first, last):
-    rig = Rig(limits=(first, last))
+    rig = Rig(first)
     rig.run(2)
-    rig.set(rig.source, [1.0])
+    rig.set(rig.source, last)
     bounds = np.vstack([first, rig.run(40)])
     changes = np.abs(np.diff(bounds, axis=0)) / (RATE * PERIOD)
     assert changes.max() <= 1.0 + 1e-9
@@ -92,49 +92,56 @@ def test_lower_limit_of_the_task_applies_at_once():
     np.testing.assert_array_equal(rig.run(1)[0], np.minimum(HIGH, mixed))
 
 
-@pytest.mark.parametrize("state", [-1.0, -0.5, 0.5, 2.0, np.nan, np.inf])
-def test_unknown_state_has_the_lowest_limits(state):
-    mixed = np.r_[LOW[:3], HIGH[3:6], LOW[6], HIGH[7]]
-    rig = Rig(state, limits=(np.r_[HIGH[:3], LOW[3:6], HIGH[6], LOW[7]], mixed))
-    np.testing.assert_array_equal(rig.run(2)[-1], LOW)
+@pytest.mark.parametrize("invalid", [-1.0, -1e-9, np.nan])
+def test_invalid_number_keeps_the_last_bound(invalid):
+    rig = Rig(LOW)
+    rig.run(2)
+    rig.set(rig.source, np.r_[np.full(4, invalid), HIGH[4:]])
+    bounds = rig.run(60)
+    np.testing.assert_array_equal(bounds[:, :4], np.tile(LOW[:4], (60, 1)))
+    np.testing.assert_array_equal(bounds[-1, 4:], HIGH[4:])
 
 
-def test_each_of_1100_states_has_its_own_limit():
-    limits = np.tile(LOW, (1100, 1))
-    limits[-1] = HIGH
-    np.testing.assert_array_equal(Rig(1099.0, limits=limits).bound, HIGH)
-    np.testing.assert_array_equal(Rig(1098.0, limits=limits).bound, LOW)
+def test_invalid_number_is_zero_at_the_start():
+    rig = Rig(np.r_[np.nan, -1.0, HIGH[2:]])
+    np.testing.assert_array_equal(rig.bound, np.r_[0.0, 0.0, HIGH[2:]])
 
 
-def test_limits_are_copied_and_may_be_lists():
-    limits = np.array([HIGH, LOW])
-    system = PhaseWrenchLimit(limits, RATE.tolist(), period=PERIOD)
-    limits[:] = 0.0
+def test_bound_is_copied_and_may_be_a_list():
+    bound = HIGH.copy()
+    system = PhaseWrenchLimit(bound, RATE.tolist(), period=PERIOD)
+    bound[:] = 0.0
     context = system.CreateDefaultContext()
-    system.get_state_input_port().FixValue(context, [0.0])
+    system.get_state_max_wrench_input_port().FixValue(context, np.full(8, np.inf))
     np.testing.assert_array_equal(system.get_phase_max_wrench_output_port().Eval(context), HIGH)
-    PhaseWrenchLimit([HIGH.tolist()], RATE, period=PERIOD)
+    PhaseWrenchLimit(HIGH.tolist(), RATE, period=PERIOD)
 
 
 def test_initialization_resets_the_bound():
-    rig = Rig(1.0)
+    rig = Rig(LOW)
     rig.run(2)
-    rig.set(rig.source, [0.0])
+    rig.set(rig.source, HIGH)
     rig.simulator.Initialize()
     np.testing.assert_array_equal(rig.bound, HIGH)
+
+
+def test_limit_that_nothing_reads_is_refused():
+    rig = Rig()
+    with pytest.raises(InputError, match="connect its output phase_max_wrench to the controller's input max_wrench"):
+        rig.simulator.AdvanceTo(2.5 * PERIOD)
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"limits": np.ones(8)}, "must have the shape"),
-        ({"limits": np.ones((0, 8))}, "must have the shape"),
-        ({"limits": np.ones((2, 6))}, "must have the shape"),
-        ({"limits": np.full((2, 8), np.inf)}, "finite and not negative"),
-        ({"limits": np.full((2, 8), np.nan)}, "finite and not negative"),
-        ({"limits": np.full((2, 8), -1e-9)}, "finite and not negative"),
-        ({"limits": np.r_[np.zeros((1, 8)), [[0.0] * 7 + [np.inf]]]}, "finite and not negative"),
-        ({"limits": np.r_[[[-1e-9] + [0.0] * 7], np.zeros((1, 8))]}, "finite and not negative"),
+        ({"bound": np.ones((1, 8))}, "8 finite numbers, none negative"),
+        ({"bound": np.ones(0)}, "8 finite numbers, none negative"),
+        ({"bound": np.ones(6)}, "8 finite numbers, none negative"),
+        ({"bound": np.full(8, np.inf)}, "8 finite numbers, none negative"),
+        ({"bound": np.full(8, np.nan)}, "8 finite numbers, none negative"),
+        ({"bound": np.full(8, -1e-9)}, "8 finite numbers, none negative"),
+        ({"bound": [0.0] * 7 + [np.inf]}, "8 finite numbers, none negative"),
+        ({"bound": [-1e-9] + [0.0] * 7}, "8 finite numbers, none negative"),
         ({"max_rate": np.zeros(8)}, "8 positive, finite numbers"),
         ({"max_rate": np.r_[np.ones(7), 0.0]}, "8 positive, finite numbers"),
         ({"max_rate": np.r_[np.nan, np.ones(7)]}, "8 positive, finite numbers"),
@@ -144,7 +151,7 @@ def test_initialization_resets_the_bound():
     ],
 )
 def test_constructor_refuses_arguments_out_of_range(change, words):
-    arguments = {"limits": np.zeros((2, 8)), "max_rate": RATE, "period": PERIOD}
+    arguments = {"bound": np.zeros(8), "max_rate": RATE, "period": PERIOD}
     PhaseWrenchLimit(**arguments)
     PhaseWrenchLimit(**arguments | {"max_rate": np.full(8, 1e-3)})
     with pytest.raises(InputError, match=words):

@@ -35,7 +35,7 @@ def primitive(**options):
 
 
 def test_environment_uses_a_registered_kernel():
-    options = {"kernel": "lab_rational_quadratic", "length_scale": 0.3, "kernel_parameters": {"mixture": 2.0}}
+    options = {"kernel": "lab_rational_quadratic", "length_scale": 0.3, "kernel.parameters": {"mixture": 2.0}}
     kernel = primitive(**options).kernel
     assert type(kernel) is RationalQuadratic
     assert (kernel.length_scale, kernel.mixture) == (0.3, 2.0)
@@ -64,9 +64,9 @@ def test_kernel_is_refused_when_it_is_a_function():
     ("options", "message"),
     [
         ({"kernel": "matern"}, "there is no kernel 'matern': did you mean matern52"),
-        ({"kernel_parameters": {"mixture": 2.0}}, "'squared_exponential' has no parameter 'mixture'"),
-        ({"kernel": "lab_rational_quadratic", "kernel_parameters": {"mix": 2.0}}, "did you mean mixture"),
-        ({"kernel_parameters": {"mixture": "wide"}}, "kernel_parameters must be"),
+        ({"kernel.parameters": {"mixture": 2.0}}, "'squared_exponential' has no parameter 'mixture'"),
+        ({"kernel": "lab_rational_quadratic", "kernel.parameters": {"mix": 2.0}}, "did you mean mixture"),
+        ({"kernel.parameters": {"mixture": "wide"}}, r"kernel\.parameters must be"),
         ({"length_scale": 0.0}, "length_scale must be more than 0"),
     ],
 )

@@ -140,7 +140,7 @@ def test_python_function_trains_the_task(lab):
 
 
 def test_training_uses_the_kernel_of_the_package(lab):
-    kernel = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel_parameters={mixture: 2.0}")
+    kernel = ("--env", "kernel=peglab_rational_quadratic", "--env", "kernel.parameters={mixture: 2.0}")
     guiderail(lab, *TRAIN, *kernel, "--out", "kernel", "--no-pictures")
     assert "kernel: peglab_rational_quadratic" in (lab.folder / "kernel" / "config.yaml").read_text()
 

@@ -87,7 +87,7 @@ def test_export_is_refused_in_one_sentence(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("option", "value"), [("kernel", "matern52"), ("history_source", "measured"), ("adaptive_history", True)]
+    ("option", "value"), [("kernel", "matern52"), ("history.source", "measured"), ("history.adaptive", True)]
 )
 def test_export_refuses_options_that_its_loop_lacks(option, value, tmp_path, monkeypatch):
     config = RunFolder(find_run("pretrained:passage")).config()

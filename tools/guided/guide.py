@@ -412,7 +412,8 @@ class TemplateGuide(Guide):
         extra: Value for `to_action`, or (name of the state) → value.
 
     Raises:
-        InputError: If the period is missing or not positive, or active constraints of a state contradict each other.
+        InputError: If the period is missing or not positive, active constraints of a state contradict each other, or a
+            state limits force or torque.
     """
 
     num_outputs = POSE_SIZE
@@ -425,6 +426,11 @@ class TemplateGuide(Guide):
         extra: Any = None,
     ):
         TemplateLaw(template, {}, period)  # refuses invalid arguments before an episode
+        if template.limits_wrench:
+            raise InputError(
+                f"states of template {template.name!r} limit force or torque, and GuidedEnv has no controller that "
+                "could follow the limit: remove max_force_n and max_torque_nm, and bound the force in the environment"
+            )
         self.template, self._frames_of, self._period, self._extra_of = template, frames, period, extra
         self.num_actions = template.inputs
 

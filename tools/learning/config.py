@@ -6,13 +6,14 @@ setting given by `--set name=value` is validated against that class.
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
+from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS
@@ -58,8 +59,16 @@ class OffPolicyConfig(LearnerConfig):
     An action of the policy lasts `action_repeat` control steps and makes one transition.
     """
 
+    entries: ClassVar[Mapping[str, str]] = {
+        "gamma_per": "gamma.per",
+        **entries_of("net_arch", "layer_norm", "dropout", "image_encoder"),
+        **entries_of("exploration", "constant_episodes", "ez_greedy", "ez_greedy_longest", "ez_greedy_until"),
+        **entries_of("exploration", "greedy_episode_fraction", "base_motion_steps"),
+        "selection_window": "selection.window",
+        "actor_ema": "selection.actor_ema",
+    }
+
     algorithm: str = "tqc"  # registered name of the learner
-    training_step: Literal["fast", "sb3"] = "fast"  # fast: equivalent to Stable-Baselines3's step, if available
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"  # interval that gamma discounts
@@ -67,7 +76,6 @@ class OffPolicyConfig(LearnerConfig):
     train_freq: Positive = 8  # transitions between two trainings
     gradient_steps: Positive = 24  # gradient steps per training
     batch_size: BatchSize = 64  # transitions
-    n_steps: Annotated[Positive, Field(le=1000)] = 1  # transitions of an n-step return
     buffer_size: Positive = 1_000_000  # transitions in the replay buffer
     learning_starts: Positive = 100  # transitions before the first training; until then, actions are random
     ent_coef: EntCoef = "auto_0.1"  # "auto", "auto_<initial value>", or a number
@@ -84,7 +92,6 @@ class OffPolicyConfig(LearnerConfig):
     base_motion_steps: NonNegative = 0  # transitions over which the probability of a zero action falls from 1 to 0
     demonstration_fraction: Fraction = 0.0  # fraction of each batch from demonstrations (RLPD: 0.5); 0: no mixing
     image_encoder: Literal["average_pooling", "convolutional", "pixels"] = "average_pooling"  # features of images
-    random_shift: Annotated[NonNegative, Field(le=100)] = 4  # largest random shift of convolved images [pixels] (DrQ)
     device: Literal["cpu", "cuda"] = "cpu"  # device that learns; only "cpu" gives the same result bit for bit
     dropout: Dropout = 0.0  # dropout probability of the critics' layers, before normalization (DroQ: 0.01)
     init_from: Folder = ""  # run whose networks, optimizers, replay buffer and episode count training starts from
@@ -122,7 +129,8 @@ class CrossQConfig(OffPolicyConfig):
         super().__post_init__()
         if self.dropout:
             raise InputError(
-                f"crossq has no dropout, which replaces its batch normalization: leave dropout={self.dropout:g} out"
+                "crossq has no dropout, which replaces its batch normalization: leave "
+                f"net_arch.dropout={self.dropout:g} out"
             )
 
 
@@ -131,6 +139,7 @@ class OnPolicyConfig(LearnerConfig):
     """Settings of an on-policy learner, by the names of Stable-Baselines3 where it has them."""
 
     takes_images: ClassVar[bool] = False
+    entries: ClassVar[Mapping[str, str]] = {"gamma_per": "gamma.per"}
 
     algorithm: str = "ppo"
     learning_rate: Rate = 3e-4
@@ -264,8 +273,8 @@ def resolve_preset(
         preset = default_preset(algorithm)
     elif not issubclass(kind, OffPolicyConfig):
         raise InputError(f"the preset {preset} has settings that {algorithm} does not have: leave --preset out")
-    base = {} if preset is None else asdict(PRESETS[preset])
-    return make_config(algorithm, base | dict(settings or {}))
+    base = {} if preset is None else setting_values(PRESETS[preset])
+    return make_config(algorithm, base | flat_options([kind], settings or {}))
 
 
 def default_preset(algorithm: str) -> str | None:
@@ -280,20 +289,20 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
         InputError: If there is no such learner or setting, or a value is out of range.
     """
     kind = LEARNERS.declared(algorithm, "Config")
-    names = {field.name for field in fields(kind)}
-    values = {**settings, "algorithm": algorithm}
+    names = option_fields(kind)
+    values = {**flat_options([kind], settings), "algorithm": algorithm}
     for name in values:
         if name not in names:
-            known = names - {"algorithm"}
+            known = names.keys() - {"algorithm"}
             raise InputError(f"the learner {algorithm} has no setting {brief(name)}: {did_you_mean(name, known)}")
     try:
-        return TypeAdapter(kind).validate_python(values)
+        return TypeAdapter(kind).validate_python({names[name]: value for name, value in values.items()})
     except ValidationError as error:
         first = error.errors()[0]
         if not first["loc"]:  # an error of `__post_init__`
             raise InputError(str(first.get("ctx", {}).get("error", first["msg"]))) from None
-        name = str(first["loc"][0])
-        defaults = {field.name: getattr(field.default, "default", field.default) for field in fields(kind)}
+        name = kind.entries.get(str(first["loc"][0]), str(first["loc"][0]))
+        defaults = {kind.entries.get(f.name, f.name): getattr(f.default, "default", f.default) for f in fields(kind)}
         example = f" such as {defaults[name]!r}" if name in defaults else ""
         raise InputError(
             f"the learner's {name} cannot be {brief(values.get(name))} ({first['msg'].lower()}): give a value{example}"
@@ -324,9 +333,9 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    known = {field.name for learner in LEARNERS.usable() for field in fields(LEARNERS.declared(learner, "Config"))}
-    known.remove("algorithm")
-    for name in settings:
+    kinds = [LEARNERS.declared(learner, "Config") for learner in LEARNERS.usable()]
+    known = {name for kind in kinds for name in option_fields(kind)} - {"algorithm"}
+    for name in flat_options(kinds, settings):
         if name not in known:
             raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known)}")
     check_episodes(1 if episodes is None else episodes)
@@ -343,6 +352,17 @@ def check_episodes(episodes: object) -> int:
     return episodes
 
 
+def setting_values(config: LearnerConfig) -> dict[str, Any]:
+    """Return the settings of a configuration by name."""
+    return {name: getattr(config, field) for name, field in option_fields(type(config)).items()}
+
+
+def flat_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return settings with the entries of structured settings as settings of their own; see `flat_options`."""
+    return flat_options([OffPolicyConfig], settings or {})
+
+
 def config_values(config: LearnerConfig) -> dict[str, Any]:
-    """Return a configuration as YAML-serializable values."""
-    return TypeAdapter(type(config)).dump_python(config, mode="json")
+    """Return the settings of a configuration by name, as YAML-serializable values."""
+    values = TypeAdapter(type(config)).dump_python(config, mode="json")
+    return {name: values[field] for name, field in option_fields(type(config)).items()}

@@ -9,9 +9,16 @@ from typing import Any
 
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
-from guiderail.tools.environments import check_environment, task_content
+from guiderail.tools.environments import check_environment, flat_environment, task_content
 from guiderail.tools.evaluation.episode import check_seed
-from guiderail.tools.learning.config import check_episodes, config_values, default_preset, make_config, resolve_preset
+from guiderail.tools.learning.config import (
+    check_episodes,
+    config_values,
+    default_preset,
+    flat_settings,
+    make_config,
+    resolve_preset,
+)
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
@@ -57,7 +64,7 @@ def with_defaults(task: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     has_learner = given.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     learner: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
-    settings = {**learner.get("settings", {}), **(given.get("settings") or {})}
+    settings = flat_settings(learner.get("settings")) | flat_settings(given.get("settings"))
     return {**learner, **given} | ({"settings": settings} if settings else {})
 
 
@@ -75,7 +82,8 @@ def resumed_config(
     stored |= {"step_log": config.step_log, "human_in_the_loop": config.human_in_the_loop} | config.environment
     if environment:
         resolved = check_environment(config.task, environment)
-        environment = {key: resolved.get(key, value) for key, value in environment.items()}
+        given_options = flat_environment(config.task, environment)
+        environment = {key: resolved.get(key, value) for key, value in given_options.items()}
     arguments = {**as_arguments(environment), **given} | ({} if task is None else {"task": task})
     for key, value in arguments.items():
         if key == "episodes" and value < config.episodes and value < (done := folder.num_saved_episodes()):
@@ -85,7 +93,7 @@ def resumed_config(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
                 "again in another folder"
             )
-    values = config_values(config.learner) | dict(settings or {})
+    values = config_values(config.learner) | flat_settings(settings)
     algorithm = values.pop("algorithm")
     if make_config(algorithm, values) != config.learner:
         raise InputError(

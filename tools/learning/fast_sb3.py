@@ -310,8 +310,7 @@ class FastTrainingStep(_Algorithm):
         states[:, :batch_size, :features] = current_features.view(steps, batch_size, -1)
         states[:, batch_size:, :features] = next_features.view(steps, batch_size, -1)
         rewards = data.rewards.view(steps, batch_size, 1)
-        gamma = self.gamma if data.discounts is None else data.discounts
-        discounts = ((1 - data.dones) * gamma).view(steps, batch_size, 1)
+        discounts = ((1 - data.dones) * self.gamma).view(steps, batch_size, 1)
         noise = torch.randn(steps, 2 * batch_size, self._actions)
         log_density = -(0.5 * noise.square() + 0.5 * math.log(2 * math.pi)).sum(dim=2, keepdim=True)
         for step in zip(states, transitions, rewards, discounts, noise, log_density, strict=True):

@@ -68,9 +68,11 @@ class LearnerConfig:
         stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
             never. Resuming such a run runs no further episodes.
         takes_images: True if the learner's networks accept observations with images.
+        entries: Names of the fields that are entries of a structured setting; see `Options.entries`.
     """
 
     takes_images: ClassVar[bool] = True
+    entries: ClassVar[Mapping[str, str]] = {}
 
     algorithm: str
     demonstration_episodes: NonNegative = 0

@@ -102,6 +102,7 @@ def with_privileged(
     return [np.concatenate(pair) for pair in zip(observations, hidden, strict=True)]
 
 
+RANDOM_SHIFT = 4  # largest random shift of convolved images [pixels] (DrQ)
 IMAGE_POOL = 5  # side of the averaged squares [pixels]; 110×144×3 becomes 22×28×3
 CHANNELS = (32, 32, 32)  # output channels of the convolutions, each 3×3 with stride 2
 
@@ -147,11 +148,11 @@ class ImageFeatures(BaseFeaturesExtractor):
         convolutions: Convolutions, each followed by a ReLU; empty without convolutions.
     """
 
-    def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str, random_shift: int):
+    def __init__(self, observation_space: spaces.Box, shape: tuple[int, int, int], encoder: str):
         """Construct the extractor of packed observations with images of height, width and channels.
 
         The encoder is "average_pooling", "convolutional" or "pixels" (none). In training mode, images are shifted by
-        up to `random_shift` pixels before convolutions.
+        up to `RANDOM_SHIFT` pixels before convolutions.
 
         Raises:
             InputError: If the image is too small.
@@ -169,7 +170,7 @@ class ImageFeatures(BaseFeaturesExtractor):
         maps = CHANNELS[-1] if encoder == "convolutional" else channels
         super().__init__(observation_space, maps * math.prod(sides) + num_state)
         self._num_state = num_state
-        self.pool, self._shape, self._random_shift = side_of_squares, (channels, height, width), random_shift
+        self.pool, self._shape = side_of_squares, (channels, height, width)
         inputs = [channels, *CHANNELS[:-1]]
         pairs = zip(inputs, CHANNELS, strict=True) if encoder == "convolutional" else ()
         self.convolutions = torch.nn.ModuleList(torch.nn.Conv2d(*pair, 3, stride=2) for pair in pairs)
@@ -181,7 +182,7 @@ class ImageFeatures(BaseFeaturesExtractor):
         if not self.convolutions:
             features = torch.nn.functional.avg_pool2d(image, self.pool)
         else:
-            features = self._shift(image) if self.training and self._random_shift else image
+            features = self._shift(image) if self.training else image
             for convolution in self.convolutions:
                 features = torch.relu(convolution(features))
         return torch.cat([features.flatten(1), state.view(len(image), self._num_state)], dim=1)
@@ -189,7 +190,7 @@ class ImageFeatures(BaseFeaturesExtractor):
     def _shift(self, images: torch.Tensor) -> torch.Tensor:
         """Shift each image by whole pixels; the border repeats the outermost pixels."""
         number, _, height, width = images.shape
-        shifts = torch.randint(-self._random_shift, self._random_shift + 1, (2, number, 1)).to(images.device)
+        shifts = torch.randint(-RANDOM_SHIFT, RANDOM_SHIFT + 1, (2, number, 1)).to(images.device)
         rows = (torch.arange(height, device=images.device) + shifts[0]).clamp(0, height - 1)
         columns = (torch.arange(width, device=images.device) + shifts[1]).clamp(0, width - 1)
         indices = torch.arange(number, device=images.device)[:, None, None]

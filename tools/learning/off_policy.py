@@ -56,8 +56,8 @@ class OffPolicyLearner(Learner):
 
     Attributes:
         algorithm: Class of the algorithm; a subclass sets it.
-        fast_algorithm: The same algorithm with a faster training step, or None; used if `training_step` is "fast", on
-            the CPU, without dropout and without convolutions.
+        fast_algorithm: The same algorithm with a faster training step, or None; used on the CPU, without
+            dropout and without convolutions.
         own_settings: Names of settings of a subclass's `Config` that the algorithm takes as arguments of the same name.
         config: Settings of the learner.
         model: Instance of the algorithm.
@@ -105,7 +105,6 @@ class OffPolicyLearner(Learner):
             networks["features_extractor_kwargs"] = {
                 "shape": self._image_shape,
                 "encoder": config.image_encoder,
-                "random_shift": config.random_shift,
             }
         self.config = config
         self.transitions = 0
@@ -124,8 +123,7 @@ class OffPolicyLearner(Learner):
             "device": config.device,
             **{name: getattr(config, name) for name in self.own_settings},
         }
-        is_fast = config.training_step == "fast" and not config.dropout and not is_encoded and config.device == "cpu"
-        is_fast = is_fast and self.fast_algorithm is not None
+        is_fast = not config.dropout and not is_encoded and config.device == "cpu" and self.fast_algorithm is not None
         algorithm: Any = self.fast_algorithm if is_fast else self.algorithm
         accepted = inspect.signature(algorithm).parameters  # not every algorithm has an entropy coefficient
         policy: Any = "MlpPolicy"
@@ -139,8 +137,6 @@ class OffPolicyLearner(Learner):
             self.model.action_space,
             device=config.device,
             n_envs=self._copies,
-            n_steps=config.n_steps,
-            gamma=self.model.gamma,
         )
         if config.demonstration_fraction:
             self.model.replay_buffer.fraction = config.demonstration_fraction

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
@@ -17,7 +17,7 @@ from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.learner import Learner
 
 
-class DemonstrationReplayBuffer(NStepReplayBuffer):
+class DemonstrationReplayBuffer(ReplayBuffer):
     """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
 
     The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
@@ -50,16 +50,6 @@ class DemonstrationReplayBuffer(NStepReplayBuffer):
         """Index of the row that was added last."""
         is_wrapped = self.full and self.pos == self.num_demonstrated
         return self.buffer_size - 1 if is_wrapped else self.pos - 1
-
-    def _get_samples(self, batch_inds: np.ndarray, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        if not self.num_demonstrated:
-            return super()._get_samples(batch_inds, env)
-        # In the ring buffer, a demonstration follows the last row: an n-step return must end at the last row.
-        timeouts = self.timeouts[-1].copy()
-        self.timeouts[-1] = np.logical_or(timeouts, np.logical_not(self.dones[-1]))
-        samples = super()._get_samples(batch_inds, env)
-        self.timeouts[-1] = timeouts
-        return samples
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Return a batch with evenly spaced demonstrated rows.

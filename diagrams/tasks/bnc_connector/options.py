@@ -30,7 +30,6 @@ OFFSET_RANGES = {
     "none": (0.0, NEGLIGIBLE_OFFSET),
 }
 GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
-LARGEST_GRASP_ANGLE = 2.0  # largest accepted `grasp_angle` [degrees]; a larger tilt would be a failed grasp
 
 
 class BncUncertainty(HiddenOffsets):
@@ -41,27 +40,23 @@ class BncUncertainty(HiddenOffsets):
     - "per_episode": the jack is within 1.5 mm of its nominal position, sampled each episode.
     - "none": the jack is within 0.3 mm of its nominal position, sampled each episode.
 
-    With `grasp_angle`, the plug is also tilted in the tool, sampled each episode; the plug's offset is then [x, y,
-    angle about x, angle about y] in m and rad. With `jack_turn`, the jack is also rotated about its axis; the jack's
-    offset is then [x, y, angle]. The reset option `offset` sets the jack's position; the jack is then not rotated, and
-    the plug neither tilted nor offset.
+    With `jack_turn`, the jack is also rotated about its axis; the jack's offset is then [x, y, angle]. The reset option
+    `offset` sets the jack's position; the jack is then not rotated, and the plug not offset.
     """
 
     def __init__(
         self,
         kind: str,
-        grasp_angle: float = 0.0,
         *,
         offset_range: Sequence[float] | None = None,
         jack_turn: float = 0.0,
     ):
         """Construct the sampler.
 
-        `grasp_angle` is the largest tilt of the plug [degrees], and `jack_turn` the largest turn of the jack [degrees].
-        `offset_range` is the smallest and largest offset of the jack [m]; default: that of the kind.
+        `jack_turn` is the largest turn of the jack [degrees]. `offset_range` is the smallest and largest offset of the
+        jack [m]; default: that of the kind.
         """
         super().__init__(kind)
-        self.grasp_angle = grasp_angle * DEGREE
         self.jack_turn = jack_turn * DEGREE
         self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
 
@@ -74,18 +69,15 @@ class BncUncertainty(HiddenOffsets):
             jack, plug = run, in_ring(rng, 0.0, GRASP_RADIUS)
         else:
             jack, plug = in_ring(rng, *self.offset_range), np.zeros(2)
-        plug = self._append_tilt(plug, in_ring(rng, 0.0, self.grasp_angle))
+        rng.uniform(size=2)  # stored results of a seed depend on the number of samples
         return (jack if self.kind == "per_run" else self._append_turn(jack, rng)), plug
 
     def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         jack = np.append(offset, 0.0) if self.jack_turn > 0.0 else offset
-        return jack, self._append_tilt(np.zeros(2), np.zeros(2))
+        return jack, np.zeros(2)
 
     def _append_turn(self, jack: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         return np.append(jack, rng.uniform(-self.jack_turn, self.jack_turn)) if self.jack_turn > 0.0 else jack
-
-    def _append_tilt(self, plug: np.ndarray, angles: np.ndarray) -> np.ndarray:
-        return np.concatenate([plug, angles]) if self.grasp_angle > 0.0 else plug
 
 
 ALIGNMENT = 2.0 * MM  # largest |x| and |y| of every command: equation 4.26
@@ -96,10 +88,6 @@ SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in 
 class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
 
-    jack_turn: Number = Field(0.0, ge=0, le=10, description="largest sampled turn of the jack about its axis [degrees]")
-    grasp_angle: Number = Field(
-        0.0, ge=0, le=LARGEST_GRASP_ANGLE, description="largest sampled tilt of the plug [degrees]"
-    )
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"
     )
@@ -116,9 +104,6 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         le=0.2 * MM,
         description="clearance between barrel and bore on each side [m]",
     )
-    slot_clearance: Number = Field(
-        NOMINAL.slot_clearance, ge=0.05 * MM, le=0.2 * MM, description="clearance between lug and slot on each side [m]"
-    )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
     contact_margin: Number = Field(
         MARGIN, ge=0, le=0.5 * MM, description="distance at which contact with the jack begins in Drake [m]"
@@ -131,12 +116,6 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     )
     num_demonstrations: Integer | None = Field(
         None, ge=1, description="number of demonstrations to use, from the first on; a single one needs prior_std"
-    )
-    time_scale: Number = Field(
-        1.0,
-        ge=0.5,
-        le=10,
-        description="factor of the demonstrations' duration; 5 with control_period=0.1 preserves their 400 steps",
     )
 
     @field_validator("demonstrations")

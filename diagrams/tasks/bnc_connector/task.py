@@ -153,23 +153,25 @@ DEMONSTRATIONS = {"insert": shipped.PATH, "search": shipped.SEARCH_PATH, "firm_s
 LOCKED_STEPS = 3  # consecutive steps with a locked plug that count as success, at the default control period
 
 
-def reference_trajectory(demonstrations: str, count: int | None = None, **fit: Any) -> ReferenceTrajectory:
+def reference_trajectory(
+    demonstrations: str, count: int | None = None, prior_std: tuple[float, ...] | None = None
+) -> ReferenceTrajectory:
     """Return the reference trajectory of demonstrations, fitted once per process and content of the file.
 
     Args:
         demonstrations: Name in `DEMONSTRATIONS`, or path of a file .npz or .csv.
         count: Number of demonstrations to use, from the first on; None: all.
-        fit: Further arguments of `ReferenceTrajectory.from_demonstrations`.
+        prior_std: As in `ReferenceTrajectory.from_demonstrations`.
     """
     if demonstrations not in DEMONSTRATIONS:
-        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, **fit)
-    return _fit_shipped(demonstrations, count, tuple(sorted(fit.items())))
+        return reference_of_file(Path(demonstrations), COMPONENTS, tuple(FLOOR.tolist()), count, prior_std)
+    return _fit_shipped(demonstrations, count, prior_std)
 
 
 @cache  # called with all arguments by position: an omitted `count` and None have the same key
-def _fit_shipped(demonstrations: str, count: int | None, fit: tuple[tuple[str, Any], ...]) -> ReferenceTrajectory:
+def _fit_shipped(demonstrations: str, count: int | None, prior_std: tuple[float, ...] | None) -> ReferenceTrajectory:
     loaded = Demonstrations.load(DEMONSTRATIONS[demonstrations]).first(count)
-    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, **dict(fit))
+    return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
 
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
@@ -241,22 +243,20 @@ class BncConnector(DemonstratedInsertion):
         "station": "gantry",
         "action_repeat": 10,
         "action_dims": (0, 1),
-        "history_variance": HISTORY_VARIANCE,
+        "history.variance": HISTORY_VARIANCE,
     }
 
     def __init__(self, config: EnvConfig):
         super().__init__(config)
         o = self.options
-        self.offsets = BncUncertainty(
-            o.fixture_offset, o.grasp_angle, offset_range=o.offset_range, jack_turn=o.jack_turn
-        )
+        self.offsets = BncUncertainty(o.fixture_offset, offset_range=o.offset_range)
         self.collision = Threshold("impedance_force", o.largest_force_limit)
         dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
-        dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer, slot_clearance=o.slot_clearance)
+        dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer)
         self._workcell = BncWorkcell(dimensions, friction=o.friction, margin=o.contact_margin, equal_area=o.equal_area)
         if o.demonstrations in DEMONSTRATIONS:
             # The duration of the shipped demonstrations is known without a fit, which would take seconds.
-            self.num_steps = round(NUM_STEPS * CONTROL_PERIOD * o.time_scale / self.control_period)
+            self.num_steps = round(NUM_STEPS * CONTROL_PERIOD / self.control_period)
         else:
             self.num_steps = self.reference().num_steps
 
@@ -267,9 +267,7 @@ class BncConnector(DemonstratedInsertion):
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the demonstrations in the options."""
         o = self.options
-        return self.on_clock(
-            reference_trajectory(o.demonstrations, o.num_demonstrations, **o.fit_arguments()), o.time_scale
-        )
+        return self.on_clock(reference_trajectory(o.demonstrations, o.num_demonstrations, o.prior_std))
 
     def constraints(self) -> LinearConstraints:
         """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""

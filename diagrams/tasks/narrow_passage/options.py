@@ -7,8 +7,7 @@ from typing import Any
 
 from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number
-from guiderail.diagrams.tasks.options import ReferenceOptions
+from guiderail.diagrams.envs.options import Number, Options
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
@@ -24,7 +23,7 @@ HARD: Mapping[str, Any] = {
 """Options of difficulty="hard": half the gap width, and two obstacles on sampled sides that must not be touched."""
 
 
-class NarrowPassageOptions(ReferenceOptions):
+class NarrowPassageOptions(Options):
     """Options of NarrowPassage."""
 
     gap_width: Number = Field(

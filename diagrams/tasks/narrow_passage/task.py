@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import Field
@@ -83,11 +83,9 @@ MAX_START = 2.0  # [m] largest coordinate of a given start
 
 
 @cache
-def reference_trajectory(model: Literal["gmr", "promp"] = "gmr") -> ReferenceTrajectory:
-    """Return the reference of the nine demonstrations, fitted once per process and model."""
-    return ReferenceTrajectory.from_demonstrations(
-        demonstrations.load(), components=COMPONENTS, floor=FLOOR, model=model
-    )
+def reference_trajectory() -> ReferenceTrajectory:
+    """Return the reference of the nine demonstrations, fitted once per process."""
+    return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
 
 
 @register_task("NarrowPassage")
@@ -141,7 +139,7 @@ class NarrowPassage(Task):
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the nine demonstrations."""
-        return self.on_clock(reference_trajectory(**self.options.fit_arguments()))
+        return self.on_clock(reference_trajectory())
 
     def constraints(self) -> LinearConstraints:
         """Return the constraint that keeps commands out of the restricted zone."""

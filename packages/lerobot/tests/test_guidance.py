@@ -63,7 +63,7 @@ def test_command_follows_the_chunk_of_each_observation(kind, register):
 def test_diagram_is_not_reused_when_base_policy_is_replaced(register):
     def last_y(y):
         register("line", lambda observation: np.tile([[0.05, y]], (8, 1)))
-        env = make_env("NarrowPassage", guidance="base_policy", base_policy="line", guard="none")
+        env = make_env("NarrowPassage", guidance="base_policy", base_policy={"policy": "line", "guard": "none"})
         trace = run(env, np.zeros((2, 2)))
         env.close()
         return trace.commanded[-1, 1]
@@ -112,7 +112,12 @@ def test_action_range_grows_with_the_spread_of_the_chunks(register):
     for name, spread in (("agree", 0.0), ("disagree", 0.02)):
         chunks = np.tile([[0.05, 0.0]], (2, 6, 1)) + np.array([[[spread, 0.0]], [[-spread, 0.0]]])
         register(name, lambda observation, chunks=chunks: chunks)
-        env = make_env("NarrowPassage", guidance="kgrl_base_policy", base_policy=name, horizon=5, covariance_floor=0.1)
+        env = make_env(
+            "NarrowPassage",
+            guidance="kgrl_base_policy",
+            base_policy={"policy": name, "covariance_floor": 0.1},
+            horizon=5,
+        )
         commands = [run(env, np.tile([action, 0.0], (3, 1))).commanded[-1, 0] for action in (0.0, 1.0)]
         ranges[name] = commands[1] - commands[0]
     assert ranges["disagree"] > ranges["agree"] + 0.01
@@ -120,30 +125,37 @@ def test_action_range_grows_with_the_spread_of_the_chunks(register):
 
 @pytest.mark.parametrize("guard", ["projection", "slowdown"])
 def test_guarded_commands_satisfy_bound_speed_and_jerk(guard, register):
-    random, limits = np.random.default_rng(2), {"max_speed": (0.3,), "max_jerk": (40.0,), "horizon": 11}
+    random, limits = np.random.default_rng(2), {"max_speed": (0.3,), "base_policy.max_jerk": (40.0,), "horizon": 11}
     register("jumps", lambda observation: np.tile(random.uniform(-1.0, 1.0, 2), (8, 1)))
     options = {"guidance": "base_policy", "base_policy": "jumps", "action_repeat": 1}
-    env = make_env("NarrowPassage", guard=guard, **options, **limits)
+    env = make_env("NarrowPassage", **options, **limits, **{"base_policy.guard": guard})
     trace = run(env, np.ones((60, 2)))
     period = trace.period
     assert np.abs(np.diff(trace.commanded, axis=0)).max() <= 0.3 * period
     assert np.abs(np.diff(trace.commanded, n=3, axis=0)).max() <= 40.0 * period**3
     assert trace.signals["commanded_violation"].max() <= 1e-9
     assert np.ptp(trace.commanded, axis=0).max() > 0.01
-    free = run(make_env("NarrowPassage", guard="none", horizon=11, **options), np.ones((60, 2))).commanded
+    free = run(
+        make_env("NarrowPassage", horizon=11, **options, **{"base_policy.guard": "none"}), np.ones((60, 2))
+    ).commanded
     assert np.abs(np.diff(free, axis=0)).max() > 10 * 0.3 * period
 
 
 def test_chunks_are_commanded_unchanged_without_guard(register):
     register("line", lambda observation: np.outer(np.arange(1.0, 9.0), [1e-3, 2e-3]))
-    env = make_env("NarrowPassage", guidance="base_policy", base_policy="line", guard="none", replan_steps=4)
+    env = make_env(
+        "NarrowPassage", guidance="base_policy", base_policy={"policy": "line", "guard": "none", "replan_steps": 4}
+    )
     commanded = run(env, np.zeros((8, 2))).commanded
     np.testing.assert_allclose(commanded[:8], np.outer(np.tile(np.arange(1.0, 5.0), 2), [1e-3, 2e-3]), atol=1e-12)
 
 
 def test_demonstrations_pass_the_default_guard_unchanged():
     guarded, plain = (
-        run(make_env("NarrowPassage", guidance="base_policy", guard=guard, action_repeat=20), np.zeros((4, 2)))
+        run(
+            make_env("NarrowPassage", guidance="base_policy", base_policy={"guard": guard}, action_repeat=20),
+            np.zeros((4, 2)),
+        )
         for guard in ("projection", "none")
     )
     np.testing.assert_allclose(guarded.commanded[15:], plain.commanded[15:], atol=1e-6)
@@ -161,14 +173,14 @@ def test_guard_limits_are_required_for_unmoved_outputs():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"max_jerk": (1.0, 1.0, 1.0)}, "max_jerk is 1, 2"),
-        ({"max_jerk": (-1.0,)}, "positive"),
+        ({"base_policy.max_jerk": (1.0, 1.0, 1.0)}, "max_jerk is 1, 2"),
+        ({"base_policy.max_jerk": (-1.0,)}, "positive"),
         ({"max_acceleration": (1.0,)}, "leave max_acceleration"),
-        ({"replan_steps": 42}, "steps"),
+        ({"base_policy.replan_steps": 42}, "steps"),
         ({"progress": "state"}, "clock"),
-        ({"guard": "brake"}, "brake"),
-        ({"guard": "none", "max_speed": (0.3,)}, "guard=none enforces no limits"),
-        ({"guard": "none", "max_jerk": (40.0,)}, "guard=none enforces no limits"),
+        ({"base_policy.guard": "brake"}, "brake"),
+        ({"base_policy.guard": "none", "max_speed": (0.3,)}, "guard=none enforces no limits"),
+        ({"base_policy.guard": "none", "base_policy.max_jerk": (40.0,)}, "guard=none enforces no limits"),
     ],
 )
 def test_guard_is_refused_when_an_option_does_not_fit(options, words):

@@ -185,7 +185,7 @@ def test_episode_is_bit_identical_for_the_same_seed(task):
 )
 def test_stiff_contact_is_stable(task, options, modulus_factor, max_steps):
     """With stiffer springs under gasket and bead, contact would be unstable at the nominal time step."""
-    env = make_env(task, station="mujoco", modulus_factor=(modulus_factor, modulus_factor), **options)
+    env = make_env(task, station="mujoco", disturbances={"modulus_factor": (modulus_factor, modulus_factor)}, **options)
     env.reset(seed=2)
     rng, has_ended = np.random.default_rng(2), False
     while not has_ended and len(env.trace) < max_steps:
@@ -241,7 +241,7 @@ def test_episode_ends_when_the_engine_lacks_contact_memory(warning, monkeypatch)
 
 
 def test_engine_bodies_have_the_offsets_of_the_reset():
-    env = make_env("BncConnector", station="mujoco", fixture_offset="per_episode", grasp_angle=1.0)
+    env = make_env("BncConnector", station="mujoco", fixture_offset="per_run")
     _, info = env.reset(seed=2)
     station = env.diagram.diagram.GetSubsystemByName("station")
     env.step(np.zeros(2))
@@ -299,7 +299,7 @@ def test_parts_with_more_pairs_than_mask_bits_are_refused():
 
 def test_disturbed_period_is_a_multiple_of_the_engine_step():
     with pytest.raises(InputError, match=r"whole multiple of the plant's time step of 0\.02 s"):
-        make_env("GridClamp", station="mujoco", clock_factor=1.5, time_step=0.02)
+        make_env("GridClamp", station="mujoco", disturbances={"clock_factor": 1.5}, time_step=0.02)
 
 
 def test_set_pose_raises_when_the_pose_is_not_finite():

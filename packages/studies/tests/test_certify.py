@@ -78,7 +78,7 @@ def test_command_of_an_attack_violates_a_bound_when_nan(tmp_path, monkeypatch):
     ("subject", "environment", "message"),
     [
         ("NarrowPassage", {"guidance": "residual"}, "cannot be certified"),
-        ("NarrowPassage", {"guidance": "skgrl", "adaptive_history": True}, "of fixed length"),
+        ("NarrowPassage", {"guidance": "skgrl", "history.adaptive": True}, "of fixed length"),
         ("Pouring", {}, "cannot be certified"),
         ("nowhere", {}, "no task"),
     ],
@@ -132,13 +132,16 @@ def declared_start(task, **environment):
 def test_declared_start_adds_pose_bias_and_start_offset():
     assert not declared_start("BncConnector").any()
     np.testing.assert_allclose(declared_start("BncConnector", start_offset_max=0.002), np.full(6, 0.002))
-    np.testing.assert_allclose(declared_start("BncConnector", pose_bias=0.001), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0])
-    combined = declared_start("BncConnector", pose_bias=0.001, start_offset_max=0.002)
+    np.testing.assert_allclose(
+        declared_start("BncConnector", sensing={"pose_bias": 0.001}), [1e-3, 1e-3, 1e-3, 0.0, 0.0, 0.0]
+    )
+    combined = declared_start("BncConnector", sensing={"pose_bias": 0.001}, start_offset_max=0.002)
     np.testing.assert_allclose(combined, [3e-3, 3e-3, 3e-3, 2e-3, 2e-3, 2e-3])
 
 
 @pytest.mark.parametrize(
-    "options", [{"pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"pose_bias": 5e-4, "start_offset_max": 1e-3}]
+    "options",
+    [{"sensing.pose_bias": 1e-3}, {"start_offset_max": 1e-3}, {"sensing.pose_bias": 5e-4, "start_offset_max": 1e-3}],
 )
 def test_history_begins_within_the_declared_offset(options):
     env = make_env("BncConnector", guidance="skgrl", **options)

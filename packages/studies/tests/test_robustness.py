@@ -174,18 +174,22 @@ def test_points_cover_every_value_or_name_a_reason(task):
 def test_axis_without_a_disturbed_point_is_left_out(tmp_path):
     result, left_out = points("NarrowPassage", {}, select_axes("late,lost"))
     assert result == []
-    assert left_out[0].startswith("late 0, 1, 2, 5, 10 left out: NarrowPassage has no option 'late_commands'")
+    assert left_out[0].startswith(
+        "late 0, 1, 2, 5, 10 left out: NarrowPassage has no option 'disturbances.late_commands'"
+    )
     with pytest.raises(InputError, match="the environment has none of these axes"):
         robustness(["zero"], task="NarrowPassage", axes="late", out=tmp_path / "late")
     assert not (tmp_path / "late").exists()
 
 
 def test_points_replace_a_range_by_each_value():
-    arguments = check_environment("BncConnector", {"friction_factor": (0.5, 2.0), "stiffness_factor": 1.7})
+    arguments = check_environment(
+        "BncConnector", {"disturbances.friction_factor": (0.5, 2.0), "disturbances.stiffness_factor": 1.7}
+    )
     result, _ = points("BncConnector", arguments, select_axes("friction,stiffness,lost"))
     environments = {(point.axis.name, point.value): point.environment for point in result}
-    assert environments["friction", 1.0]["friction_factor"] == (1.0, 1.0)
-    assert environments["stiffness", 1.0]["stiffness_factor"] == 1.0
+    assert environments["friction", 1.0]["disturbances.friction_factor"] == (1.0, 1.0)
+    assert environments["stiffness", 1.0]["disturbances.stiffness_factor"] == 1.0
     assert environments["lost", 0.0] == arguments
     assert {point.axis.name: point.trained for point in result} == {"friction": None, "stiffness": None, "lost": 0.0}
 

@@ -46,7 +46,7 @@ def test_prior_is_refused_when_the_control_period_differs(period):
 
 
 def test_prior_is_accepted_when_clock_factor_changes_the_period():
-    env = make_env("BncConnector", clock_factor=0.5)
+    env = make_env("BncConnector", disturbances={"clock_factor": 0.5})
     assert env.unwrapped.diagram.diagram.GetSubsystemByName("station").control_period == pytest.approx(0.01)
 
 

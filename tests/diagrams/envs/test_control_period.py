@@ -41,13 +41,6 @@ def test_shipped_reference_is_used_at_the_default_period():
     assert make_task("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
 
 
-def test_reference_is_equal_when_period_and_motion_scale():
-    shipped, task = reference_trajectory("insert"), make_task("BncConnector", control_period=0.1, time_scale=5.0)
-    assert task.num_steps == task.reference().num_steps == shipped.num_steps
-    np.testing.assert_allclose(task.reference().means, shipped.means, atol=1e-12)
-    np.testing.assert_allclose(np.diff(task.reference().times), 0.1, rtol=1e-9)
-
-
 def test_step_and_reference_have_the_given_control_period():
     env = make_env("NarrowPassage", guidance="skgrl", control_period=0.1, action_repeat=1)
     env.reset(seed=0)
@@ -188,7 +181,7 @@ def test_period_is_refused_when_task_and_station_units_differ(own_tasks):
 
 def test_reference_is_refused_when_not_resampled():
     class UnresampledPassage(make_task("NarrowPassage").__class__):
-        def on_clock(self, reference, time_scale=1.0):
+        def on_clock(self, reference):
             return reference
 
     from guiderail.diagrams.envs.assemble import build_prior_knowledge

@@ -15,7 +15,13 @@ CASES = [
     ),
     (
         "BncConnector",
-        {"guidance": "skgrl", "sensing": "robot", "action_repeat": 3, "lost_commands": 0.2, "late_commands": 2},
+        {
+            "guidance": "skgrl",
+            "sensing": "robot",
+            "action_repeat": 3,
+            "disturbances.lost_commands": 0.2,
+            "disturbances.late_commands": 2,
+        },
     ),
     ("BncConnector", {"guidance": "kgrl", "time_step": 0.0025, "action_repeat": 5}),
     ("NarrowPassage", {"guidance": "kgrl", "action_repeat": 10}),

@@ -66,7 +66,14 @@ def test_sct_has_the_common_ports(template):
     inputs = [guidance.get_input_port(i).get_name() for i in range(guidance.num_input_ports())]
     outputs = [guidance.get_output_port(i).get_name() for i in range(guidance.num_output_ports())]
     assert inputs == ["action", "pose", "wrench", "frame_poses"]
-    assert set(outputs) == {*OUTPUTS, "state", "transition_distance", "progress", "measured_violation"}
+    assert set(outputs) == {
+        *OUTPUTS,
+        "state",
+        "transition_distance",
+        "progress",
+        "measured_violation",
+        "state_max_wrench",
+    }
     check_guidance_ports(guidance, pose_size=6, wrench_size=6)
 
 

@@ -42,11 +42,11 @@ def test_station_is_undisturbed_by_default(undisturbed):
 
 
 def test_disturbances_depend_on_the_seed(undisturbed):
-    options = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
-    _, first, info = descend(**options)
-    _, second, _ = descend(**options)
+    errors = {"wrench_scale": (0.5, 2.0), "wrench_bias": (1.0, 0.02), "wrench_noise": (0.2, 0.01), "pose_bias": 1e-3}
+    _, first, info = descend(sensing=errors)
+    _, second, _ = descend(sensing=errors)
     np.testing.assert_array_equal(second, first)
-    _, other_seed, other_info = descend(seed=2, **options)
+    _, other_seed, other_info = descend(seed=2, sensing=errors)
     assert not np.array_equal(other_seed, first)
     assert 0.5 <= info["wrench_scale"] <= 2.0
     assert np.abs(info["wrench_bias"][:3]).max() <= 1.0
@@ -55,7 +55,7 @@ def test_disturbances_depend_on_the_seed(undisturbed):
 
 
 def test_contact_factors_are_applied_at_every_reset():
-    env, _, info = descend(1, friction_factor=(0.5, 0.5), modulus_factor=(0.1, 0.1))
+    env, _, info = descend(1, disturbances={"friction_factor": (0.5, 0.5), "modulus_factor": (0.1, 0.1)})
     assert info["friction_factor"] == pytest.approx(0.5)
 
     def surfaces():
@@ -78,12 +78,12 @@ def test_contact_factors_are_applied_at_every_reset():
 
 
 def test_smaller_stiffness_leads_to_a_smaller_force(undisturbed):
-    soft, _, _ = descend(stiffness_factor=0.5)
+    soft, _, _ = descend(disturbances={"stiffness_factor": 0.5})
     assert max(soft.trace.force) < 0.7 * max(undisturbed[0].trace.force)
 
 
 def test_clock_factor_scales_the_control_period():
-    env, _, _ = descend(1, clock_factor=1.5)
+    env, _, _ = descend(1, disturbances={"clock_factor": 1.5})
     assert env.diagram.control_period == pytest.approx(3 * PLANT_PERIOD)
     assert env.diagram.control_period != CONTROL_PERIOD
 
@@ -91,11 +91,11 @@ def test_clock_factor_scales_the_control_period():
 def test_disturbed_period_is_a_multiple_of_the_plant_step():
     # The plant's time step is a quarter of the control period.
     fine = {"impedance_control": "cartesian", "bounded_force": False}
-    env = make_env("GridClamp", clock_factor=1.25, **fine)
+    env = make_env("GridClamp", disturbances={"clock_factor": 1.25}, **fine)
     assert env.diagram.control_period == pytest.approx(1.25 * CONTROL_PERIOD)
     for factor, options in ((1.3, fine), (1.5, {"time_step": CONTROL_PERIOD})):
         with pytest.raises(InputError, match="whole multiple of the plant's"):
-            make_env("GridClamp", clock_factor=factor, **options)
+            make_env("GridClamp", disturbances={"clock_factor": factor}, **options)
 
 
 def test_stiffness_factor_scales_the_station_impedance():
@@ -111,12 +111,17 @@ def test_stiffness_factor_scales_the_station_impedance():
 
 
 def test_late_commands_delay_the_tool(undisturbed):
-    late, _, _ = descend(1, late_commands=20)  # 20 of the 25 control steps of the action
+    late, _, _ = descend(1, disturbances={"late_commands": 20})  # 20 of the 25 control steps of the action
     assert late.trace.measured[-1, 2] > undisturbed[0].trace.measured[24, 2] + 1.0 * MM
 
 
 def test_lost_commands_are_independent_of_the_noise():
-    env = make_env("GridClamp", wrench_noise=(0.2, 0.01), lost_commands=0.3, action_repeat=1)
+    env = make_env(
+        "GridClamp",
+        sensing={"wrench_noise": (0.2, 0.01)},
+        disturbances={"lost_commands": 0.3},
+        action_repeat=1,
+    )
     station = env.diagram.diagram.GetSubsystemByName("station")
     commands, wrench = (station.GetSubsystemByName(name) for name in ("commands", "wrench"))
     env.reset(seed=1)
@@ -134,7 +139,7 @@ def test_lost_commands_are_independent_of_the_noise():
 
 
 def test_payload_is_added_to_the_tool_mass_of_an_arm():
-    env = make_env("GridClamp", station="arm", payload=0.3)
+    env = make_env("GridClamp", station="arm", disturbances={"payload": 0.3})
     env.reset(seed=0)
     arm = env.diagram.diagram.GetSubsystemByName("station").GetSubsystemByName("station")
     tool = arm.arm.tool[0]
@@ -146,11 +151,11 @@ def test_payload_is_added_to_the_tool_mass_of_an_arm():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"payload": 0.5}, "station=arm"),
-        ({"clock_factor": 0.6}, "whole multiple"),
-        ({"friction_factor": (2.0, 1.0)}, "smaller one first"),
-        ({"wrench_bias": (-1.0, 0.0)}, "none negative"),
-        ({"lost_commands": 1.0}, "less than 1"),
+        ({"disturbances.payload": 0.5}, "station=arm"),
+        ({"disturbances.clock_factor": 0.6}, "whole multiple"),
+        ({"disturbances.friction_factor": (2.0, 1.0)}, "smaller one first"),
+        ({"sensing.wrench_bias": (-1.0, 0.0)}, "none negative"),
+        ({"disturbances.lost_commands": 1.0}, "less than 1"),
     ],
 )
 def test_environment_raises_when_a_disturbance_is_invalid(options, message):
@@ -162,4 +167,6 @@ def test_environment_raises_when_hardware_is_disturbed():
     from guiderail.diagrams.envs.make import make_skill
 
     with pytest.raises(InputError, match="real robot"):
-        make_skill("GridClamp", lambda o: o, station="hardware", robot_url="memq://", lost_commands=0.1)
+        make_skill(
+            "GridClamp", lambda o: o, station="hardware", robot_url="memq://", disturbances={"lost_commands": 0.1}
+        )

@@ -49,7 +49,9 @@ def test_setting_is_tared_and_seeded_on_every_station(station, sensing):
 
 
 def test_arm_estimates_the_wrench_from_joint_torques():
-    env = make_env("BncConnector", station="arm", sensing="robot", tare=False, wrench_delay=0, **HARD)
+    env = make_env(
+        "BncConnector", station="arm", sensing={"profile": "robot", "tare": False, "wrench_delay": 0}, **HARD
+    )
     measured, exact, info = free_motion(env)
     assert info["torque_offset"].shape == (7,)
     bias = np.abs((measured - exact)[10:].mean(axis=0))
@@ -60,15 +62,16 @@ def test_arm_estimates_the_wrench_from_joint_torques():
 
 def test_payload_is_measured_and_tared():
     """A payload of 0.5 kg that the model lacks weighs 4.9 N before the tare, and nothing after the tare."""
-    options = {**HARD, "station": "arm", "sensing": "robot", "wrench_bias": (0.0, 0.0), "wrench_scale": (1.0, 1.0)}
-    untared, _, _ = free_motion(make_env("BncConnector", payload=0.5, tare=False, **options))
+    sensing = {"profile": "robot", "wrench_bias": (0.0, 0.0), "wrench_scale": (1.0, 1.0)}
+    options = {**HARD, "station": "arm", "disturbances": {"payload": 0.5}}
+    untared, _, _ = free_motion(make_env("BncConnector", sensing={**sensing, "tare": False}, **options))
     assert untared[12:28, 2].mean() == pytest.approx(-0.5 * 9.81, abs=0.5)
-    tared, _, _ = free_motion(make_env("BncConnector", payload=0.5, **options))
+    tared, _, _ = free_motion(make_env("BncConnector", sensing=sensing, **options))
     assert abs(tared[12:28, 2].mean()) < 0.3
 
 
 def test_calibration_error_displaces_tool_from_measurement():
-    env = make_env("BncConnector", sensing="exact", calibration_error=(1.0 * MM, 0.0), **HARD)
+    env = make_env("BncConnector", sensing={"calibration_error": (1.0 * MM, 0.0)}, **HARD)
     _, info = env.reset(seed=1)
     for _ in range(30):
         env.step(np.zeros(2))
@@ -129,7 +132,7 @@ def test_hardware_station_is_tared_and_adds_no_errors(sensing, is_tared):
     station = make_station(task)
     for copy in (station, station.clone(task.workcell())):
         assert any(system.get_name() == "tare" for system in copy.GetSystems()) == is_tared
-    noisy = EnvConfig.resolve("BncConnector", {**options, "wrench_noise": (0.1, 0.01)}).make_task()
+    noisy = EnvConfig.resolve("BncConnector", {**options, "sensing.wrench_noise": (0.1, 0.01)}).make_task()
     with pytest.raises(InputError, match="disturbances of its own"):
         make_station(noisy)
 
@@ -143,9 +146,9 @@ def test_exact_setting_adds_no_disturbances():
     ("options", "message"),
     [
         ({"sensing": "perfect"}, "there is no sensing 'perfect'"),
-        ({"calibration_error": (0.5, 0.0)}, "meters"),
-        ({"wrench_drift": (-1.0, 0.0)}, "none negative"),
-        ({"sensing": "robot", "wrench_bias": (1.0,)}, "wrench_bias"),
+        ({"sensing.calibration_error": (0.5, 0.0)}, "meters"),
+        ({"sensing.wrench_drift": (-1.0, 0.0)}, "none negative"),
+        ({"sensing": "robot", "sensing.wrench_bias": (1.0,)}, "sensing.wrench_bias"),
     ],
 )
 def test_environment_raises_when_a_setting_is_invalid(options, message):

@@ -171,27 +171,6 @@ def test_single_demonstration_requires_prior_std(tmp_path):
     assert (shipped.standard_deviations[:, :2] >= 1.73 * MM).all()
 
 
-def test_gap_scale_narrows_the_covariance_in_a_gap(tmp_path):
-    """Recordings without samples from 2 s to 5 s: both models interpolate, and `gap_scale` applies only there."""
-    loaded = Demonstrations.load(shipped_demonstrations.PATH)
-    masks = [(t - t[0] < 2.0) | (t - t[0] > 5.0) for t in loaded.times]
-    times, outputs = (
-        np.array([samples[mask] for samples, mask in zip(arrays, masks, strict=True)])
-        for arrays in (loaded.times, loaded.outputs)
-    )
-    Demonstrations(times, outputs).save(tmp_path / "gap.npz")
-    options = {"demonstrations": str(tmp_path / "gap.npz"), "reference_model": "promp"}
-    plain, scaled = (
-        make_prior_knowledge("BncConnector", **options | change).primitive.reference
-        for change in ({}, {"gap_scale": 0.1})
-    )
-    ratio = (scaled.standard_deviations / plain.standard_deviations)[:, :3]
-    np.testing.assert_allclose(ratio[[10, 350]], 1.0, atol=0.05)
-    np.testing.assert_allclose(ratio[175], 0.1, atol=0.02)
-    gmr = make_prior_knowledge("BncConnector", **options | {"reference_model": "gmr"}).primitive.reference
-    assert np.abs(gmr.means - plain.means).max() > 1e-4
-
-
 def test_action_displaces_the_command_by_the_prior_std():
     """An action of 1 displaces the command by √3 standard deviations: 3 mm for a prior of 1.73 mm."""
     env = make_env("BncConnector", guidance="kgrl", num_demonstrations=1, prior_std=PRIOR_STD, bound=6.0 * MM)

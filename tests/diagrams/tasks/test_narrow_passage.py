@@ -214,7 +214,7 @@ def test_command_continues_at_the_pushed_pose(step, push):
     """Section 5.3.4: with P = 1 the history is the measured pose, so the command continues at the robot."""
     if step == 45 and push[1] == 0.0:
         push = (0.01 * np.sign(push[0]), 0.0)  # free space to the walls [m]
-    env = make("skgrl", history=1, history_source="measured")
+    env = make("skgrl", history={"length": 1, "source": "measured"})
     env.reset()
     info = {"termination": ""}
     worst_after = -np.inf
@@ -235,7 +235,7 @@ def test_command_continues_at_the_pushed_pose(step, push):
 
 
 def test_robot_returns_when_pushed_out_of_the_constraint():
-    env = make("skgrl", history=1, history_source="measured", action_repeat=1)
+    env = make("skgrl", history={"length": 1, "source": "measured"}, action_repeat=1)
     env.reset()
     for k in range(100):
         env.step(zero_action(k))
@@ -373,8 +373,8 @@ def test_missing_display_library_is_named(monkeypatch):
         ({"action_repeat": 0}, "action_repeat"),
         ({"action_scale": -1.0}, "action_scale"),
         ({"history": 0}, "history"),
-        ({"history_variance": 0.0}, "history_variance"),
-        ({"history_source": "planned"}, "no history_source 'planned': choose one of commanded, measured"),
+        ({"history.variance": 0.0}, "history.variance"),
+        ({"history.source": "planned"}, "no history.source 'planned': choose one of commanded, measured"),
         ({"gains": (1.0,)}, "one per output"),
     ],
 )
@@ -425,7 +425,7 @@ def test_motion_constraints_are_refused_when_invalid(options, match):
 
 
 def test_observed_phase_stops_while_the_motion_waits():
-    env = make("kgrl", progress="state", progress_tolerance=(1e-9, 0.1), max_lag=0.5, action_repeat=5)
+    env = make("kgrl", progress={"mode": "state", "tolerance": (1e-9, 0.1), "max_lag": 0.5}, action_repeat=5)
     clock, times = make("kgrl", action_repeat=5), []
     assert env.diagram.num_steps == clock.diagram.num_steps + round(0.5 / env.diagram.control_period)
     duration = clock.diagram.num_steps * env.diagram.control_period
@@ -436,5 +436,5 @@ def test_observed_phase_stops_while_the_motion_waits():
         assert observation[0] == pytest.approx(2.0 * times[-1] / duration - 1.0, abs=1e-6)
     late = 60 * env.diagram.control_period - np.array(times[-1])
     assert 0.3 < late <= 0.5 + 2 * env.diagram.control_period  # the position error is almost always above 1 nm
-    with pytest.raises(InputError, match="progress_tolerance"):
-        make("kgrl", progress="state", progress_tolerance=(0.0, 0.1))
+    with pytest.raises(InputError, match=r"progress\.tolerance"):
+        make("kgrl", progress={"mode": "state", "tolerance": (0.0, 0.1)})

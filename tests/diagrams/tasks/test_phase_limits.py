@@ -6,9 +6,11 @@ from itertools import count
 import gymnasium
 import numpy as np
 import pytest
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.diagrams.stations.impedance_control import WRENCH_RATE, make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Impedance, max_wrench
 from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
@@ -83,14 +85,19 @@ def test_lower_limit_of_task_and_state_is_enforced():
 def test_limit_changes_with_the_state_at_bounded_rate():
     env = make_clamp(two_states({}, {"max_force_n": 6.0}), action_repeat=1)
     limit = phase_limit(env)
-    port, state = limit.get_phase_max_wrench_output_port(), limit.get_state_input_port()
+    port = limit.get_phase_max_wrench_output_port()
     env.reset(seed=0, options={"offset": (0.0025, 0.0)})
     context = limit.GetMyContextFromRoot(env.simulator.get_context())
+    guidance = env.diagram.diagram.GetSubsystemByName("guidance")
+    state, guidance_context = (
+        guidance.GetOutputPort("state"),
+        guidance.GetMyContextFromRoot(env.simulator.get_context()),
+    )
     bounds, states = [], []
     for _ in range(90):
         env.step(np.array([1.0, 1.0, -1.0]))
         bounds.append(port.Eval(context).copy())
-        states.append(state.Eval(context)[0])
+        states.append(state.Eval(guidance_context)[0])
     changes = np.abs(np.diff(bounds, axis=0))
     assert states[0] == 0.0
     assert states[-1] == 1.0
@@ -129,23 +136,36 @@ def test_state_does_not_raise_the_bound_of_the_station():
     bounded = Impedance().with_max_force(10.0)
     system = make_phase_wrench_limit(with_limits(max_force_n=100.0, max_torque_nm=100.0), bounded, 0.01)
     context = system.CreateDefaultContext()
-    system.get_state_input_port().FixValue(context, [0.0])
+    limit = with_limits(max_force_n=100.0, max_torque_nm=100.0).max_wrench(0)
+    system.get_state_max_wrench_input_port().FixValue(context, limit)
     bound = system.get_phase_max_wrench_output_port().Eval(context)
     np.testing.assert_array_equal(bound, bounded.bound.numbers)
 
 
-def test_torque_limit_bounds_the_norm_of_the_torque():
-    bound = max_wrench(np.inf, 1.5)
-    assert np.linalg.norm(bound[3:6]) == pytest.approx(1.5)
-    assert bound[7] == pytest.approx(1.5)
-    np.testing.assert_array_equal(bound[[0, 1, 2, 6]], max_wrench(np.inf)[[0, 1, 2, 6]])
-    np.testing.assert_array_equal(max_wrench(20.0, 1e3), max_wrench(20.0))
+def test_wrench_limit_of_guidance_without_its_port_is_refused():
+    def guidance(prior):
+        inner, builder = GUIDANCE.get("sct").build(prior), DiagramBuilder()
+        builder.AddSystem(inner)
+        for index in range(inner.num_input_ports()):
+            builder.ExportInput(inner.get_input_port(index), inner.get_input_port(index).get_name())
+        for index in range(inner.num_output_ports()):
+            if (port := inner.get_output_port(index)).get_name() != "state_max_wrench":
+                builder.ExportOutput(port, port.get_name())
+        return builder.Build()
+
+    register_guidance("lab/portless", needs=(("template",),))(guidance)
+    try:
+        make_clamp(with_limits(), guidance="lab/portless")
+        with pytest.raises(InputError, match="no output 'state_max_wrench': export max_wrench of its state machine"):
+            make_clamp(with_limits(max_force_n=6.0), guidance="lab/portless")
+    finally:
+        GUIDANCE._entries.pop("lab/portless")
 
 
-@pytest.mark.parametrize("limits", [(20.0, np.nan), (20.0, -1.0), (20.0, 0.0), (np.nan,), (-1.0,), (0.0,)])
-def test_limit_is_refused_when_not_positive(limits):
+@pytest.mark.parametrize("force", [np.nan, -1.0, 0.0])
+def test_limit_is_refused_when_not_positive(force):
     with pytest.raises(InputError, match=r"positive|negative"):
-        max_wrench(*limits)
+        max_wrench(force)
 
 
 def test_shipped_template_of_the_clamp_has_no_limits():

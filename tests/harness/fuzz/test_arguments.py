@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from fuzz.tally import attempt
 from guiderail.diagrams.envs.config import EnvConfig, option_models
 from guiderail.diagrams.envs.make import make_env
+from guiderail.diagrams.envs.options import option_fields
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import as_value, check_environment
@@ -56,7 +57,7 @@ SETTINGS = [name for name in OffPolicyConfig.__dataclass_fields__ if name != "al
 @example("tqc_contact", [("ent_coef", "inf")])
 @example("tqc_contact", [("net_arch", "1000000,1000000")])
 @example("tqc_contact", [("batch_size", "1e20")])
-@example("tqc_contact", [("layer_norm", "7")])
+@example("tqc_contact", [("net_arch.layer_norm", "7")])
 def test_configure_accepts_or_refuses_any_learner_setting(preset, pairs):
     arguments = dict(pairs)
     config = attempt("--set", InputError, lambda: configure("NarrowPassage", {}, preset=preset, settings=arguments))
@@ -82,7 +83,9 @@ def options_of(task):
     """Return all options of a task's environments with their defaults as text."""
     config = EnvConfig.resolve(task, {})
     models = option_models(TASKS.get(task), config.guidance, config.station).values()
-    return {name: str(field.default) for model in models for name, field in model.model_fields.items()}
+    return {
+        name: str(model.model_fields[field].default) for model in models for name, field in option_fields(model).items()
+    }
 
 
 OPTIONS = {task: options_of(task) for task in TASK_NAMES}

@@ -373,7 +373,7 @@ from guiderail.tools.cli.main import main
 for line in (
     "", "--guidance nope", "--env guidance=nope", "--station nope", "--algorithm nope", "--preset nope", "--set nope=1",
     "--preset tqc_fast --set batch_size=0", "--episodes 0", "--seed -1", "--log nope", "--out .",
-    "--env nope=1", "--env friction=9", "--env time_step=-1", "--env slack_width=-1", "--env offset_range=1",
+    "--env nope=1", "--env friction=9", "--env time_step=-1", "--env action_scale=-1", "--env offset_range=1",
 ):
     try:
         main(["train", "BncConnector", *(["--out", "run"] if line else []), *line.split()])

@@ -421,6 +421,14 @@ class PouringPointEnv(PointEnv):
         return result
 
 
+def test_template_that_limits_the_force_is_refused():
+    template = load_template("pouring")
+    limited = replace(template, states=(replace(template.states[0], max_force_n=12.0), *template.states[1:]))
+    guide.TemplateGuide(template, lambda env, observation: {}, 0.02)
+    with pytest.raises(InputError, match="GuidedEnv has no controller that could follow the limit"):
+        guide.TemplateGuide(limited, lambda env, observation: {}, 0.02)
+
+
 def test_template_guides_within_its_active_constraints():
     frames = {"mug_tip": RigidTransform([0.6, 0.0, 0.3])}
     env = GuidedEnv(

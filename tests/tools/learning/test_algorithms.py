@@ -179,29 +179,13 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
     assert learner.model.rollout_buffer.pos == 0
 
 
-def test_n_step_returns_of_a_full_buffer_omit_demonstrations():
-    box = spaces.Box(-1.0, 1.0, (1,))
-    buffer = DemonstrationReplayBuffer(8, box, box, device="cpu", n_steps=3, gamma=1.0)
-    buffer.num_demonstrated = 2
-    for step in range(9):  # the last transition overwrites row 2
-        is_demonstrated = step < 2
-        observations = (np.full((1, 1), float(step + k)) for k in range(2))
-        reward, done = np.array([1000.0 if is_demonstrated else 1.0]), np.array([step == 1])
-        buffer.add(*observations, np.zeros((1, 1)), reward, done, [{}])
-    samples = buffer._get_samples(np.arange(8))
-    np.testing.assert_array_equal(samples.rewards.numpy()[:, 0], [2000.0, 1000.0, 1.0, 3.0, 3.0, 3.0, 2.0, 1.0])
-    np.testing.assert_array_equal(samples.next_observations.numpy()[2:, 0], [9.0, 6.0, 7.0, 8.0, 8.0, 8.0])
-    np.testing.assert_array_equal(samples.dones.numpy()[:, 0], [1, 1, 0, 0, 0, 0, 0, 0])
-    assert not buffer.timeouts.any()
-
-
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"demonstration_fraction": 0.5}, "needs demonstrations: give --set demonstration_episodes"),
         ({"demonstration_fraction": 0.5, "demonstration_episodes": 1, "pipelined": True}, "fraction does not work"),
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
-        ({"algorithm": "crossq", "dropout": 0.01}, "leave dropout=0.01 out"),
+        ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
         ({"algorithm": "ppo", "symmetry": True}, "ppo learns from no symmetric copies: leave symmetry out"),
         ({"algorithm": "trpo", "symmetry": "near"}, "trpo learns from no symmetric copies"),
@@ -224,7 +208,9 @@ def test_newest_row_is_the_last_added_also_in_a_full_buffer():
 
 @pytest.mark.parametrize("algorithm", ["sac", "tqc"])
 def test_dropout_is_applied_to_the_critics_in_training_only(algorithm):
-    config = resolve_preset(None, algorithm, {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "dropout": 0.5})
+    config = resolve_preset(
+        None, algorithm, {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "net_arch.dropout": 0.5}
+    )
     learner = make(config)
     learn(learner, 4, np.random.default_rng(0))
     critic = learner.model.critic
@@ -295,7 +281,7 @@ def test_images_are_refused_by_learners_without_image_encoder(algorithm):
 
 
 def test_probability_of_an_action_grows_over_base_motion_steps():
-    settings = {"net_arch": "8", "learning_starts": 10_000, "base_motion_steps": 2000}
+    settings = {"net_arch": "8", "learning_starts": 10_000, "exploration.base_motion_steps": 2000}
     learner = make(resolve_preset(None, "sac", settings))
     learner._constant_action = None
     fractions = []

@@ -10,10 +10,11 @@ from guiderail.tools.learning.train import train
     ("setting", "value"),
     [
         ("ent_coef", "_0.5"), ("ent_coef", "auto0.5"), ("ent_coef", "inf"), ("ent_coef", "auto_nan"),
-        ("ent_coef", "-1"), ("ent_coef", "much"), ("net_arch", ""), ("net_arch", "1000000,1000000"), ("dropout", 1.0),
-        ("gamma", 1.5), ("constant_episodes", -1), ("greedy_episode_fraction", 1.5), ("selection_window", -1),
-        ("ez_greedy", 1.5), ("ez_greedy_longest", 0), ("ez_greedy_until", -1), ("batch_size", 2.5),
-        ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("layer_norm", "7"),
+        ("ent_coef", "-1"), ("ent_coef", "much"), ("net_arch", ""), ("net_arch", "1000000,1000000"),
+        ("gamma", 1.5), ("exploration.constant_episodes", -1), ("exploration.greedy_episode_fraction", 1.5),
+        ("exploration.ez_greedy", 1.5), ("exploration.ez_greedy_longest", 0), ("exploration.ez_greedy_until", -1),
+        ("net_arch.dropout", 1.0), ("selection.window", -1), ("batch_size", 2.5),
+        ("batch_size", "1e20"), ("batch_size", True), ("buffer_size", "9" * 5000), ("net_arch.layer_norm", "7"),
         ("learning_rate", "inf"), ("gamma", True), ("gradient_steps", 10**12), ("net_arch", ",".join(["8"] * 50)),
     ],
 )  # fmt: skip

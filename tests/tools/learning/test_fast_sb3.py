@@ -54,7 +54,7 @@ def train_both(plain, ensemble, seed=0):
     """Train both on the same batches: Stable-Baselines3 samples them one by one, the fast step all at once."""
     np.random.seed(seed)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     batches = plain.model.replay_buffer.sample(STEPS * BATCH)
-    single_batches = iter(zip(*[array.split(BATCH) for array in batches], strict=True))
+    single_batches = iter(zip(*[array.split(BATCH) for array in batches if array is not None], strict=True))
     for learner, sample in (
         (plain, lambda _, env=None: type(batches)(*next(single_batches))),
         (ensemble, lambda _, env=None: batches),
@@ -77,7 +77,7 @@ def assert_equal(plain, ensemble, tolerance):
 @pytest.mark.parametrize(("plain", "ensemble"), PAIRS)
 @pytest.mark.parametrize(
     ("preset", "settings"),
-    [("tqc_contact", {}), ("tqc_fast", {"n_steps": 3}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
+    [("tqc_contact", {}), ("tqc_fast", {"ent_coef": "0.2", "net_arch": "16"})],
 )
 def test_fast_step_equals_the_step_of_stable_baselines3(plain, ensemble, preset, settings):
     expected, result = make(plain, preset, **settings), make(ensemble, preset, **settings)

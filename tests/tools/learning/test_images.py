@@ -17,8 +17,8 @@ SHAPE = (16, 17, 3)
 IMAGE = spaces.Box(0, 255, SHAPE, np.uint8)
 IMAGE_AND_STATE = ImageAndStateSpace(SHAPE, spaces.Box(-3, 3, (2,), np.float32))
 SETTINGS = {
-    "image_encoder": "convolutional", "random_shift": 2, "net_arch": "8", "batch_size": 4, "learning_starts": 4,
-    "train_freq": 4, "gradient_steps": 2, "constant_episodes": 0,
+    "net_arch.image_encoder": "convolutional", "net_arch": "8", "batch_size": 4, "learning_starts": 4,
+    "train_freq": 4, "gradient_steps": 2, "exploration.constant_episodes": 0,
 }  # fmt: skip
 
 
@@ -49,7 +49,7 @@ def learn(learner, space, rng, episodes=2):
     ("algorithm", "encoder"), [("tqc", "convolutional"), ("crossq", "convolutional"), ("sac", "average_pooling")]
 )
 def test_policy_acts_as_its_learner(space, algorithm, encoder, tmp_path):
-    learner, rng = make(space, algorithm, image_encoder=encoder), np.random.default_rng(0)
+    learner, rng = make(space, algorithm, **{"net_arch.image_encoder": encoder}), np.random.default_rng(0)
     learn(learner, space, rng)
     assert learner.model.replay_buffer.observations.dtype == np.uint8
     learner.policy(described_observation(SpacesOnlyEnv(space))).save(tmp_path)

@@ -130,17 +130,6 @@ def test_replay_buffer_has_symmetric_copies(config):
     assert (buffer.size(), buffer.full) == (50, False)
 
 
-def test_n_step_returns_end_with_the_episode(config):
-    learner = make(replace(config, n_steps=3, gamma=0.5))
-    zero = np.zeros(3, np.float32)
-    for reward, terminated in ((1.0, False), (2.0, True), (4.0, False), (8.0, False), (16.0, False), (32.0, False)):
-        learner.store(transition(zero, np.zeros(2), reward, zero, terminated))
-    samples = learner.model.replay_buffer._get_samples(np.arange(4))
-    np.testing.assert_allclose(samples.rewards[:, 0], [1 + 2 / 2, 2, 4 + 8 / 2 + 16 / 4, 8 + 16 / 2 + 32 / 4])
-    np.testing.assert_array_equal(samples.dones[:, 0], [1, 1, 0, 0])
-    np.testing.assert_allclose(samples.discounts[2:, 0], 0.125)
-
-
 def test_restored_learner_continues_bit_for_bit(config):
     first = make(config)
     learn_from_random_transitions(first, 23)

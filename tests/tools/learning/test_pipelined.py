@@ -18,7 +18,13 @@ from guiderail.tools.learning.pipelined import PipelinedLearner, _write
 def make_learner(algorithm="sac", **options):
     """Return a pipelined learner and its acting learner; `algorithm` trains in the second process."""
     env = SpacesOnlyEnv()
-    small = {"net_arch": (8, 8), "learning_starts": 4, "batch_size": 4, "constant_episodes": 0, "train_freq": 1}
+    small = {
+        "net_arch": (8, 8),
+        "learning_starts": 4,
+        "batch_size": 4,
+        "exploration.constant_episodes": 0,
+        "train_freq": 1,
+    }
     preset = resolve_preset("tqc_contact", "sac", small)
     keywords = {"action_repeat": 1, "seed": 0, "max_transitions": 100, "symmetry": None}
     acting = LEARNERS.get("sac")(preset, env, **keywords)

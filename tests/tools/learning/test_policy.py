@@ -23,7 +23,7 @@ IMAGE = spaces.Box(0, 255, (22, 29, 3), np.uint8)
 def learner(request):
     algorithm, observation_space, layer_norm = request.param
     env = SpacesOnlyEnv(observation_space, spaces.Box(np.array([-1, -2]), np.array([1, 3]), dtype=np.float32))
-    config = resolve_preset("tqc_contact", algorithm, {"net_arch": "32,16", "layer_norm": layer_norm})
+    config = resolve_preset("tqc_contact", algorithm, {"net_arch": "32,16", "net_arch.layer_norm": layer_norm})
     return LEARNERS.get(algorithm)(config, env, action_repeat=1, seed=3, max_transitions=10)
 
 

@@ -25,7 +25,7 @@ def test_missing_setting_has_the_default_despite_a_preset(bead_config, tmp_path)
     folder = RunFolder(tmp_path / "run")
     folder.create(replace(bead_config, preset="sac_gridclamp", learner=PRESETS["sac_gridclamp"]))
     file = tmp_path / "run" / "config.yaml"
-    lines = [line for line in file.read_text().splitlines() if "ez_greedy_until" not in line]
+    lines = [line for line in file.read_text().splitlines() if "exploration.ez_greedy_until" not in line]
     file.write_text("\n".join(lines))
     assert folder.config().learner == replace(PRESETS["sac_gridclamp"], ez_greedy_until=0)
 

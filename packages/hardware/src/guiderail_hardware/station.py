@@ -186,6 +186,7 @@ class HardwareStation(Station):
         controller, impedance_monitor, tank = add_controller(
             builder, model, self.impedance, period, contact_wrench=measured_wrench, compensate_gravity=False
         )
+        self._tank = tank
         pose = controller.get_pose_output_port()
         self._limiter = limiter = add_system(
             builder,
@@ -289,8 +290,8 @@ class HardwareStation(Station):
     def take_over(self, simulator: Simulator, other: HardwareStation, other_context: Context) -> None:
         """Initialize a simulator that contains this station, and take control from another station without a gap.
 
-        This method does not wait. If the driver fails, it raises no exception, because the arm may be moving. See
-        `copy_state_from` for `other` and `other_context`.
+        This method does not wait. If the driver fails, it raises no exception, because the arm may be moving. A new
+        motion begins, so the energy tank is full. See `copy_state_from` for `other` and `other_context`.
         """
         self.driver.guard.receive()
         if isinstance(self.driver, PoseDriver):
@@ -298,6 +299,12 @@ class HardwareStation(Station):
         self.receive(simulator.get_mutable_context())
         simulator.Initialize()
         self.copy_state_from(self.GetMyMutableContextFromRoot(simulator.get_mutable_context()), other, other_context)
+        self._refill_tank(simulator.get_mutable_context())
+
+    def _refill_tank(self, context: Context) -> None:
+        """Fill the energy tank if there is one; `context` is the root context."""
+        if self._tank is not None:
+            self._tank.refill(self._tank.GetMyMutableContextFromRoot(context))
 
     def receive(self, context: Context, clock: float | None = None) -> None:
         """Read the newest status and heartbeat before a step; `context` is the root context.
@@ -327,12 +334,14 @@ class HardwareStation(Station):
     def resume(self, context: Context) -> None:
         """End a stop, and continue from the arm's current pose; `context` is the root context.
 
-        Without a valid command the arm stays at its pose, even if it was moved by hand during the stop.
+        Without a valid command the arm stays at its pose, even if it was moved by hand during the stop. The energy tank
+        is full again.
 
         Raises:
             InputError: If the arm is not stopped, not yet at rest, or a fault persists.
         """
         self._limiter.resume(self._limiter.GetMyMutableContextFromRoot(context))
+        self._refill_tank(context)
 
     def read_max_wrench(self, context: Context) -> np.ndarray | None:
         """Return the value of the input ``max_wrench``, (8,), or None without one; `context` is this station's own."""

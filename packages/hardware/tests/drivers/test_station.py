@@ -36,12 +36,14 @@ ALIASES = ("position_measured", "velocity_estimated", "state_estimated", "torque
 class Loop:
     """Station and simulated robot in one process, on a bus in memory, stepped in turn."""
 
-    def __init__(self, is_settled=True):
+    def __init__(self, is_settled=True, impedance=None):
         self.lcm = lcm = DrakeLcm("memq://")
         self.torques = []
         self.robot = SimulatedIiwa(WORKCELL, lcm)
         limits = replace(safety_limits(self.robot.controller_plant.plant, IiwaDriver), damping_time=0.2, ramp_time=0.1)
-        self.station = HardwareStation(WORKCELL, IiwaDriver(lcm), robot_timeout=1.0, limits=limits)
+        self.station = HardwareStation(
+            WORKCELL, IiwaDriver(lcm), impedance or Impedance(), robot_timeout=1.0, limits=limits
+        )
         self.robot_simulator, self.simulator = self.robot.simulator(), Simulator(self.station)
         self.robot.set_pose(self.robot_simulator.get_mutable_context(), START)
         self.context = self.simulator.get_mutable_context()
@@ -258,6 +260,33 @@ def test_station_resumes_at_the_measured_pose_without_commands():
     loop.advance(no_command, 0.6)
     assert loop.arm_state == ArmState.RUNNING
     np.testing.assert_allclose(loop["pose"], displaced, atol=1e-3)
+
+
+def tank_energy(station, context):
+    tank = station.GetSubsystemByName("tank")
+    return tank.get_energy_output_port().Eval(tank.GetMyContextFromRoot(context))[0]
+
+
+@pytest.mark.parametrize("new_motion", ["resume", "take_over"])
+def test_new_motion_begins_with_a_full_energy_tank(new_motion):
+    """With an empty tank the reference would not move, so that the arm would stand still without a fault."""
+    loop = Loop(impedance=Impedance().with_max_force(30.0))
+    station, context = loop.station, loop.context
+    full, tank = tank_energy(station, context), station.GetSubsystemByName("tank")
+    content = tank.GetMyMutableContextFromRoot(context).get_mutable_discrete_state()
+    content.get_mutable_vector(tank._content).SetAtIndex(0, 0.0)
+    assert tank_energy(station, context) == 0.0 < full
+    if new_motion == "resume":
+        station.stop(context)
+        loop.advance(START, 1.0)
+        station.resume(context)
+    else:
+        other, station = station, station.clone(WORKCELL)
+        simulator = Simulator(station)
+        station.get_desired_pose_input_port().FixValue(simulator.get_mutable_context(), START)
+        station.take_over(simulator, other, context)
+        context = simulator.get_context()
+    assert tank_energy(station, context) == full
 
 
 def test_copy_state_from_continues_the_motion():

@@ -136,7 +136,13 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
 
 
 def test_training_saves_its_state_when_it_ends_early(env, monkeypatch, tmp_path, forkserver):
-    small = {"net_arch": (8, 8), "learning_starts": 1, "batch_size": 1, "constant_episodes": 0, "train_freq": 1}
+    small = {
+        "net_arch": (8, 8),
+        "learning_starts": 1,
+        "batch_size": 1,
+        "exploration.constant_episodes": 0,
+        "train_freq": 1,
+    }
     arguments = {"algorithm": "sac", "episodes": 5, "settings": small}
     config = configure("BncConnector", {"station": "arm", "guidance": "kgrl"}, **arguments)
     folder, idle, files = RunFolder(tmp_path), env.idle, []  # the files at each call of `idle`

@@ -2,17 +2,21 @@
 
 from collections.abc import Hashable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, field_validator
 from typing_extensions import override
 
-from guiderail.diagrams.envs.options import Integer, Number, Options, PositiveNumbers
+from guiderail.diagrams.envs.options import Integer, Number, Options, PositiveNumbers, entries_of
 from guiderail_lerobot.base_policy import BASE_POLICIES, add_base_policy, base_policy_key, find_base_policy
 
 
 class BasePolicyOptions(Options):
     """Options of guidance around a base policy."""
+
+    entries: ClassVar[Mapping[str, str]] = entries_of(
+        "base_policy", "replan_steps", "covariance_floor", "guard", "max_jerk"
+    )
 
     base_policy: str = Field(
         "",

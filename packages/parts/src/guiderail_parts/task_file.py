@@ -238,7 +238,7 @@ class DemonstrationFile(PriorOptions):
 
     def reference(self, folder: Path) -> ReferenceTrajectory:
         """Return the reference trajectory of the demonstrations in a task folder, fitted once per process."""
-        return reference_of_file(folder / self.file, self.components, self.floor, **self.fit_arguments())
+        return reference_of_file(folder / self.file, self.components, self.floor, prior_std=self.prior_std)
 
 
 class Recommended(Options):

@@ -172,10 +172,10 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
     task, arguments, about = _find_subject(subject, environment)
     options = check_environment(task, arguments)
     config, guidance = EnvConfig.resolve(task, options), str(options["guidance"])
-    if guidance not in GUIDANCE or options.get("adaptive_history") or options.get("history_source") == "measured":
+    if guidance not in GUIDANCE or options.get("history.adaptive") or options.get("history.source") == "measured":
         raise InputError(
             f"guidance={guidance!r} cannot be certified: use {' or '.join(GUIDANCE)}, with a "
-            "history of fixed length that contains commands (neither adaptive_history nor history_source=measured)"
+            "history of fixed length that contains commands (neither history.adaptive nor history.source=measured)"
         )
     loop = _make_loop(config, start_within)
     impedance = config.make_task().impedance()
@@ -183,7 +183,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
         impedance = Impedance()
     if impedance is None:
         return _Skill(loop, None, None, about)
-    stiffness = options.get("stiffness_factor", 1.0) * np.array(impedance.stiffness)
+    stiffness = options.get("disturbances.stiffness_factor", 1.0) * np.array(impedance.stiffness)
     return _Skill(loop, stiffness, np.array(impedance.limits), about)
 
 

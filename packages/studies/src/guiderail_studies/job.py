@@ -27,7 +27,13 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import changed_environment, check_reset, make_environment, task_content
+from guiderail.tools.environments import (
+    changed_environment,
+    check_reset,
+    flat_environment,
+    make_environment,
+    task_content,
+)
 from guiderail.tools.evaluation.baselines import constant_policy, make_baseline
 from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.evaluate import evaluate_run
@@ -37,6 +43,7 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
+from guiderail.tools.learning.config import flat_settings
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
@@ -96,11 +103,12 @@ class Job:
         choices = [study.learner, method.learner]
         chosen = {k: getattr(c, k) for c in choices for k in ("algorithm", "preset") if k in c.model_fields_set}
         given: dict[str, Any] = {k: v for k, v in chosen.items() if v is not None}
-        settings = {**study.learner.settings, **method.learner.settings}
+        settings = flat_settings(study.learner.settings) | flat_settings(method.learner.settings)
         if "init_from" in settings:  # the run of another method of the study
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings
-        environment, given = {**study.env, **method.env}, with_defaults(study.task, given)
+        of_study, of_method = (flat_environment(study.task, env) for env in (study.env, method.env))
+        environment, given = {**of_study, **of_method}, with_defaults(study.task, given)
         given |= {"imports": study.imports, "seed": self.seed}
         config = configure(study.task, environment, episodes=max(episodes, 1), **given)
         if config.learner.stop_after_successes:

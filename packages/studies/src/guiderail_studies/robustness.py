@@ -91,26 +91,42 @@ def _offsets(environment: Environment, value: float) -> dict[str, Any]:
 
 def _period(environment: Environment, value: float) -> dict[str, Any]:
     period = environment["control_period"] or CONTROL_PERIOD
-    return {"clock_factor": max(round(value * period / PLANT_PERIOD), 1) * PLANT_PERIOD / period}
+    return {"disturbances.clock_factor": max(round(value * period / PLANT_PERIOD), 1) * PLANT_PERIOD / period}
 
 
 FACTORS = (0.5, 0.7, 1.0, 1.4, 2.0)
 
 AXES = (
-    Axis("friction", "friction (factor)", FACTORS, 1.0, _range("friction_factor")),
-    Axis("modulus", "contact stiffness (factor)", (0.1, 0.3, 1.0, 3.0, 10.0), 1.0, _range("modulus_factor")),
-    Axis("stiffness", "impedance stiffness (factor)", (1 / 3, 0.6, 1.0, 1.7, 3.0), 1.0, _scalar("stiffness_factor")),
+    Axis("friction", "friction (factor)", FACTORS, 1.0, _range("disturbances.friction_factor")),
+    Axis(
+        "modulus", "contact stiffness (factor)", (0.1, 0.3, 1.0, 3.0, 10.0), 1.0, _range("disturbances.modulus_factor")
+    ),
+    Axis(
+        "stiffness",
+        "impedance stiffness (factor)",
+        (1 / 3, 0.6, 1.0, 1.7, 3.0),
+        1.0,
+        _scalar("disturbances.stiffness_factor"),
+    ),
     Axis("clearance", "clearance (factor)", (0.5, 0.75, 1.0, 1.5, 2.0), 1.0, _clearance),
     Axis("offsets", "offsets per episode (factor)", (0.5, 1.0, 1.25, 1.5, 2.0), 1.0, _offsets, resamples=True),
-    Axis("wrench_scale", "measured wrench (factor)", FACTORS, 1.0, _range("wrench_scale")),
-    Axis("wrench_bias", "max. wrench bias [N]", (0.0, 0.5, 1.0, 2.0, 4.0), 0.0, _force_and_torque("wrench_bias")),
-    Axis("wrench_noise", "wrench noise, σ [N]", (0.0, 0.25, 0.5, 1.0, 2.0), 0.0, _force_and_torque("wrench_noise")),
-    Axis("wrench_delay", "wrench delay [steps]", (0, 1, 2, 5, 10), 0, _scalar("wrench_delay", kind=int)),
-    Axis("pose_bias", "max. pose bias [mm]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _scalar("pose_bias", MM)),
-    Axis("lost", "fraction of commands lost", (0.0, 0.1, 0.3, 0.5, 0.8), 0.0, _scalar("lost_commands")),
-    Axis("late", "command delay [steps]", (0, 1, 2, 5, 10), 0, _scalar("late_commands", kind=int)),
+    Axis("wrench_scale", "measured wrench (factor)", FACTORS, 1.0, _range("sensing.wrench_scale")),
+    Axis(
+        "wrench_bias", "max. wrench bias [N]", (0.0, 0.5, 1.0, 2.0, 4.0), 0.0, _force_and_torque("sensing.wrench_bias")
+    ),
+    Axis(
+        "wrench_noise",
+        "wrench noise, σ [N]",
+        (0.0, 0.25, 0.5, 1.0, 2.0),
+        0.0,
+        _force_and_torque("sensing.wrench_noise"),
+    ),
+    Axis("wrench_delay", "wrench delay [steps]", (0, 1, 2, 5, 10), 0, _scalar("sensing.wrench_delay", kind=int)),
+    Axis("pose_bias", "max. pose bias [mm]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _scalar("sensing.pose_bias", MM)),
+    Axis("lost", "fraction of commands lost", (0.0, 0.1, 0.3, 0.5, 0.8), 0.0, _scalar("disturbances.lost_commands")),
+    Axis("late", "command delay [steps]", (0, 1, 2, 5, 10), 0, _scalar("disturbances.late_commands", kind=int)),
     Axis("period", "control period (factor)", (0.5, 1.0, 1.5, 2.0), 1.0, _period),
-    Axis("payload", "unmodeled payload [kg]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _scalar("payload")),
+    Axis("payload", "unmodeled payload [kg]", (0.0, 0.1, 0.3, 0.6, 1.0), 0.0, _scalar("disturbances.payload")),
 )
 
 

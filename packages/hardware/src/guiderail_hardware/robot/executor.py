@@ -18,7 +18,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.assemble import SkillDiagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
-from guiderail.diagrams.envs.options import Options
+from guiderail.diagrams.envs.options import Options, option_fields
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -417,7 +417,7 @@ def hardware_environment(task: str, environment: Mapping[str, Any], station: str
         raise InputError(f"station {station!r} is a simulation: watch the policy there with guiderail visualize")
     config = EnvConfig.resolve(task, environment)
     training_options = config.station_kind.options or Options
-    options = {name: value for name, value in environment.items() if name not in training_options.model_fields}
+    options = {name: value for name, value in environment.items() if name not in option_fields(training_options)}
     task_class = TASKS.get(config.task)
     simulated = getattr(task_class, "simulated_rewards", ())
     if environment.get("reward") in simulated:

@@ -333,6 +333,7 @@ class RobotEnv(DiagramEnv):
         return is_near(self.pose, self._start)
 
     def _follow_return_path(self) -> None:
+        self._switch_to_new_transfer()  # the energy tank is full; the last motion may have emptied it against friction
         while self._return_path:
             # After a stop the motion continues with the rest of the path.
             self._retry_until_ok(lambda: self._command(self._return_path[-1]))
