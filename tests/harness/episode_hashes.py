@@ -138,6 +138,7 @@ def guided_hash(options: dict[str, Any]) -> str:
         to_action=to_action,
         period=PERIOD,
         action_repeat=3,
+        horizon=20,
         **options,
     )
     return _hash_of(env, STEPS, ({}, {}))
