@@ -27,8 +27,9 @@ def classes(path):
 
 
 def system_names(path):
-    """Return the names of the classes of a file that derive from LeafSystem."""
-    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id == "LeafSystem" for b in c.bases)]
+    """Return the names of the classes of a file that derive from LeafSystem or ConvertibleSystem."""
+    bases = ("LeafSystem", "ConvertibleSystem")
+    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id in bases for b in c.bases)]
 
 
 def ports(system):
