@@ -5,7 +5,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.primitives.full_turns import continued_angles
+from guiderail.models.common.transforms import nearest_pose
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
@@ -39,8 +39,8 @@ class HistoryBuffer(LeafSystem):
         length: Number P of stored outputs, at least 1; P·O is at most a million.
         period: Control period [s], positive.
         near: Pose (6,), [x y z Rz Ry Rx], such as the first mean of the reference; None: outputs are stored unchanged.
-            With it, the angles of the first output are on the full turn nearest to `near`, and those of each output on
-            the full turn nearest to the output before, so that the history has no jump at ±π.
+            With it, the angles of the first output are those of its orientation nearest to `near`, and the angles of
+            each output those nearest to the output before (`nearest_pose`), so that the history has no jumps.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if ``initial_output`` is not connected or not
@@ -90,7 +90,7 @@ class HistoryBuffer(LeafSystem):
         discrete_state.set_value(self._state, np.concatenate([stored[size:], newest]))
 
     def _continued(self, output: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-        """Return the output with its angles on the full turns nearest to those of `last`."""
+        """Return the output with its angles nearest to those of `last`."""
         if self._near is None or last is None:
             return output
-        return np.concatenate([output[:3], continued_angles(output[None, 3:], last[3:])[0]])
+        return nearest_pose(output, last)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, is_whole
+from guiderail.models.common.arrays import as_numbers, is_finite, is_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.transforms import POSE_SIZE, pose_difference
+from guiderail.models.common.transforms import POSE_SIZE, angle_between
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.qp import UnsolvableError
 
@@ -163,16 +163,16 @@ class StateProgress:
 
         s_{k+1} = s_k + 1  if ‖y − x‖ ≤ tolerance  or  k + 1 − s_k > max_lag,  else  s_k
 
-    Here y is the last command and x the measured pose. For poses (6,), position and angles must each be within their
-    tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. An intended contact, such as in
-    a search, can therefore delay the motion by at most `max_lag` steps. The tolerance should cover the deviations that
-    contact and tracking cause while nothing blocks the robot.
+    Here y is the last command and x the measured pose. For poses (6,), the distance and the rotation between them must
+    each be within their tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. An
+    intended contact, such as in a search, can therefore delay the motion by at most `max_lag` steps. The tolerance
+    should cover the deviations that contact and tracking cause while nothing blocks the robot.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
-    tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
+    tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and the rotation [rad], positive
     # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (The option `max_lag`
     # of an environment is a time in seconds.)
     max_lag: int
@@ -192,8 +192,10 @@ class StateProgress:
             command: Last command (O,).
             pose: Measured pose (O,); NaN counts as not near.
         """
-        is_pose = len(command) == POSE_SIZE
-        error = pose_difference(command, pose) if is_pose else command - pose
-        position, angles = (error[:3], error[3:]) if is_pose else (error, error[:0])
-        is_near = all(np.sqrt(e @ e) <= tol for e, tol in zip((position, angles), self.tolerance, strict=True))
+        is_pose, error = len(command) == POSE_SIZE, command - pose
+        is_near = is_finite(error)
+        if is_near:
+            distance = error[:3] if is_pose else error
+            angle = angle_between(command, pose) if is_pose else 0.0
+            is_near = bool(np.sqrt(distance @ distance) <= self.tolerance[0] and angle <= self.tolerance[1])
         return step + 1 if is_near or clock - step > self.max_lag else step
