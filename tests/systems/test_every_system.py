@@ -67,6 +67,7 @@ def system_by_name():
         systems.CommandFilter(BarrierFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0)), PERIOD),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
+        systems.ContinuousPose(np.zeros(6), PERIOD),
         systems.CenterOfPressure(0.5),
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
