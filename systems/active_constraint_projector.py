@@ -3,12 +3,11 @@
 from collections.abc import Mapping
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number
-from guiderail.models.common.errors import InputError
-from guiderail.models.laws.template import TemplateState, guarded_pose, start_in, violation_of
+from guiderail.models.laws.template import TemplateLaw, TemplateState
 from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -74,11 +73,9 @@ class ActiveConstraintProjector(LeafSystem):
         max_tracking_error: float = np.inf,
     ):
         super().__init__()
-        if not as_number(max_tracking_error, "max_tracking_error") > 0.0:
-            raise InputError(f"the largest tracking error must be positive, not {max_tracking_error} m")
         check_template(template, frames)
-        self._template, self._period, self._max_tracking_error = template, period, max_tracking_error
-        template.check_consistency()
+        declare.check_period(period)
+        self._law = TemplateLaw(template, {}, period, max_tracking_error=max_tracking_error)
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._state_port = self.DeclareVectorInputPort("state", 1)
@@ -87,7 +84,7 @@ class ActiveConstraintProjector(LeafSystem):
         # [last command (6,), pose (6,) measured at the same instant]
         self._last = declare.unset_state(self, 12)
         constraints = [self._state_port, self.frames.ticket]
-        self._command = declare.cache(
+        self._command = declare.cache_entry(
             self, "command", self._calc_command, [*constraints, self._last, self._requested_pose_port]
         )
         declare.part_output(self, "desired_pose", self._command, lambda command: command[:6], 6)
@@ -115,37 +112,29 @@ class ActiveConstraintProjector(LeafSystem):
     get_commanded_violation_output_port = output_getter("commanded_violation", "violation of the command, (1,)")
     get_measured_violation_output_port = output_getter("measured_violation", "violation of the measured pose, (1,)")
 
-    def _violation(self, context: Context, pose: np.ndarray) -> float:
-        return violation_of(self._template, self._state(context), pose, self.frames.eval(context))
-
     def _state(self, context: Context) -> int | None:
-        return declare.state_number(self._state_port, context, len(self._template.states))
+        return declare.state_number(self._state_port, context, len(self._law.template.states))
 
-    def _calc_command(self, context: Context) -> np.ndarray:
-        """Return the command and the fallback flag, (7,)."""
-        value = declare.initialized(self, context, self._last)
-        last, measured = value[:6], value[6:]
-        number = self._state(context)
-        if number is None:
-            return np.append(last, 1.0)
-        requested, frames = self._requested_pose_port.Eval(context), self.frames.eval(context)
-        state = TemplateState(number, last, measured)
-        command, is_fallback = guarded_pose(
-            self._template, state, requested, frames, self._period, self._max_tracking_error
-        )
-        return np.append(command, float(is_fallback))
+    def _calc_command(self, context: Context, value: AbstractValue) -> None:
+        """Compute the command and the fallback flag, (7,)."""
+        last, measured = np.split(declare.initialized(self, context, self._last), 2)
+        number, command, is_fallback = self._state(context), last, True
+        if number is not None:
+            requested, frames = self._requested_pose_port.Eval(context), self.frames.eval(context)
+            command, is_fallback = self._law.constrain(TemplateState(number, last, measured), requested, frames)
+        value.set_value(np.append(command, float(is_fallback)))
 
     def _commanded_violation(self, context: Context) -> float:
-        return self._violation(context, self._command.Eval(context)[:6])
+        return self._law.violation(self._state(context), self._command.Eval(context)[:6], self.frames.eval(context))
 
     def _measured_violation(self, context: Context) -> float:
-        return self._violation(context, self._pose_port.Eval(context))
+        return self._law.violation(self._state(context), self._pose_port.Eval(context), self.frames.eval(context))
 
     def _start(self, context: Context, discrete_state: DiscreteValues) -> None:
         measured = declare.start_pose(self._pose_port.Eval(context))
         # The state port is not read, because the system that outputs the state is initialized at the same instant.
-        _, command = start_in(self._template, measured, self.frames.eval(context), self._period)
-        discrete_state.set_value(self._last, np.concatenate([command, measured]))
+        start = self._law.start_in(measured, self.frames.eval(context))
+        discrete_state.set_value(self._last, np.concatenate([start.last, measured]))
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         command, measured = self._command.Eval(context)[:6], self._pose_port.Eval(context)

@@ -135,9 +135,7 @@ class CartesianPositionController(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._positions_port = self.DeclareVectorInputPort("positions", num_joints)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
-        self._validity = CommandValidity(
-            self._desired_pose_port, self._command_time_port, period=period, timeout=timeout
-        )
+        self._validity = CommandValidity(self._command_time_port, period=period, timeout=timeout)
         self._command = declare.unset_state(self, num_joints)
         self._is_stuck = self.DeclareDiscreteState(1)
         self._has_timed_out = self.DeclareDiscreteState(1)
@@ -171,12 +169,13 @@ class CartesianPositionController(LeafSystem):
             discrete_state.set_value(flag, [0.0])
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
-        is_valid = self._validity.is_valid(context, context.get_time())
+        desired_pose = self._desired_pose_port.Eval(context)
+        is_valid = self._validity.is_valid(context, desired_pose, context.get_time())
         discrete_state.set_value(self._has_timed_out, [float(not is_valid)])
         if not is_valid:
             return
         plant, plant_context = self._plant, self._plant_context.Eval(context)
-        V = self._desired_velocity(self._X_TP(context), pose_to_transform(self._desired_pose_port.Eval(context)))
+        V = self._desired_velocity(self._X_TP(context), pose_to_transform(desired_pose))
         J = plant.CalcJacobianSpatialVelocity(
             plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
         )

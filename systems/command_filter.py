@@ -1,6 +1,7 @@
 """Filter of commanded positions that depends on the last command."""
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import is_finite
@@ -50,7 +51,7 @@ class CommandFilter(LeafSystem):
         self._last = declare.unset_state(self, size)  # state of the law, which begins with the last command
         self._measured = declare.sample(self, self._pose_port, period)
         sources = [self._desired_pose_port, self._last, self._measured]
-        self._command = declare.cache(self, "command", self._calc_command, sources)
+        self._command = declare.cache_entry(self, "command", self._calc_command, sources)
         declare.part_output(self, "safe_pose", self._command, lambda command: command[:outputs], outputs)
         declare.part_output(self, "intervention", self._command, lambda command: command[-1])
         declare.update_after_start(self, period, self._update, self._reset)
@@ -66,11 +67,11 @@ class CommandFilter(LeafSystem):
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         discrete_state.set_value(self._last, self._command.Eval(context)[:-1])
 
-    def _calc_command(self, context: Context) -> np.ndarray:
-        """Return the next state, which begins with the safe command, and the intervention flag."""
+    def _calc_command(self, context: Context, value: AbstractValue) -> None:
+        """Compute the next state, which begins with the safe command, and the intervention flag."""
         last = declare.initialized(self, context, self._last)
         measured = context.get_discrete_state().value(self._measured)
         state, is_changed = self._law.apply(last, self._desired_pose_port.Eval(context), measured)
         if not is_finite(state):  # NaN would remain in the state
             state, is_changed = last, True
-        return np.append(state, float(is_changed))
+        value.set_value(np.append(state, float(is_changed)))

@@ -3,7 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
-from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_number, is_finite
 from guiderail.models.common.errors import InputError, brief
@@ -93,9 +94,14 @@ class EnergyTank(LeafSystem):
         self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
         inputs = (self._desired_pose_port, self._pose_port, *self._requested_bound.sources)
         states = (self._last_reference, self._last_limits, self._last_pose, self._content)
-        self._admitted = declare.cache(self, "admitted", self._calc_admitted, [*inputs, *states])
-        declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, [self._admitted])
-        declare.output(self, "admitted_wrench", MAX_WRENCH_SIZE, self._admitted_wrench, [self._admitted])
+        self._admitted = declare.cache_entry(self, "admitted", self._calc_admitted, [*inputs, *states])
+        sources = declare.tickets(self, [self._admitted])
+        self.DeclareVectorOutputPort(
+            "reference_pose", POSE_SIZE, self._calc_reference_pose, prerequisites_of_calc=sources
+        )
+        self.DeclareVectorOutputPort(
+            "admitted_wrench", MAX_WRENCH_SIZE, self._calc_admitted_wrench, prerequisites_of_calc=sources
+        )
         self.DeclareStateOutputPort("energy", self._content)
         declare.update(self, period, self._update, self._reset)
 
@@ -110,7 +116,7 @@ class EnergyTank(LeafSystem):
         """Fill the tank to its capacity, for a new motion; `context` is the context of this system."""
         context.get_mutable_discrete_state().set_value(self._content, [self._capacity])
 
-    def _calc_admitted(self, context: Context) -> _Admitted:
+    def _calc_admitted(self, context: Context, value: AbstractValue) -> None:
         pose, desired = self._pose_port.Eval(context), self._desired_pose_port.Eval(context)
         states = context.get_discrete_state()
         reference, last_limits = states.value(self._last_reference), states.value(self._last_limits)
@@ -120,7 +126,8 @@ class EnergyTank(LeafSystem):
         requested = self._requested_bound.eval(context).in_pose_order.axes
         limits, K = np.minimum(last_limits, requested), self._stiffness
         if not is_finite(pose):  # NaN would fill the tank and remain in its state
-            return _Admitted(reference, limits, content)
+            value.set_value(_Admitted(reference, limits, content))
+            return
         if not is_finite(reference):  # the pose was not finite at initialization: the reference starts here
             reference = pose
         displacement = pose_difference(pose, last_pose) if is_finite(last_pose) else np.zeros(POSE_SIZE)
@@ -134,16 +141,16 @@ class EnergyTank(LeafSystem):
         else:
             next_reference = pose + error + share * (desired_error - error)
             admitted = limits + share * (requested - limits)
-        return _Admitted(next_reference, admitted, min(self._capacity, max(energy - stored, 0.0)))
+        value.set_value(_Admitted(next_reference, admitted, min(self._capacity, max(energy - stored, 0.0))))
 
-    def _reference_pose(self, context: Context) -> np.ndarray:
+    def _calc_reference_pose(self, context: Context, reference: BasicVector) -> None:
         desired = self._desired_pose_port.Eval(context)
-        return self._admitted.Eval(context).reference if is_finite(desired) else desired
+        reference.SetFromVector(self._admitted.Eval(context).reference if is_finite(desired) else desired)
 
-    def _admitted_wrench(self, context: Context) -> list[float]:
+    def _calc_admitted_wrench(self, context: Context, wrench: BasicVector) -> None:
         bound = self._requested_bound.eval(context)
         limits = self._admitted.Eval(context).limits.tolist()
-        return [*(limits[i] for i in POSE_ORDER), bound.force, bound.torque]
+        wrench.SetFromVector([*(limits[i] for i in POSE_ORDER), bound.force, bound.torque])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

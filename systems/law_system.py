@@ -3,9 +3,10 @@
 from typing import Any
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.laws.law import Command, Law, check_command, check_law, safe_command
+from guiderail.models.laws.law import Law, check_command, check_law, safe_command
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
@@ -62,7 +63,7 @@ class LawSystem(LeafSystem):
         )
         self._inputs = (self._held_action, pose, wrench)
         sources = [self._state, self._last, *self._inputs]
-        self._command = declare.cache(self, "command", self._calc_command, sources)
+        self._command = declare.cache_entry(self, "command", self._calc_command, sources)
         declare.part_output(self, "desired_pose", self._command, lambda command: command.pose, law.num_outputs)
         self.DeclareStateOutputPort("held_action", self._held_action)
         declare.part_output(self, "fallback", self._command, lambda command: command.fallback)
@@ -88,10 +89,10 @@ class LawSystem(LeafSystem):
         discrete_state.set_value(self._state, _flat(state))
         discrete_state.set_value(self._last, command.pose)
 
-    def _calc_command(self, context: Context) -> Command:
+    def _calc_command(self, context: Context, value: AbstractValue) -> None:
         last = declare.initialized(self, context, self._last)
         inputs = (context.get_discrete_state().value(index).copy() for index in self._inputs)
-        return safe_command(self._law.command(self._law_state(context), *inputs), last.copy())
+        value.set_value(safe_command(self._law.command(self._law_state(context), *inputs), last.copy()))
 
     def _law_state(self, context: Context) -> Any:
         return _like(self._example, context.get_discrete_state().value(self._state).copy())

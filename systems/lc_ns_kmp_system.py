@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.arrays import as_numbers
@@ -119,7 +120,9 @@ class LcNsKmpSystem(LeafSystem):
 
         optional = [port for port in (self._history_port, self._history_length_port) if port is not None]
         ports = [self._null_space_action_port, self._motion_time_port, self._reference_window_port, *optional]
-        self._prediction = declare.cache(self, "prediction", self._predict, [*ports, self._step, self._last_command])
+        self._prediction = declare.cache_entry(
+            self, "prediction", self._predict, [*ports, self._step, self._last_command]
+        )
         declare.part_output(self, "command", self._prediction, lambda prediction: prediction.output, outputs)
         declare.part_output(self, "constraint_violation", self._prediction, self._violation)
         declare.part_output(self, "fallback", self._prediction, lambda prediction: prediction.fallback)
@@ -174,7 +177,7 @@ class LcNsKmpSystem(LeafSystem):
             discrete_state.set_value(self._last_command, self._prediction.Eval(context).output)
         discrete_state.set_value(self._step, [step])
 
-    def _predict(self, context: Context) -> _Prediction:
+    def _predict(self, context: Context, value: AbstractValue) -> None:
         step = int(context.get_discrete_state().value(self._step).item())
         if self._motion_time_port.HasValue(context):
             time = self._motion_time_port.Eval(context)[0]
@@ -196,7 +199,7 @@ class LcNsKmpSystem(LeafSystem):
         window = self._reference_window_port.Eval(context) if self._reference_window_port.HasValue(context) else None
         output = predict(primitive, step, action, history, window)
         last_command = context.get_discrete_state().value(self._last_command)
-        return _Prediction(step, *output_or_nearest(primitive.constraints, step, output, last_command))
+        value.set_value(_Prediction(step, *output_or_nearest(primitive.constraints, step, output, last_command)))
 
     def _violation(self, prediction: _Prediction) -> float:
         violation = self.primitive.constraints.violation(prediction.output, prediction.step)

@@ -75,7 +75,7 @@ def make_law(
     if action == "none" or constrained:
         command_filter = MotionConstraintFilter(motion, period) if motion is not None else None
     elif motion is not None:
-        refuse_limits(config)
+        motion.refuse_limits()
     primitive = config.primitive(history=history, constrained=constrained)
     return PrimitiveLaw(
         primitive,
@@ -89,20 +89,6 @@ def make_law(
         progress=config.progress,
         checked=motion or config.constraints,
     )
-
-
-def refuse_limits(config: PrimitiveConfig) -> None:
-    """Raise an `InputError` if limits of the motion are given, for guidance that does not enforce them."""
-    motion = config.motion
-    if motion is None:
-        return
-    given = {
-        "max_speed": np.isfinite(np.asarray(motion.max_speed, float)).any(),
-        "max_acceleration": np.isfinite(np.asarray(motion.max_acceleration, float)).any(),
-        "joint_margin": bool(motion.state),
-    }
-    if names := " and ".join(name for name, is_given in given.items() if is_given):
-        raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
 class DemonstratedGuidance(Guidance):

@@ -104,6 +104,16 @@ class MotionConstraints:
         linear, shapes, state = self.violations(output)
         return _largest([linear, shapes, LEVER * state])
 
+    def refuse_limits(self) -> None:
+        """Raise an InputError if there are limits besides shapes, for guidance that does not enforce them."""
+        limits = {
+            "max_speed": np.isfinite(np.asarray(self.max_speed, dtype=float)).any(),
+            "max_acceleration": np.isfinite(np.asarray(self.max_acceleration, dtype=float)).any(),
+            "joint_margin": bool(self.state),
+        }
+        if names := " and ".join(name for name, is_given in limits.items() if is_given):
+            raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
+
 
 def _largest(violations: list[float]) -> float:
     """Return the largest violation, −inf if there is none, NaN if any is NaN (Python's `max` may ignore it)."""

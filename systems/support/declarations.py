@@ -210,16 +210,14 @@ def part_output(
     `part` maps the value of `source` to an array (size,). Without `size`, it returns a number, and the port is (1,).
     """
 
-    def value_of_state(context: Context) -> Any:
-        return part(context.get_discrete_state().value(source))
+    def calc(context: Context, vector: BasicVector) -> None:
+        whole = source.Eval(context) if isinstance(source, CacheEntry) else context.get_discrete_state().value(source)
+        if size is None:
+            vector.SetAtIndex(0, part(whole))
+        else:
+            vector.SetFromVector(part(whole))
 
-    def value_of_cache(context: Context) -> Any:
-        return part(source.Eval(context))
-
-    value = value_of_state if isinstance(source, DiscreteStateIndex) else value_of_cache
-    if size is None:
-        return scalar_output(system, name, value, [source])
-    return output(system, name, size, value, [source])
+    return system.DeclareVectorOutputPort(name, size or 1, calc, prerequisites_of_calc=tickets(system, [source]))
 
 
 def start_pose(pose: np.ndarray) -> np.ndarray:
@@ -353,13 +351,15 @@ def sample(system: LeafSystem, port: InputPort, period: float) -> DiscreteStateI
 
 def cache(system: LeafSystem, name: str, calc: Callable[[Context], object], sources: Iterable[Source]) -> CacheEntry:
     """Declare a cache entry; `calc` computes its value from `sources`, and `name` is its description."""
-    return system.DeclareCacheEntry(
-        description=name,
-        value_producer=ValueProducer(
-            allocate=Value[object], calc=lambda context, value: value.set_value(calc(context))
-        ),
-        prerequisites_of_calc=tickets(system, sources),
-    )
+    return cache_entry(system, name, lambda context, value: value.set_value(calc(context)), sources)
+
+
+def cache_entry(
+    system: LeafSystem, name: str, calc: Callable[[Context, AbstractValue], object], sources: Iterable[Source]
+) -> CacheEntry:
+    """Declare a cache entry, as `cache`; `calc` has Drake's signature and sets the value, in one frame of the stack."""
+    producer = ValueProducer(allocate=Value[object], calc=calc)
+    return system.DeclareCacheEntry(name, producer, prerequisites_of_calc=tickets(system, sources))
 
 
 def plant_context(

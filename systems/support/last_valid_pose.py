@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from guiderail.models.common.arrays import as_number, is_finite
@@ -21,7 +22,6 @@ class CommandValidity:
     not valid.
 
     Args:
-        desired_pose: Input port of the command, (O,).
         command_time: Input port of the time stamp of the command, (1,) [s]; if it is not connected, commands never time
             out.
         period: Period of the check [s], positive.
@@ -31,20 +31,20 @@ class CommandValidity:
         InputError: If an argument is out of range.
     """
 
-    def __init__(self, desired_pose: InputPort, command_time: InputPort, *, period: float, timeout: float):
+    def __init__(self, command_time: InputPort, *, period: float, timeout: float):
         declare.check_period(period)
         if not 0.0 < as_number(timeout, "timeout") < np.inf:
             raise InputError(f"the timeout of commands must be positive and finite, not {timeout} s")
-        self._desired_pose, self._command_time = desired_pose, command_time
+        self._command_time = command_time
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
 
-    def is_valid(self, context: Context, time: float) -> bool:
-        """Return True if the present command is valid; `context` is the context of the system.
+    def is_valid(self, context: Context, pose: np.ndarray, time: float) -> bool:
+        """Return True if the present command (O,) is valid; `context` is the context of the system.
 
         `time` [s] is the time of the last check. The command is stale if its age at this time exceeds the timeout. A
         time stamp in the future is compared with the time of the context, which is up to a period later.
         """
-        if not all(abs(number) <= _MAX_COORDINATE for number in self._desired_pose.Eval(context).tolist()):
+        if not all(abs(number) <= _MAX_COORDINATE for number in pose.tolist()):
             return False  # also for NaN
         if not self._command_time.HasValue(context):
             return True
@@ -92,12 +92,12 @@ class LastValidPose:
     ):
         self._system, self._desired_pose, self._blend_factor = system, desired_pose, blend_factor
         self._measured_pose = measured_pose
-        self._validity = CommandValidity(desired_pose, command_time, period=period, timeout=timeout)
+        self._validity = CommandValidity(command_time, period=period, timeout=timeout)
         self._last_pose = declare.unset_state(system, desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
         declare.update(system, period, self._update, self._reset)
         # Outputs and event share one check of a command.
-        self._valid = declare.cache(system, "valid", self._check, [desired_pose, command_time, self._check_time])
+        self._valid = declare.cache_entry(system, "valid", self._check, [desired_pose, command_time, self._check_time])
         self.sources: list[declare.Source] = [desired_pose, self._valid, self._last_pose]
 
     def eval(self, context: Context) -> np.ndarray:
@@ -112,8 +112,9 @@ class LastValidPose:
             system, "command_timed_out", lambda context: float(not self._valid.Eval(context)), [self._valid]
         )
 
-    def _check(self, context: Context) -> bool:
-        return self._validity.is_valid(context, context.get_discrete_state().value(self._check_time).item())
+    def _check(self, context: Context, value: AbstractValue) -> None:
+        pose, time = self._desired_pose.Eval(context), context.get_discrete_state().value(self._check_time).item()
+        value.set_value(self._validity.is_valid(context, pose, time))
 
     def _is_controlled(self, context: Context) -> bool:
         port = self._blend_factor

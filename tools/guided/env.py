@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.laws.law import Law
+from guiderail.models.laws.law import Command, Law
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
@@ -26,7 +26,6 @@ from guiderail.tools.contract import check_reset_result, check_step_result, chec
 from guiderail.tools.guided.guide import (
     PRIMITIVE_GUIDANCE,
     Guide,
-    GuideCommand,
     GuideSettings,
     LawGuide,
     PrimitiveGuide,
@@ -169,7 +168,8 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
         self.action_repeat, self._observe = int(action_repeat), observed
         self._pose, self._to_action = pose, to_action
-        self._command: GuideCommand | None = None
+        self._command: Command | None = None
+        self._extra: Any = None
         self._is_pending = False  # True if an error prevented the step with `_command`
         self._observation: Any = None
         self._has_begun = False
@@ -255,9 +255,10 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         """
         command = self._command
         if command is None or not self._is_pending:
-            self._command = command = self.guide.finish(output)
+            command, self._extra = self.guide.finish(output)
+            self._command = command
         self._is_pending = True
-        action = self._to_action(self.env, self._observation, command.output, command.extra)
+        action = self._to_action(self.env, self._observation, command.pose, self._extra)
         self._check_action(action)
         if self._is_checked:
             check_values(self.env, self._observation, action)
@@ -271,7 +272,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         self._has_begun = True
         self._reward += reward
         self._violation = float(np.maximum(self._violation, command.violation))  # NaN if one is NaN
-        self._fallbacks += command.is_fallback
+        self._fallbacks += command.fallback
         self._successes |= {name: self._info[name] for name in SUCCESSES if np.any(self._info.get(name, False))}
         self._count += 1
         self._num_steps += 1
@@ -287,7 +288,7 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
             "constraint_violation": self._violation,
             "fallback": self._fallbacks,
             "phase": self.guide.phase,
-            "command": self._command.output.copy(),
+            "command": self._command.pose.copy(),
             "segment": self.guide.segment_name,
         }
         return self._extended(), self._reward, bool(self._terminated), bool(self._truncated), info

@@ -37,19 +37,6 @@ GUIDANCE = (*PRIMITIVE_GUIDANCE, "template")
 _COMMAND_SCALE = np.array([0.2, 0.2, 0.2, np.pi, np.pi, np.pi])
 
 
-@dataclass(frozen=True)
-class GuideCommand:
-    """Command of one control step."""
-
-    output: np.ndarray  # command (O,) in the world
-    # Constraint violation: negative inside a segment's constraints, 0 inside a template's, −inf without constraints.
-    violation: float
-    # True if no prediction within the constraints was found, so that the last command is repeated or projected onto the
-    # constraints, if only braking was feasible, or if a segment that began too fast exceeded its largest acceleration.
-    is_fallback: bool
-    extra: Any  # discrete output of the segment, for `to_action`
-
-
 class Guide(ABC):
     """Source of the commands of an episode, one per control step.
 
@@ -73,7 +60,7 @@ class Guide(ABC):
 
     def _begin(self, law: Law, pose: np.ndarray) -> None:
         """Begin with the commands of a law at a measured pose (O,), or after the last outputs (n, O)."""
-        self._law, self._state, self._last = law, law.start(pose), None
+        self._law, self._state, self._last, self._start = law, law.start(pose), None, pose
 
     def request(self, env: Any, observation: Any, action: np.ndarray, pose: np.ndarray) -> Request | None:
         """Begin a control step; return the request for the prediction that `finish` needs, or None.
@@ -91,8 +78,12 @@ class Guide(ABC):
         self._now = self._state if last is None else self._law.next(self._state, last, pose)
         return self._law.request(self._now, self._action) if isinstance(self._law, PrimitiveLaw) else None
 
-    def _finish(self, output: np.ndarray | None) -> Command:
-        """Return the law's command for the predicted output, and complete the control step."""
+    def finish(self, output: np.ndarray | None) -> tuple[Command, Any]:
+        """Complete the control step; return the command in the world and the discrete output for `to_action`.
+
+        `output` is the predicted output (O,), or None without a request or a solution.
+        """
+        extra = self._extra()  # may call a function of the user, whose error must not skip a command
         law, last = self._law, self._last
         if isinstance(law, PrimitiveLaw):
             command = law.finish(self._now, self._action, self._pose, output)
@@ -100,26 +91,26 @@ class Guide(ABC):
             returned = law.command(self._now, self._action, self._pose, np.zeros(0))
             command = safe_command(returned, self._pose if last is None else last.pose)
         self._state, self._last = self._now, command
-        return command
+        return command, extra
 
-    @abstractmethod
-    def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step with the predicted output (O,), or None without a request or a solution."""
+    def _extra(self) -> Any:
+        """Return the discrete output of the control step, for `to_action`."""
+        return None
 
     @property
-    @abstractmethod
     def is_finished(self) -> bool:
-        """True after the last step of the last segment."""
+        """True after the last step of the motion."""
+        return False
 
     @property
-    @abstractmethod
     def phase(self) -> float:
         """Phase of the motion, from 0 to 1."""
+        return 0.0
 
     @property
-    @abstractmethod
     def segment_name(self) -> str:
         """Name of the current segment."""
+        return "0"
 
     @abstractmethod
     def scaled_command(self) -> np.ndarray:
@@ -161,7 +152,7 @@ class _FittedSegment:
             constraints = LinearConstraints.box(constraints.lower[phase], constraints.upper[phase])
         if isinstance(constraints, MotionConstraints):
             if "residual" in self.guidance:
-                _refuse_limits(constraints)
+                constraints.refuse_limits()
             constraints = constraints.linear
         if not isinstance(constraints, LinearConstraints):
             raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(constraints)}")
@@ -319,18 +310,17 @@ class PrimitiveGuide(Guide):
             self._is_ended = True
         return super().request(env, observation, action, pose)
 
-    def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step."""
-        extra = self._extra(self._step)  # may call a function of the user, whose error must not skip a command
-        command = self._finish(output)
+    def finish(self, output: np.ndarray | None) -> tuple[Command, Any]:
+        """Complete the control step; see `Guide.finish`."""
+        command, extra = super().finish(output)
         self._last_output = command.pose
         world = self.frame.to_world(command.pose, self._orientation)
         self._recent = [*self._recent, world][-max(self.settings.history, 2) :]
         self._step += 1
-        return GuideCommand(world, command.violation, command.fallback, extra)
+        return command._replace(pose=world), extra
 
-    def _extra(self, step: int) -> Any:
-        fitted = self.segments[self._index]
+    def _extra(self) -> Any:
+        fitted, step = self.segments[self._index], self._step
         if callable(fitted.segment.extra):
             last = fitted.num_steps - 1
             return fitted.segment.extra(min(step / last, 1.0), step > last)
@@ -360,13 +350,6 @@ class PrimitiveGuide(Guide):
         """Return the last command (O,) in the segment's frame, scaled to ±1 over the range of its demonstrations."""
         fitted = self.segments[self._index]
         return (self._last_output - fitted.center) / fitted.half_range
-
-
-def _refuse_limits(motion: MotionConstraints) -> None:
-    """Raise an InputError if the motion has limits, which residual guidance does not enforce."""
-    limits = [name for name in ("max_speed", "max_acceleration") if np.isfinite(getattr(motion, name)).any()]
-    if names := " and ".join([*limits, *(["state"] if motion.state else [])]):
-        raise InputError(f"only kgrl, skgrl and kmp enforce {names}: choose one of them, or leave {names} out")
 
 
 def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[int]:
@@ -454,16 +437,8 @@ class TemplateGuide(Guide):
         self._begin(TemplateLaw(self.template, self._frames, self._period), pose)
         self._now = self._state
 
-    def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step."""
-        extra = self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
-        command = self._finish(output)
-        return GuideCommand(command.pose, command.violation, command.fallback, extra)
-
-    @property
-    def is_finished(self) -> bool:
-        """Never true: a template has no last step."""
-        return False
+    def _extra(self) -> Any:
+        return self._extra_of(self.segment_name) if callable(self._extra_of) else self._extra_of
 
     @property
     def phase(self) -> float:
@@ -500,21 +475,10 @@ class LawGuide(Guide):
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
         """Begin an episode at a measured pose (O,)."""
         self._begin(self._law, pose)
-        self._command = pose
-
-    def finish(self, output: np.ndarray | None) -> GuideCommand:
-        """Complete the control step."""
-        command = self._finish(output)
-        self._command = command.pose
-        return GuideCommand(command.pose, command.violation, command.fallback, None)
-
-    is_finished = False
-    phase = 0.0
-    segment_name = "0"
 
     def scaled_command(self) -> np.ndarray:
         """Return the last command (O,), which has no range to be scaled to."""
-        return self._command
+        return self._start if self._last is None else self._last.pose
 
 
 def predict_request(request: Request | None) -> np.ndarray | None:

@@ -14,6 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform, transform_to_pose
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
+from guiderail.models.laws import Law
 from guiderail.models.primitives import UnsolvableError
 from guiderail.models.primitives.demonstrations import compute_bounds
 from guiderail.models.primitives.poses import pose_rotation
@@ -101,7 +102,9 @@ def test_commands_satisfy_the_constraints_for_any_actions(guidance, seed):
 def test_violation_of_an_action_is_nan_if_a_command_has_nan(number, monkeypatch):
     env = make_guided()
     finish, violations = env.guide.finish, iter([np.nan if k == number else -1.0 for k in range(3)])
-    monkeypatch.setattr(env.guide, "finish", lambda output: replace(finish(output), violation=next(violations)))
+    monkeypatch.setattr(
+        env.guide, "finish", lambda output: (finish(output)[0]._replace(violation=next(violations)), 0.0)
+    )
     env.reset(seed=0)
     assert np.isnan(env.step(np.zeros(3))[-1]["constraint_violation"])
 
@@ -456,7 +459,7 @@ def test_scaled_command_of_a_template_is_in_its_frame():
     X_FE = pose_to_transform(np.array([-0.1, -0.2, 0.15, 0.3, 0.1, -0.2]))
     template_guide.reset(None, None, transform_to_pose(X_WF @ X_FE))
     template_guide.request(None, None, np.zeros(3), np.zeros(6))
-    command = pose_to_transform(template_guide.finish(None).output)
+    command = pose_to_transform(template_guide.finish(None)[0].pose)
     scaled = template_guide.scaled_command()
     np.testing.assert_allclose(
         scaled * [0.2, 0.2, 0.2, np.pi, np.pi, np.pi], transform_to_pose(X_WF.inverse() @ command)
@@ -723,8 +726,8 @@ def test_error_skips_no_command_of_a_template():
                     template_guide.finish(None)
                 is_failing = False
                 template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
-            command = template_guide.finish(None)
-        outputs.append(command.output)
+            command, _ = template_guide.finish(None)
+        outputs.append(command.pose)
     np.testing.assert_array_equal(*outputs)
 
 
@@ -755,7 +758,7 @@ def test_template_frames_may_be_drake_transforms():
         template_guide = guide.TemplateGuide(load_template("pouring"), lambda env, o, X=X_WF: {"mug_tip": X}, 0.02)
         template_guide.reset(None, None, np.array([0.6, -0.3, 0.45, 0.1, 0.0, 0.0]))
         template_guide.request(None, None, np.array([0.0, 1.0, -1.0]), np.zeros(6))
-        output = template_guide.finish(None).output
+        output = template_guide.finish(None)[0].pose
         scaled.append(np.concatenate([output, template_guide.scaled_command()]))
     np.testing.assert_array_equal(*scaled)
 
@@ -803,3 +806,28 @@ def test_invalid_result_of_to_action_is_refused(action, is_vector):
 def test_nan_from_the_environment_is_refused(make, is_vector):
     with pytest.raises(InputError, match=r"the environment returned .*(nan|NaN)"):
         reset_and_step(make, is_vector, to_action)
+
+
+class Integrator(Law):
+    """Law that adds each action to its last command; without a finite action, its command is invalid."""
+
+    def command(self, last, action, pose, wrench):
+        return last + 0.01 * action if action[0] >= 0.0 else np.full(3, np.nan)
+
+
+def test_law_with_memory_guides_any_environment():
+    def make():
+        return GuidedEnv(PointEnv(), guidance=Integrator(3), pose=pose, to_action=to_action, action_repeat=2)
+
+    env = make()
+    for _ in range(2):
+        env.reset(seed=0)
+        expected = env.unwrapped.p.copy()
+        for action in ([1.0, 0.5, 0.0], [-1.0, 0.0, 0.0], [0.5, 0.0, 1.0]):
+            *_, info = env.step(np.array(action))
+            expected += 0.02 * np.array(action) if action[0] > 0.0 else 0.0
+            np.testing.assert_allclose(info["command"], expected, atol=1e-12)
+            assert info["fallback"] == (0 if action[0] > 0.0 else 2)
+    assert env.action_space.shape == (3,)
+    with pytest.raises(InputError, match="a guide does not use demonstrations"):
+        make_guided(Integrator(3), constraints=None, frame=None)
