@@ -109,7 +109,7 @@ def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
 
     def list_names() -> list[str]:
         tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
-        return sorted({name for task in tasks.usable() for name in getattr(tasks.get(task), attribute)})
+        return sorted({name for task in tasks.usable() for name in tasks.declared(task, attribute)})
 
     return list_names
 
