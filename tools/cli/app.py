@@ -67,7 +67,10 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
         titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
         typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key == "baselines" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
+        if key == "baselines" or any(
+            key.startswith(f"{name}_") and key.removeprefix(f"{name}_") in result
+            for name in (*columns, "demonstration")
+        ):
             continue
         values = [value, *(result[f"{name}_{key}"] for name in columns if f"{name}_{key}" in result)]
         cells = ["none" if is_rounding(key, entry) else cell(entry) for entry in values]
@@ -106,7 +109,7 @@ def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
 
     def list_names() -> list[str]:
         tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
-        return sorted({name for task in tasks.usable() for name in getattr(tasks.get(task), attribute)})
+        return sorted({name for task in tasks.usable() for name in tasks.declared(task, attribute)})
 
     return list_names
 
@@ -290,7 +293,22 @@ TrustImports = Annotated[
         callback=_trust,
     ),
 ]
-Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
+Guidance = Annotated[
+    str | None, option("Guidance: {guidance}.  [default: that of the task or run]", choices="guidance")
+]
+Difficulty = Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")]
+ActionRepeat = Annotated[int | None, option("Control steps per action.")]
+Reward = Annotated[
+    str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
+]
+Observation = Annotated[
+    str | None,
+    option("Observation: {observations}; guiderail list TASK lists those of a task.", choices="observations"),
+]
+FixtureOffset = Annotated[
+    str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
+]
+Station = Annotated[str | None, option("Station: {stations}.  [default: that of the task or run]", choices="stations")]
 Algorithm = Annotated[str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")]
 Preset = Annotated[str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")]
 Settings = Annotated[

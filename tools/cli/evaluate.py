@@ -28,7 +28,13 @@ def evaluate(
         option("Policy to evaluate in a TASK: scripted, {baselines}."),
     ] = None,
     env: cli.Env = None,
-    station: Annotated[str | None, option("Station: {stations}.  [default: the run's]", choices="stations")] = None,
+    guidance: cli.Guidance = None,
+    difficulty: cli.Difficulty = None,
+    action_repeat: cli.ActionRepeat = None,
+    reward: cli.Reward = None,
+    observation: cli.Observation = None,
+    fixture_offset: cli.FixtureOffset = None,
+    station: cli.Station = None,
     baselines: cli.Baselines = None,
     resample_offsets: cli.Offsets = False,
     save: Annotated[
@@ -49,7 +55,16 @@ def evaluate(
     them out. The row evaluation_scope states the conditions that the result is valid for. The last line is the result
     in one sentence.
     """
-    environment = cli.parse_environment(env, station=station)
+    environment = cli.parse_environment(
+        env,
+        guidance=guidance,
+        difficulty=difficulty,
+        action_repeat=action_repeat,
+        reward=reward,
+        observation=observation,
+        fixture_offset=fixture_offset,
+        station=station,
+    )
     name = cli.find_task(subject, imports)[0]  # before the next line, because an import may register the station
     cli.refuse_robot(environment.get("station"), "guiderail deploy RUN --episodes N")
     if policy is not None and (task is not None or Path(name).is_dir()):

@@ -31,19 +31,12 @@ def train(
         ),
     ] = None,
     env: cli.Env = None,
-    difficulty: Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")] = None,
-    action_repeat: Annotated[int | None, option("Control steps per action.")] = None,
-    reward: Annotated[
-        str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
-    ] = None,
-    observation: Annotated[
-        str | None,
-        option("Observation: {observations}; guiderail list TASK lists those of a task.", choices="observations"),
-    ] = None,
-    fixture_offset: Annotated[
-        str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
-    ] = None,
-    station: Annotated[str | None, option("Station: {stations}.  [default: the task's]", choices="stations")] = None,
+    difficulty: cli.Difficulty = None,
+    action_repeat: cli.ActionRepeat = None,
+    reward: cli.Reward = None,
+    observation: cli.Observation = None,
+    fixture_offset: cli.FixtureOffset = None,
+    station: cli.Station = None,
     step_log: cli.WriteStepLog = None,
     log: Annotated[
         list[str] | None,

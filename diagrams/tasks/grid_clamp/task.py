@@ -243,6 +243,7 @@ class GridClamp(InsertionTask):
     options: GridClampOptions
     workpiece, fixture = "clamp", "table"
     rewards = REWARDS
+    observations = ("state",)
     simulated_rewards = ("aligned",)
     snaps_in = True
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}

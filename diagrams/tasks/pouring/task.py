@@ -196,6 +196,7 @@ class Pouring(Task):
     has_held_out_distribution = True
     options: PouringOptions
     rewards = ("shaped", "sparse", "hand_shaped")
+    observations = ("state",)
     defaults = {"guidance": "sct", "action_repeat": 10}
     difficulties = {STANDARD: {}, "hard": HARD, "thesis": THESIS}
     learner = {"algorithm": "sac", "preset": "pouring"}
