@@ -278,7 +278,7 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
         observation[TIME], observation[Z] = time - 1.0, height / (0.5 * file.motion.travel) - 1.0
         return search(observation)
 
-    on_rim, inserted = file.motion.rim, 0.5 * file.motion.rim
+    on_rim, inserted = file.motion.first_contact, 0.5 * file.motion.first_contact
     step = 0.1 * file.search.speed
     for time, height, x in (
         (0.0, on_rim, 0.0),
@@ -296,7 +296,7 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
 def test_scripted_search_follows_the_plug_below_the_rim(folder):
     file = read_task_file(folder)
     times, poses = file.motion.plan_search()
-    inserted, duration = 0.5 * file.motion.rim, times[-1]
+    inserted, duration = 0.5 * file.motion.first_contact, times[-1]
     grid = np.arange(0.0, duration, 0.01)
     time = grid[
         np.argmax(np.interp(grid, times, poses[:, 2]) < inserted)
@@ -343,7 +343,7 @@ def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
     file = read_task_file(turning)
     search, observation = ScriptedSearch(file, lambda: 20.0), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
-    observation[Z] = file.motion.rim / (0.5 * file.motion.travel) - 1.0
+    observation[Z] = file.motion.first_contact / (0.5 * file.motion.travel) - 1.0
     turns = []
     for time in np.arange(0.0, 20.0, 0.1):
         observation[TIME] = 0.1 * time - 1.0
@@ -364,7 +364,7 @@ def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
     assert file.measured["inserted"]
     assert file.measured["penetration_mm"] < 0.5 * file.measured["clearance_mm"]
     with pytest.raises(ValueError, match="the advance must be more than"):
-        MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
+        MotionNumbers.model_validate({"travel": 0.02, "first_contact": 0.004, "turn": -180.0, "advance": 0.004})
 
 
 def test_search_turn_is_refused_when_out_of_range(tmp_path):

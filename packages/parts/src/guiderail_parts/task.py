@@ -132,7 +132,7 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
-IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
+IN_SOCKET = 0.5 * MM  # depth below the first contact from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
 MIN_PUSH = 1.5 * MM  # smallest displacement of the command by a push on a seated plug, in addition to the play [m]
 FOLLOWING = 3.0  # rate of change of the action per 2 mm of distance between the command and a plug in the socket [1/s]
@@ -218,7 +218,7 @@ class ScriptedSearch:
         self._time = time
         lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
         height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
-        on_rim, search = height > self._file.motion.rim - IN_SOCKET, self._file.search
+        on_rim, search = height > self._file.motion.first_contact - IN_SOCKET, self._file.search
         change = np.zeros(self._size)
         if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
             change[:2] = search.lever_sign * search.speed * lever / max(length, MM)
