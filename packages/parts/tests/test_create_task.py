@@ -1,6 +1,7 @@
 """Command `create-task`: task folders of two meshes, their checks, difficulties, search and fitted bounds."""
 
 import json
+import shutil
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -20,6 +21,8 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
 from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import start_or_resume
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts import trial
 from guiderail_parts.contact import rank
@@ -592,3 +595,26 @@ def test_plug_without_a_stop_is_not_pushed_past_the_target(tmp_path):
     created = yaml.safe_load((tmp_path / "task" / "task.yaml").read_text())
     assert created["motion"]["push"] == 0.0
     assert int(created["measured"]["demonstrations_seated"][0]) >= 3
+
+
+def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    text = (other / "task.yaml").read_text()
+    (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
+    options = "--set", "net_arch=8", "--set", "gradient_steps=1", "--no-pictures", "--out", tmp_path / "run"
+    call("train", folder, other, "--episodes", 2, *options, "--json")
+    run = RunFolder(tmp_path / "run")
+    assert sorted(run.episodes()["environment"]) == ["parts/other", "parts/peg"]
+    assert len({member.task_content for member in run.config().members}) == 2
+    capsys.readouterr()
+    call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "scripted", "--json")
+    result = json.loads(capsys.readouterr().out)
+    assert {*result["environments"]} == {"parts/other", "parts/peg"}
+    assert {*result["environments"]["parts/peg"]} == {"policy", "demonstration", "scripted"}
+    call("evaluate", tmp_path / "run", "--task", folder, "--task", other, "--episodes", 1, "--baselines", "none")
+    assert "parts/other" in capsys.readouterr().out
+    changed = (other / "task.yaml").read_text().replace("force_limit: 35.0", "force_limit: 30.0", 1)
+    (other / "task.yaml").write_text(changed)
+    with pytest.raises(InputError, match="the files of parts/other are not those that the run"):
+        start_or_resume(None, tmp_path / "run", environment={}, episodes=3, resume=True)

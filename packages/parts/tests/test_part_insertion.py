@@ -119,7 +119,10 @@ def test_invalid_task_is_refused_with_the_name_of_its_file(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"motion": {"travel": 0.02, "first_contact": 0.01, "push": -0.004}}, "motion.push must be at least 0, not -0.004"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -0.004}},
+            "motion.push must be at least 0, not -0.004",
+        ),
         ({"motion": {"first_contact": 0.01}}, "motion.travel is missing"),
         ({"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}}, "motion has no option 'pusch'.*push"),
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "modulus": -1.0}])}, r"plug\.pieces\[0\]\.modulus must be"),
@@ -355,11 +358,20 @@ FREE = [None] * 6  # no bound on any output
         ({"tolerance": {"height": 0.01}}, r"height must be less than motion\.first_contact, 0\.01 m"),
         ({"tolerance": {"steps": 52}}, r"tolerance\.steps in .* is 52, longer than an episode"),
         ({"tolerance": {"lateral": 1.0}}, r"tolerance\.lateral must be at most 0\.01, not 1\.0"),
-        ({"motion": {"travel": 0.02, "first_contact": 0.0005}}, r"motion\.first_contact must be more than 0\.0005, not 0\.0005"),
-        ({"motion": {"travel": 0.02, "first_contact": 0.01, "push": -1.0}}, r"motion\.push must be at least 0, not -1\.0"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.0005}},
+            r"motion\.first_contact must be more than 0\.0005, not 0\.0005",
+        ),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -1.0}},
+            r"push must be at least 0, not -1\.0",
+        ),
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "friction": 3}])}, r"plug\.pieces\[0\]\.friction must be"),
         ({"motion": {"travel": 0.02}}, r"motion\.first_contact is missing: give it"),
-        ({"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}}, r"motion has no option 'pusch': did you mean push"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}},
+            r"motion has no option 'pusch': did you mean push",
+        ),
         ({"recommended": {"learner": {"algoritm": "tqc"}}}, "there is no key 'algoritm': did you mean algorithm"),
         ({"recommended": {"learner": {"algorithm": 3}}}, r"recommended\.learner cannot .*: algorithm must be a name"),
         ({"measured": {"clearance_mm": "abc"}}, "clearance_mm must be a number from 0 to 500, or null"),

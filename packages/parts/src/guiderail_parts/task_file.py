@@ -111,7 +111,9 @@ class MotionNumbers(Options):
     def _check_first_contact(cls, value: float, info: ValidationInfo) -> float:
         travel = info.data.get("travel", np.inf)
         if travel - value - TOUCH < 0.0:
-            raise ValueError(f"first_contact must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m")
+            raise ValueError(
+                f"first_contact must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m"
+            )
         return value
 
     @field_validator("advance")
@@ -127,9 +129,7 @@ class MotionNumbers(Options):
 
     def plan_search(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times (N,) [s] and poses (N, 6) of a demonstration with a search on the rim."""
-        return plan_search(
-            self.travel, self.first_contact, self.turn * DEGREE, self.push, self.press, self.advance
-        )
+        return plan_search(self.travel, self.first_contact, self.turn * DEGREE, self.push, self.press, self.advance)
 
 
 class Tolerance(Options):

@@ -62,8 +62,8 @@ def plan_search(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and poses (N, 6) [m, rad] of a demonstration without its random deviations.
 
-    The plug moves to the first contact, stays there for the time `SEARCH`, is inserted, and turns. `demonstrator_motions` adds
-    the lateral motion of the search.
+    The plug moves to the first contact, stays there for the time `SEARCH`, is inserted, and turns.
+    `demonstrator_motions` adds the lateral motion of the search.
 
     Args:
         travel: Height of the start [m].
@@ -96,10 +96,10 @@ def demonstrator_motions(
 
     The random deviations are wide while the command is above the height `press_from` [m], and become narrow over the
     distance `NARROWING` below. If the script does not go down so far, they become narrow after the search, within the
-    time `NARROWING_TIME`. Each search ends at a different socket position (`socket_offsets`). The variance of the demonstrations
-    is then the variance of the socket positions, so that actions can follow a displaced socket down to the target. With
-    a `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its socket's turn from the
-    start.
+    time `NARROWING_TIME`. Each search ends at a different socket position (`socket_offsets`). The variance of the
+    demonstrations is then the variance of the socket positions, so that actions can follow a displaced socket down to
+    the target. With a `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its
+    socket's turn from the start.
     """
     rng = np.random.default_rng(seed)
     script_times, script_poses = script
