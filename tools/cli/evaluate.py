@@ -36,6 +36,10 @@ def evaluate(
         Path | None, option("Write the successful episodes as demonstrations, .npz or .csv; the file must not exist.")
     ] = None,
     signal: Annotated[str, option("Poses that --save writes: commanded or measured.")] = "commanded",
+    steps: Annotated[
+        Path | None,
+        option("Write every control step of the policy into this folder, as train does; it must not exist."),
+    ] = None,
     imports: cli.TaskImports = None,
     trust_imports: cli.TrustImports = False,
     as_json: cli.Json = False,
@@ -68,6 +72,7 @@ def evaluate(
         resample_offsets=resample_offsets,
         save=save,
         signal=signal,
+        steps=steps,
         processes=processes,
         trust_policy=trust_policy,
     )

@@ -40,6 +40,7 @@ from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.policies import as_policy, is_compatible
 from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.evaluation.subject import (
     Subject,
     counts_collisions,
@@ -70,6 +71,7 @@ def evaluate_policies(
     collect: Collect | None = None,
     processes: int | None = 1,
     first_number: int | None = None,
+    steps: Path | None = None,
 ) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
     """Evaluate several policies on the same held-out episodes of one environment.
 
@@ -89,6 +91,7 @@ def evaluate_policies(
         processes: Largest number of processes; None for the number of cores.
         first_number: Number for `start_episode` in the first episode, incremented in each further one; by default
             `seed` - `HELD_OUT_SEED`. Numbers are taken modulo 2^32.
+        steps: Folder for the step log of the policy named `POLICY`; None for no step log.
 
     Yields:
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
@@ -114,7 +117,9 @@ def evaluate_policies(
             with naming_failures(title):
                 return act(observation)
 
-        callbacks = (act,) if isinstance(act, Callback) else ()
+        callbacks: tuple[Callback, ...] = (act,) if isinstance(act, Callback) else ()
+        if steps is not None and name == POLICY:
+            callbacks = (*callbacks, StepLog(env, steps, act))
         row = rollout(env, named_act, *callbacks, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 
@@ -243,6 +248,7 @@ def evaluate(
     resample_offsets: bool = False,
     save: Path | str | None = None,
     signal: str = "commanded",
+    steps: Path | str | None = None,
     describe_differences: Callable[[RunConfig], Sequence[str]] | None = None,
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
@@ -276,6 +282,8 @@ def evaluate(
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the
             commanded poses, because their difference from the measured poses causes the contact force.
+        steps: Folder to write the policy's step log into, with one row for each control step, in a set one folder for
+            each environment; it must not exist. The log of an ensemble has the column `disagreement`.
         describe_differences: Function from a configuration to sentences on how it differs from a reference.
 
     Returns:
@@ -298,11 +306,13 @@ def evaluate(
     """
     save = None if save is None else Path(save)
     _check_saved(save, signal)
+    if steps is not None:
+        check_new(Path(steps), "folder")
     episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
     options: dict[str, Any] = {
         "episodes": episodes, "seed": seed, "processes": processes, "baselines": baselines, "save": save,
         "signal": signal, "environment": environment or {}, "resample_offsets": resample_offsets,
-        "describe_differences": describe_differences,
+        "describe_differences": describe_differences, "steps": None if steps is None else Path(steps),
     }  # fmt: skip
     envs: list[Any] = list(env) if isinstance(env, list | tuple) else [env]
     if not envs:
@@ -330,7 +340,11 @@ def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: Mapp
     """Evaluate a policy in each of several environments, and combine the results; see `evaluate`."""
     if options["save"] is not None:
         raise InputError("demonstrations are saved from one environment: evaluate in one, or leave save out")
-    results = {name: _evaluate_subject(*place, label=name, **options) for name, place in places.items()}
+    steps = options["steps"]
+    results = {
+        name: _evaluate_subject(*place, **options | {"label": name, "steps": None if steps is None else steps / name})
+        for name, place in places.items()
+    }
     first = next(iter(results.values()))
     policies = [policy for policy in first.rows if all(policy in result.rows for result in results.values())]
     rows = {
@@ -369,6 +383,7 @@ def _evaluate_subject(
     save: Path | None,
     signal: str,
     describe_differences: Callable[[RunConfig], Sequence[str]] | None,
+    steps: Path | None,
     label: str = "",
 ) -> Evaluation:
     """Evaluate a policy in one environment; see `evaluate`.
@@ -402,8 +417,10 @@ def _evaluate_subject(
     evaluation_env = cast(gymnasium.Env, env) if config is None else make_environment(config.task, environment)
     with nullcontext() if is_given else closing(evaluation_env):
         if config is not None:
-            if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
-                raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
+            if (save is not None or steps is not None) and not hasattr(evaluation_env.unwrapped, "trace"):
+                raise InputError(
+                    f"{config.task} is no task of this package and records no poses: leave --save and --steps out"
+                )
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {
@@ -430,7 +447,7 @@ def _evaluate_subject(
         evaluated, motions, started = dict(stored), [], time.monotonic()
         collect = None if save is None else partial(_successful_motion, signal)
         for name, rows, data in evaluate_policies(
-            evaluation_env, policies, labels=labels, processes=processes, collect=collect, **kwargs
+            evaluation_env, policies, labels=labels, processes=processes, collect=collect, steps=steps, **kwargs
         ):
             evaluated[name] = rows
             if name == POLICY:
