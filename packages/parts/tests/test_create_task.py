@@ -618,3 +618,64 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     (other / "task.yaml").write_text(changed)
     with pytest.raises(InputError, match="the files of parts/other are not those that the run"):
         start_or_resume(None, tmp_path / "run", environment={}, episodes=3, resume=True)
+
+
+def shared(folder, **options):
+    options = {"difficulty": "hard", "guidance": "kgrl", "observation": "shared"} | options
+    return make_env(str(folder), **options)
+
+
+def test_shared_observation_is_relative_to_the_measured_contact(folder):
+    file, env = read_task_file(folder), shared(folder)
+    assert file.motion.first_contact == pytest.approx(15e-3, abs=0.1e-3)  # depth of the drawn hole
+    observations, poses, commands = [], [], []
+    observation, _ = env.reset(seed=0)
+    for _ in range(40):
+        observation, _, terminated, truncated, _ = env.step(np.zeros(2))
+        observations.append(observation)
+        poses.append(env.trace.measured[-1].copy())
+        commands.append(env.trace.commanded[-1].copy())
+        if terminated or truncated:
+            break
+    observations, poses, commands = map(np.array, (observations, poses, commands))
+    height = np.clip((poses[:, 2] - file.motion.first_contact) / 5e-3, -3, 3)
+    np.testing.assert_allclose(observations[:, 17], height, atol=1e-5)
+    lag = np.clip((poses - commands)[:, 2] / 5e-3, -3, 3)
+    assert np.corrcoef(observations[:, 20], lag)[0, 1] > 0.99
+    per_action = env.action_repeat * env.diagram.control_period
+    for delay, entries in ((0.2, slice(21, 24)), (0.6, slice(24, 27))):
+        back = round(delay / per_action)
+        moved = np.clip((poses[back:] - poses[:-back])[:, :3] / 1e-3, -3, 3)
+        np.testing.assert_allclose(observations[back:, entries], moved, atol=1e-4)
+    env.close()
+
+
+def test_search_acts_equally_on_the_shared_observation(folder):
+    actions = {}
+    for name in ("center_of_pressure", "shared"):
+        env = shared(folder, observation=name)
+        search = env.diagram.task.scripted_policies("hard")["scripted_search"]
+        observation, _ = env.reset(seed=1)
+        actions[name] = []
+        while True:
+            actions[name].append(search(observation))
+            observation, _, terminated, truncated, _ = env.step(actions[name][-1])
+            if terminated or truncated:
+                break
+        env.close()
+    first, second = (np.array(each) for each in actions.values())
+    assert len(first) == len(second)
+    np.testing.assert_allclose(first, second, atol=1e-3)
+
+
+def test_shared_observation_has_the_symmetries_of_the_part(folder):
+    env, other = shared(folder), shared(folder, observation="center_of_pressure")
+    symmetry, known = env.diagram.near_symmetry, other.diagram.near_symmetry
+    np.testing.assert_array_equal(symmetry.observations[:, :17, :17], known.observations)
+    across = symmetry.observations[0][15:17, 15:17]  # commanded x and y
+    np.testing.assert_array_equal(symmetry.observations[0][18:20, 18:20], across)
+    for start in (21, 24):
+        np.testing.assert_array_equal(symmetry.observations[0][start : start + 2, start : start + 2], across)
+    assert (symmetry.observations[:, [17, 20, 23, 26], [17, 20, 23, 26]] == 1).all()
+    env.close()
+    other.close()
