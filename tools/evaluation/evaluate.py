@@ -342,7 +342,7 @@ def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: Mapp
         raise InputError("demonstrations are saved from one environment: evaluate in one, or leave save out")
     steps = options["steps"]
     results = {
-        name: _evaluate_subject(*place, **options | {"label": name, "steps": None if steps is None else steps / name})
+        name: _evaluate_subject(*place, **{**options, "label": name, "steps": None if steps is None else steps / name})
         for name, place in places.items()
     }
     first = next(iter(results.values()))

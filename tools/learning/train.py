@@ -265,7 +265,8 @@ def start_or_resume(
 
     demonstrator = _make_demonstrator(config) if num_demonstrated else None
     supervise = open_supervision() if config.human_in_the_loop and open_supervision is not None else None
-    with EpisodeProgress(config.episodes, name=config.task) as progress:
+    label = f"{len(config.members)} environments" if config.members else config.task
+    with EpisodeProgress(config.episodes, name=label) as progress:
         run_training(
             folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervise=supervise,
             log=formats, sb3_callbacks=sb3_callbacks,
