@@ -16,7 +16,7 @@ from guiderail.models.common.errors import InputError
 GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
-    "parts": ("create-task",),
+    "parts": ("create-task", "create-tasks"),
     "studies": ("study", "robustness", "certify", "report"),
     "data": ("dataset",),
     "lerobot": (),

@@ -329,6 +329,14 @@ Baselines = Annotated[
     ),
 ]
 PolicyTask = Annotated[str | None, option("Task that a POLICY without a run acts in: {tasks}.", choices="tasks")]
+PolicyTasks = Annotated[
+    list[str] | None,
+    option(
+        "Task that a POLICY without a run acts in: {tasks}; repeatable, to evaluate it in each.",
+        "--task",
+        choices="tasks",
+    ),
+]
 TrustPolicy = Annotated[
     bool,
     option(
