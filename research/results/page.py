@@ -121,10 +121,10 @@ def _page_head(title: str) -> str:
 
 
 _HEAD = """\
-Written by `python -m research.results` from the tables in `research/results`. [Results](../results.md) explains how they were
-measured. Success: mean (smallest–largest seed) of 100 held-out episodes of each seed, with a 95 % interval for a
-single run. IQM: interquartile mean of the seeds. Episodes to convergence: median (smallest–largest). Stopped: episodes
-that a force above the limit, an obstacle or a spill ended.
+Written by `python -m research.results` from the tables in `research/results`. [Results](../results.md) explains how
+they were measured. Success: mean (smallest–largest seed) of 100 held-out episodes of each seed, with a 95 % interval
+for a single run. IQM: interquartile mean of the seeds. Episodes to convergence: median (smallest–largest). Stopped:
+episodes that a force above the limit, an obstacle or a spill ended.
 """
 _STUDIES = """\
 ## Studies
