@@ -15,7 +15,7 @@ from guiderail.tools.imports import import_modules
 from guiderail.tools.tables import cell, read_table, table_text
 from guiderail_studies.declaration import LEARNED, Study, load_study
 from guiderail_studies.job import Job
-from guiderail_studies.study import BREAKING_SUCCESS, curve, draw_sweeps, each, format_breaking_point
+from guiderail_studies.study import BREAKING_SUCCESS, curve, draw_sweeps, format_breaking_point
 from research.figures import FIGURES
 from research.results.methods import (
     COLUMNS,
@@ -237,25 +237,18 @@ def _differences(studies: Mapping[str, Study], stored: Mapping[str, pd.DataFrame
 
 
 def _sweep_lines(study: Study, rows: pd.DataFrame) -> list[str]:
-    """Return the picture of a study's sweeps, and a table of every method's success for each sweep."""
+    """Return the picture of a study's sweeps, and a table of the values at which each method falls below the limit."""
     if not study.sweeps:
         return []
-    lines = ["", f"![Success of every method over difficulty]({study.name}.svg)"]
-    for sweep in study.sweeps:
-        columns = [sweep.quantity, *(f"{value:g}" for value in sweep.at), f"below {BREAKING_SUCCESS:.0%} at"]
-        lines += ["", f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
-        for method in study.methods:
-            of_method = rows[rows["method"] == method]
-            values, points = curve(sweep, rows, method)
-            if not values:
-                continue
-            rates = (
-                each(of_method[of_method["eval_set"] == sweep.eval_set(value).name], "success_rate", "{:.0%}")
-                for value in sweep.at
-            )
-            cells = [method, *rates, format_breaking_point(values, points)]
-            lines.append(f"| {' | '.join(text or '–' for text in cells)} |")
-    return lines
+    ranges = [f"{sweep.quantity}, {min(sweep.at):g} to {max(sweep.at):g}" for sweep in study.sweeps]
+    curves = {method: [curve(sweep, rows, method) for sweep in study.sweeps] for method in study.methods}
+    cells = [
+        (method, *(format_breaking_point(*points) if points[0] else "–" for points in of_method))
+        for method, of_method in curves.items()
+        if any(values for values, _ in of_method)
+    ]
+    picture = f"![Success of every method over difficulty]({study.name}.svg)"
+    return ["", picture, "", markdown_table([f"success below {BREAKING_SUCCESS:.0%} at", *ranges], cells)]
 
 
 def _without_sweeps(study: Study, rows: pd.DataFrame) -> pd.DataFrame:

@@ -83,8 +83,9 @@ def test_sweep_has_a_picture_and_breaking_points(tmp_path):
     page, picture = write_results([tmp_path / "study"], tmp_path / "results"), tmp_path / "results/pouring_sweep.svg"
     content = picture.read_bytes()
     assert "](pouring_sweep.svg)" in page
-    assert "| rl_sct | 100% | 100% | 95% | 85% | 60% | 0% | 30 |" in page
-    assert "| uniform_random | 5% | 5% | 5% | 5% | 5% | 5% | from the easiest on |" in page
+    assert "| success below 90% at | mug offset [mm], 0 to 60 |" in page
+    assert "| rl_sct | 30 |" in page
+    assert "| uniform_random | from the easiest on |" in page
     assert "| uniform_random | – |" not in page
     assert ", not run: " in page
     write_results([], tmp_path / "results")
