@@ -30,6 +30,8 @@ HARD_TASKS_COLUMNS = (
     "training episodes per seed (seeds)",
 )  # fmt: skip
 README_COLUMNS = 5  # the README has only these first columns of the hard tasks
+MISSING = "–"
+ALWAYS = (0, 2)  # columns that every table of methods has: name and success
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
@@ -49,7 +51,7 @@ def task_table(task: str, tables: Path) -> str:
         rows = [(row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))]
         if rows:
             studies = ", ".join(f"`{study}`" for study in dict.fromkeys(row.study for row, _ in rows))
-            table = markdown_table(COLUMNS, [(row.name, *method_cells(seeds)) for row, seeds in rows])
+            table = methods_table([(row.name, seeds) for row, seeds in rows])
             remarks = "".join(f"\n{line}\n" for write in REMARKS for line in write(section, tables))
             parts.append(f"### {section.title}\n\nStudies: {studies}.\n\n{table}\n{remarks}")
     return "\n".join(parts)
@@ -116,9 +118,24 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def method_cells(seeds: pd.DataFrame) -> tuple[str, ...]:
+def methods_table(methods: Sequence[tuple[str, pd.DataFrame]]) -> str:
+    """Return the Markdown table of methods; a sentence replaces a column in which all methods are equal."""
+    rows = [(name, *_method_cells(seeds)) for name, seeds in methods]
+    trained = [is_trained(seeds) for _, seeds in methods]
+    values = [
+        {cell for cell, learns in zip(column, trained, strict=True) if learns or cell != MISSING}
+        for column in zip(*rows, strict=True)
+    ]
+    kept = [index for index, column in enumerate(values) if len(column) > 1 or index in ALWAYS]
+    equal = {COLUMNS[i]: "".join(column - {MISSING}) for i, column in enumerate(values) if i not in kept}
+    sentences = "; ".join(f"{name}: {value}" for name, value in equal.items() if value)
+    caption = f"The same for all methods: {sentences}.\n\n" if sentences else ""
+    return caption + markdown_table([COLUMNS[i] for i in kept], [[row[i] for i in kept] for row in rows])
+
+
+def _method_cells(seeds: pd.DataFrame) -> tuple[str, ...]:
     """Return the cells of a method's row after its name: of all its seeds together, not of each."""
-    if not _is_trained(seeds):
+    if not is_trained(seeds):
         parts = [_safety(seeds, "")]
         success = _interval(seeds.iloc[0].to_dict()) if len(seeds) == 1 else success_cell(seeds)
         return "–", success, "–", "–", "–", largest_violation(parts), _forces(parts)
@@ -132,7 +149,7 @@ def method_cells(seeds: pd.DataFrame) -> tuple[str, ...]:
 
 def effort_cell(seeds: pd.DataFrame) -> str:
     """Return the number of training episodes and the seeds; a dash for a policy that does not learn."""
-    if not _is_trained(seeds):
+    if not is_trained(seeds):
         return "–"
     episodes = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"]))
     return f"{episodes} ({span(seeds['seed'])})"
@@ -156,7 +173,7 @@ def _converged(episodes: pd.Series) -> str:
 
 def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
     """Return the held-out success of the seeds; None for too few seeds or a method that does not learn."""
-    if not (len(seeds) >= MIN_SEEDS and _is_trained(seeds) and _is_evaluated(seeds)):
+    if not (len(seeds) >= MIN_SEEDS and is_trained(seeds) and _is_evaluated(seeds)):
         return None
     return [seeds["success_rate"].to_numpy(dtype=float)]
 
@@ -214,7 +231,7 @@ def knowledge(section: Section, tables: Path) -> list[str]:
     failed = []
     for row in section.rows:
         seeds = last_rows(tables, row)
-        if _is_trained(seeds):
+        if is_trained(seeds):
             methods.setdefault(number := demonstrated_episodes(row), []).append(row.name)
             if number and not seeds.get("training_ended_in_success", pd.Series([1])).any():
                 failed.append(row.name)
@@ -273,7 +290,8 @@ def offsets(section: Section, tables: Path) -> list[str]:
     return [f"One hidden offset for each seed, in training and in held-out episodes: {'; '.join(fixed)}.{others}"]
 
 
-def _is_trained(seeds: pd.DataFrame) -> bool:
+def is_trained(seeds: pd.DataFrame) -> bool:
+    """Return True for a method that learns, and False for a baseline policy."""
     return "training_episodes" in seeds and bool(seeds["training_episodes"].notna().any())
 
 
@@ -321,7 +339,7 @@ def mean_and_range(seeds: pd.DataFrame, column: str = "success_rate") -> str:
     """Return the mean success [%] with the range over several seeds; a single seed is marked."""
     rates = 100 * seeds[column].astype(float)
     interval = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
-    is_single = len(seeds) == 1 and _is_trained(seeds)
+    is_single = len(seeds) == 1 and is_trained(seeds)
     is_exact = 99.5 <= rates.mean() < 100 or 0 < rates.mean() < 10  # 99.6 is not written as 100
     mean = f"{rates.mean():.1f}".removesuffix(".0") if is_exact else f"{rates.mean():.0f}"
     return f"{mean}{' (one seed)' if is_single else interval}"

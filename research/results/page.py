@@ -20,10 +20,11 @@ from research.figures import FIGURES
 from research.results.methods import (
     COLUMNS,
     effort_cell,
+    is_trained,
     largest_violation,
     markdown_table,
     mean_and_range,
-    method_cells,
+    methods_table,
     span,
     success_cell,
     task_table,
@@ -38,12 +39,14 @@ PAGES = {
     "Pouring": "pouring",
     "NarrowPassage": "narrow_passage",
 }
-# Tables of programs that are not studies, with the columns that the page shows; None: all of them.
-PROGRAMS: dict[str, tuple[str, ...] | None] = {
-    "certificates": None,
+# Tables of programs that are not studies, with the columns that the page shows.
+PROGRAMS = {
+    "certificates": (
+        "skill", "checker", "steps", "constrained_steps", "attack_steps", "bound_violations", "budget_spent",
+        "worst_ratio_free", "worst_ratio_active", "worst_active",
+    ),
     "smoothness": (
-        "method", "jerk_commanded_linear", "jerk_commanded_angular", "times_below_kgrl_linear",
-        "times_below_kgrl_angular", "success_rate", "peak_force",
+        "method", "jerk_commanded_linear", "jerk_commanded_angular", "success_rate", "peak_force",
     ),
 }  # fmt: skip
 
@@ -153,11 +156,7 @@ def _words(key: str) -> str:
 def _program_section(name: str, rows: pd.DataFrame) -> str:
     """Return the section of a program; a method with a row for each place has one row, with a slash between places."""
     lines = [f"## {name}", "", f"`python -m research.{name} --out studies` writes `{name}.csv`."]
-    cells = (
-        rows.astype(object).map(cell)
-        if (columns := PROGRAMS[name]) is None
-        else rows.astype(object).map(cell)[list(columns)]
-    )
+    cells = rows[list(PROGRAMS[name])].astype(object).map(cell)
     if "place" in rows:
         lines[-1] += f" Numbers: {' / '.join(rows['place'].unique())}."
         cells = cells.groupby("method", sort=False, as_index=False).agg(" / ".join)
@@ -198,7 +197,9 @@ def _method_lines(rows: pd.DataFrame, is_shown: Callable[[str, str], object]) ->
     if not methods:
         return []
     if len(names) == 1:
-        return ["", markdown_table(COLUMNS, [(name, *method_cells(*sets.values())) for name, sets in methods.items()])]
+        parts = [(method, *sets.values()) for method, sets in methods.items()]
+        trained = [(method, part) for method, part in parts if is_trained(part)]
+        return ["", methods_table(trained)] if trained else []
     numbers = {int(number) for sets in methods.values() for part in sets.values() for number in part["episodes"]}
     format_success = mean_and_range if len(numbers) == 1 else success_cell
     lines = [] if numbers == {100} or len(numbers) > 1 else ["", f"Success in {numbers.pop()} episodes of each seed."]
