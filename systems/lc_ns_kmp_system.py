@@ -8,8 +8,8 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
-from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.laws.law import checked_vector
 from guiderail.models.laws.primitive import output_or_nearest, predict
 from guiderail.models.primitives import LcNsKmp
 from guiderail.systems.constraint_violation import ConstraintViolation
@@ -101,8 +101,8 @@ class LcNsKmpSystem(LeafSystem):
                 raise InputError(f"the primitive with a history of {other.history} outputs has other constraints")
         self.primitive, self._period = primitive, period
         self._by_history_length = {
-            other.history: (other, _checked_gain(own_gain, outputs))
-            for other, own_gain in [(primitive, gain), *shorter]
+            other.history: (other, checked_vector(own_gain, "the gain", outputs))
+            for other, own_gain in [(primitive, np.ones(outputs) if gain is None else gain), *shorter]
         }
 
         self._null_space_action_port = self.DeclareVectorInputPort("null_space_action", outputs)
@@ -210,10 +210,3 @@ def _checked_pairs(shorter: object) -> tuple[tuple[LcNsKmp, np.ndarray], ...]:
     if isinstance(shorter, Sequence) and all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in shorter):
         return tuple((primitive, gain) for primitive, gain in shorter)
     raise InputError(f"shorter is a list of primitives with their gains, not {brief(shorter)}")
-
-
-def _checked_gain(gain: np.ndarray | None, outputs: int) -> np.ndarray:
-    checked = np.ones(outputs) if gain is None else as_numbers(gain, "the gain")
-    if checked.shape != (outputs,) or not np.isfinite(checked).all():
-        raise InputError(f"the gain must be {outputs} finite numbers, not {gain}")
-    return checked
