@@ -105,11 +105,11 @@ def _names(place: str) -> Callable[[], list[str]]:
 
 
 def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
-    """Return a function that lists what all registered tasks declare under `attribute`."""
+    """Return a function that lists what the options of all tasks of guiderail declare under `attribute`."""
 
     def list_names() -> list[str]:
-        tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
-        return sorted({name for task in tasks.usable() for name in tasks.declared(task, attribute)})
+        models = [point.load() for _, point in find_plugins("task_options")]
+        return sorted({name for model in models for name in getattr(model, attribute)})
 
     return list_names
 
@@ -299,11 +299,18 @@ Guidance = Annotated[
 Difficulty = Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")]
 ActionRepeat = Annotated[int | None, option("Control steps per action.")]
 Reward = Annotated[
-    str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
+    str | None,
+    option(
+        "Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task.",
+        choices="rewards",
+    ),
 ]
 Observation = Annotated[
     str | None,
-    option("Observation: {observations}; guiderail list TASK lists those of a task.", choices="observations"),
+    option(
+        "Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task.",
+        choices="observations",
+    ),
 ]
 FixtureOffset = Annotated[
     str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")

@@ -437,7 +437,7 @@ def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch)
     (information / "METADATA").write_text("Metadata-Version: 2.1\nName: lab_broken\nVersion: 1.0\n")
     (information / "entry_points.txt").write_text("[guiderail]\nkernel:lab = lab_broken:Kernel\n")
     monkeypatch.syspath_prepend(str(tmp_path))
-    for name in ("_plugins", "_points", "broken"):
+    for name in ("_plugins", "_packaged", "_points", "broken"):
         monkeypatch.delitem(vars(KERNELS), name, raising=False)
     sentence = "the kernel 'lab' of the installed package lab_broken cannot be used: importing lab_broken:Kernel failed"
     try:
@@ -454,7 +454,7 @@ def test_list_names_and_omits_broken_entry_points(capsys, tmp_path, monkeypatch)
         assert code == 2
         assert sentence in err
     finally:
-        for name in ("_plugins", "_points", "broken"):
+        for name in ("_plugins", "_packaged", "_points", "broken"):
             vars(KERNELS).pop(name, None)
 
 
