@@ -11,14 +11,14 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, BasicVector_, Context
 
-from guiderail.models.common.arrays import as_number, as_numbers
+from guiderail.models.common.arrays import as_number, as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.differentiable_impedance import differentiable_torques
+from guiderail.systems.support.differentiable_impedance import differentiable_torques, values_of
 from guiderail.systems.support.drake_multibody import (
     check_plant,
     effort_limits,
@@ -362,8 +362,11 @@ class CartesianImpedanceController(ConvertibleSystem):
                 posture_stiffness=posture_stiffness,
                 posture_damping=posture_damping,
             )
-            plant_context, pose = plant.CreateDefaultContext(), desired_pose.Eval(context)
-            plant.SetPositionsAndVelocities(plant_context, state.Eval(context))
+            plant_context, pose, present = plant.CreateDefaultContext(), desired_pose.Eval(context), state.Eval(context)
+            for name, values in (("state", present), ("desired pose", pose)):
+                if not is_finite(values_of(values)):  # Drake would abort the process
+                    raise InputError(f"derivatives of an impedance need a finite {name}, not {values_of(values)}")
+            plant.SetPositionsAndVelocities(plant_context, present)
             X_TPd = RigidTransform_[scalar](RollPitchYaw_[scalar](pose[5], pose[4], pose[3]), pose[:3])
             tool_center, target = (plant.get_frame(frame.index()) for frame in (self._tool_center, self._target))
             X_TP = tool_center.CalcPose(plant_context, target)

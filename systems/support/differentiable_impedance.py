@@ -17,7 +17,7 @@ from guiderail.models.control.cartesian_impedance import (
 )
 
 
-def values(numbers: np.ndarray) -> np.ndarray:
+def values_of(numbers: np.ndarray) -> np.ndarray:
     """Return the values of an array of floats and `AutoDiffXd`, as floats."""
     flat = [number.value() if isinstance(number, AutoDiffXd) else number for number in np.ravel(numbers)]
     return np.array(flat, dtype=float).reshape(np.shape(numbers))
@@ -29,7 +29,7 @@ def differentiable_damping(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ra
     G = D / (2 ζ) is the solution of G Λ⁻¹ G = K, so that its derivative is that of a Lyapunov equation:
     dG Λ⁻¹ G + G Λ⁻¹ dG = dK − G dΛ⁻¹ G.
     """
-    K_values, inverse_values = values(K), values(Lambda_inverse)
+    K_values, inverse_values = values_of(K), values_of(Lambda_inverse)
     G = damping_matrix(K_values, inverse_values, 0.5)
     dK, d_inverse = _derivatives(K), _derivatives(Lambda_inverse)
     size = max(dK.shape[-1], d_inverse.shape[-1])
@@ -76,17 +76,17 @@ def differentiable_torques(
         K = R @ K @ R.T
     M_inverse_JT = inv(M) @ J.T
     Lambda_inverse = regularized(J @ M_inverse_JT)
-    if not has_regular_inertia(values(Lambda_inverse)):
+    if not has_regular_inertia(values_of(Lambda_inverse)):
         raise InputError("an impedance has derivatives in regular postures only: move the arm away from this posture")
     damping = differentiable_damping(K, Lambda_inverse, damping_ratio) @ (J @ v)
     unlimited_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
     along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
     wrench = np.minimum(np.maximum(along_axes, -wrench_limits), wrench_limits)
-    is_limited = bool((np.abs(values(along_axes)) >= values(wrench_limits)).any())
+    is_limited = bool((np.abs(values_of(along_axes)) >= values_of(wrench_limits)).any())
     if R_axes is not None:
         wrench = R @ wrench
     leak = inv(Lambda_inverse) @ (M_inverse_JT.T @ posture_torque)
     unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
     torque = np.minimum(np.maximum(unlimited_torque, -torque_limits), torque_limits)
-    is_clipped = bool((np.abs(values(unlimited_torque)) > torque_limits).any())
+    is_clipped = bool((np.abs(values_of(unlimited_torque)) > torque_limits).any())
     return JointTorques(torque, wrench, is_limited or is_clipped)

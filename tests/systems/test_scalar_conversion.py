@@ -11,6 +11,8 @@ from pydrake.systems.framework import DiagramBuilder
 from guiderail import systems
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import WrenchBound
+from oracles.prerequisites import changed_outputs
+from oracles.systems import check_stale_outputs
 
 STEP = 1e-6
 LIMITS = np.array([60.0, 60.0, 60.0, 6.0, 6.0, 6.0])
@@ -142,6 +144,19 @@ def test_closed_loop_has_derivatives_of_its_motion():
     np.testing.assert_allclose(ExtractGradient(found), expected, rtol=1e-6, atol=1e-4)
 
 
+def test_no_output_of_a_converted_system_is_stale():
+    reward = systems.RewardSystem([systems.RewardTerm("cost", {"pose": 2}, lambda pose: -pose @ pose)])
+    residual, controller = systems.Residual([2.0, 3.0]), make_controller()
+    for system in (residual, reward):
+        for converted in (system.ToAutoDiffXd(), system.ToSymbolic()):
+            check_stale_outputs(converted)
+    # Without a value at max_wrench, which an impedance with derivatives refuses.
+    inputs = ("desired_pose", "estimated_state")
+    stale, effects = changed_outputs(controller.ToAutoDiffXd(), trials=5, inputs=inputs)
+    assert not stale
+    assert {(source, "generalized_force") for source in ("desired_pose", "estimated_state")} <= effects
+
+
 def test_context_of_a_converted_diagram_takes_state_and_parameters():
     controller = make_controller()
     context = controller.CreateDefaultContext()
@@ -192,6 +207,14 @@ def test_conversion_of_an_impedance_that_is_not_smooth_is_refused():
     system.GetInputPort("max_wrench").FixValue(context, np.ones(8))
     with pytest.raises(InputError, match="do not connect max_wrench"):
         system.GetOutputPort("generalized_force").Eval(context)
+
+
+@pytest.mark.parametrize(("index", "name"), [(3, "state"), (14, "desired pose")])
+def test_number_that_is_not_finite_is_refused(index, name):
+    numbers = state_and_pose(0)
+    numbers[index] = np.nan
+    with pytest.raises(InputError, match=f"derivatives of an impedance need a finite {name}"):
+        evaluate(make_controller().ToAutoDiffXd(), InitializeAutoDiff(numbers).ravel(), ("generalized_force",))
 
 
 def test_other_systems_are_refused_by_name():
