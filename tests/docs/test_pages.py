@@ -91,6 +91,12 @@ def test_reference_has_every_command_task_and_template_kind(reference):
     assert all(f"| `{metric.name}` |" in reference["metrics"] for metric in (*COLUMNS, *statistics_of().values()))
 
 
+def test_signatures_of_the_reference_have_types(reference):
+    signatures = re.findall(r"^    (\**\w+)(: [^=]+)?(?: ?=.*)?,$", reference["names"], re.MULTILINE)
+    assert len(signatures) > 100
+    assert not [name for name, hint in signatures if not hint]
+
+
 def test_template_fields_have_descriptions(reference):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| .* \|$", reference["templates"], re.MULTILINE)
     assert len(rows) > 50
