@@ -46,6 +46,13 @@ def test_every_page_is_in_the_contents():
         assert name == "index" or f"\n{name}\n" in contents, name
 
 
+def test_index_for_language_models_lists_every_page():
+    listed = LINK.findall((DOCS / "llms.txt").read_text(encoding="utf-8"))
+    assert all((DOCS / page).is_file() for page in listed)
+    pages = {page.relative_to(DOCS).as_posix() for page in WRITTEN} - {"index.md"}
+    assert pages <= {*listed}, pages - {*listed}
+
+
 def test_every_reference_page_is_in_a_toctree(generator):
     text = "".join(page.read_text(encoding="utf-8") for page in WRITTEN)
     assert all(f"reference/{name}\n" in text for name in generator.PAGES)
