@@ -29,7 +29,9 @@ HARD_TASKS_COLUMNS = (
     "stopped in training, guided / residual RL [%]", "episodes with violations, guided / residual RL [%]",
     "training episodes per seed (seeds)",
 )  # fmt: skip
-README_COLUMNS = 5  # the README has only these first columns of the hard tasks
+# Columns and rows of the README's table of hard tasks: without an effect, and with an effect of template and primitive.
+README_COLUMNS = 5
+README_TITLES = ("Connector, hard", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
 MISSING = "–"
 ALWAYS = (0, 2)  # columns that every table of methods has: name and success
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
@@ -57,15 +59,17 @@ def task_table(task: str, tables: Path) -> str:
     return "\n".join(parts)
 
 
-def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS)) -> str:
+def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS), titles: Sequence[str] | None = None) -> str:
     """Return the Markdown table of the hard tasks: a row for each of their sections.
 
     Args:
         tables: Folder of the studies' tables.
         columns: Number of columns.
+        titles: Titles of the sections; by default all.
     """
     rows = []
     sections = [section for of_task in SECTIONS.values() for section in of_task if ", hard" in section.title]
+    sections = [section for section in sections if titles is None or section.title in titles]
     for section in sections:
         named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
         guided = [named[name] for name in section.guided if name in named]

@@ -9,6 +9,7 @@ from guiderail.tools.learning.config import LEARNERS
 from guiderail_studies.declaration import load_study
 from research.results.methods import (
     README_COLUMNS,
+    README_TITLES,
     hard_tasks_table,
     knowledge,
     offsets,
@@ -33,7 +34,7 @@ def rows(text):
 @pytest.mark.parametrize(
     ("page", "table"),
     [
-        ("README.md", hard_tasks_table(TABLES, README_COLUMNS)),
+        ("README.md", hard_tasks_table(TABLES, README_COLUMNS, README_TITLES)),
         ("docs/results.md", hard_tasks_table(TABLES)),
     ],
 )
