@@ -37,6 +37,7 @@ nb_render_markdown_format = "myst"
 html_theme = "furo"
 html_title = "guiderail"
 html_static_path = ["_static"]
+html_extra_path = ["llms.txt"]
 html_css_files = ["guiderail.css"]
 html_math_renderer = "mathml"
 html_copy_source = html_show_sourcelink = html_show_copyright = html_show_sphinx = False

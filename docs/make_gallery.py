@@ -1,12 +1,16 @@
-"""Render the animations of the gallery: `python docs/make_gallery.py [NAME …]`.
+"""Render the picture of the README and the animations of the gallery: `python docs/make_gallery.py [NAME …]`.
 
-Each animation has episodes side by side with a common clock and their endings in the last frame. The endings are also
-in `pictures/gallery.json`, from which a test detects stale animations.
+Each animation has episodes side by side with a common clock and their endings in the last frame. The commands of the
+README make its picture, `readme`. The endings of all episodes are in `pictures/gallery.json`, from which a test detects
+stale pictures and captions.
 """
 
 from __future__ import annotations
 
 import json
+import re
+import shlex
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -43,6 +47,7 @@ GREEN, DARK, RED = (0, 150, 60), (28, 31, 36), (179, 38, 30)
 SCALE = 2  # supersampling of lines, which Pillow does not smooth
 LEARNING_EPISODES = 32  # as in `make demo`
 SCRATCH = tempfile.TemporaryDirectory()
+ROOT = HERE.parent
 ENDINGS = {"collision": "stopped by the force limit"}  # in pictures; other terminations are shown by name
 ON_ARM = {"guidance": "kgrl", "difficulty": "hard", "station": "arm"}
 
@@ -196,13 +201,50 @@ def _learned(env: Any) -> PolicyFn:
         return Policy.load(out)
 
 
+def readme_commands() -> dict[str, list[str]]:
+    """Return the arguments of the first `guiderail` commands of the README, by the name of the command."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8").replace("\\\n", " ")
+    commands: dict[str, list[str]] = {}
+    for line in re.findall(r"^guiderail (.*)$", text, re.MULTILINE):
+        words = shlex.split(line, comments=True)
+        commands.setdefault(words[0], words)
+    return commands
+
+
+def readme_run() -> Path:
+    """Return the run of the README's training command; if it is missing, train it, which takes some minutes."""
+    train = readme_commands()["train"]
+    run = ROOT / train[train.index("--out") + 1]
+    if not (run / "policy.safetensors").is_file():
+        _run_guiderail(train)
+    return run
+
+
+def make_readme_picture(folder: Path) -> dict[str, str]:
+    """Make the picture of the README by its own commands; return the ending of the episode by its title."""
+    readme_run()
+    visualize = readme_commands()["visualize"]
+    _run_guiderail([*visualize, "--overwrite"])
+    picture = ROOT / visualize[visualize.index("--image") + 1]
+    (folder / "readme.jpg").write_bytes(picture.read_bytes())
+    picture.unlink()
+    panel = Panel(
+        "iiwa after 60 episodes, a connector off by a hidden offset",
+        "BncConnector",
+        ON_ARM | {"reward": "aligned"},
+        _learned_on_arm,
+    )
+    run_panel(panel, SQUARE, 1000)
+    return {panel.title: panel.ending()}
+
+
+def _run_guiderail(arguments: Sequence[str]) -> None:
+    subprocess.run([sys.executable, "-m", "guiderail", *arguments], cwd=ROOT, check=True)
+
+
 def _learned_on_arm(env: Any) -> PolicyFn:
-    """Train KGRL on the hard connector with an arm, which takes some minutes."""
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "run"
-        arguments = ON_ARM | {"reward": "aligned"}
-        start_or_resume("BncConnector", out, environment=arguments, settings={"symmetry": "near"}, episodes=60, seed=0)
-        return Policy.load(out)
+    """Return the policy of the README's training command."""
+    return Policy.load(readme_run())
 
 
 def _right(env: Any) -> PolicyFn:
@@ -354,18 +396,26 @@ def draw(name: str) -> tuple[list[Panel], list[Image.Image], float]:
 
 
 def make(folder: Path, names: Sequence[str]) -> None:
-    """Render the animations of these names."""
+    """Make the pictures of these names."""
     folder.mkdir(exist_ok=True)
     log = folder / "gallery.json"
     log_content = json.loads(log.read_text(encoding="utf-8")) if log.is_file() else {}
     for name in names:
-        panels, frames, seconds = draw(name)
-        save(folder / f"{name}.webp", frames, seconds)
-        log_content[name] = {panel.title: panel.ending() for panel in panels}
+        if name == "readme":
+            log_content[name] = make_readme_picture(folder)
+        else:
+            log_content[name] = make_animation(folder, name)
         log.write_text(
             json.dumps(dict(sorted(log_content.items())), indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
         )
 
 
+def make_animation(folder: Path, name: str) -> dict[str, str]:
+    """Render an animation; return the ending of each panel by its title."""
+    panels, frames, seconds = draw(name)
+    save(folder / f"{name}.webp", frames, seconds)
+    return {panel.title: panel.ending() for panel in panels}
+
+
 if __name__ == "__main__":
-    make(FOLDER, sys.argv[1:] or list(PICTURES))
+    make(FOLDER, sys.argv[1:] or ["readme", *PICTURES])

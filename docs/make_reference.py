@@ -110,24 +110,33 @@ def paragraphs(text: str) -> str:
 
 
 def signature(name: str, thing: Callable[..., Any]) -> str:
-    """Return the signature as a code block."""
+    """Return the signature with its types as a code block."""
     try:
-        parameters = inspect.signature(thing).parameters.values()
+        described = inspect.signature(thing)
     except (ValueError, TypeError):
         return ""
     words = []
-    for one in parameters:
+    for one in described.parameters.values():
         if one.name == "self":
             continue
         stars = {one.VAR_POSITIONAL: "*", one.VAR_KEYWORD: "**"}.get(one.kind, "")
-        default = "" if one.default is one.empty else f"={_default(one.default)}"
+        hint = "" if one.annotation is one.empty else f": {_annotation(one.annotation)}"
+        default = "" if one.default is one.empty else f"{' = ' if hint else '='}{_default(one.default)}"
         if one.kind is one.KEYWORD_ONLY and "*" not in words and not any(word.startswith("*") for word in words):
             words.append("*")
-        words.append(f"{stars}{one.name}{default}")
-    line = f"{name}({', '.join(words)})"
+        words.append(f"{stars}{one.name}{hint}{default}")
+    result = described.return_annotation
+    arrow = "" if result in (described.empty, None, "None") else f" -> {_annotation(result)}"
+    line = f"{name}({', '.join(words)}){arrow}"
     if len(line) > 88:
-        line = f"{name}(\n" + "".join(f"    {word},\n" for word in words) + ")"
+        line = f"{name}(\n" + "".join(f"    {word},\n" for word in words) + f"){arrow}"
     return f"```python\n{line}\n```\n\n"
+
+
+def _annotation(annotation: Any) -> str:
+    """Return an annotation as in the source, without the names of modules."""
+    text = annotation if isinstance(annotation, str) else inspect.formatannotation(annotation)
+    return re.sub(r"\b(?:\w+\.)+(?=[A-Za-z_]\w*)", "", text.strip("'"))
 
 
 def _default(value: Any) -> str:

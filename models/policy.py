@@ -126,18 +126,43 @@ class Policy:
             arrays = load(read_bytes(weights, "policy's weights", MAX_WEIGHTS_SIZE))
             if values["format"] != FORMAT or values.pop("digest") != _digest(arrays, values):
                 raise ValueError("the format or the digest differs")
-            if len(arrays) % 2:
-                raise ValueError("a layer has a weight and a bias")
-            kinds = [name.split(".")[0] for name in arrays if name.endswith(".weight")]
-            layers, encoder = (
-                [(arrays[f"{kind}.{i}.weight"], arrays[f"{kind}.{i}.bias"]) for i in range(kinds.count(kind))]
-                for kind in ("layers", "encoder")
+            if "members" not in values:
+                return cls._of_arrays(arrays, values)
+            members = [
+                Policy._of_arrays(
+                    {name.removeprefix(start): arrays[name] for name in arrays if name.startswith(start)}, each
+                )
+                for each, start in zip(values["members"], (f"{i}." for i in range(len(values["members"]))), strict=True)
+            ]
+            if sum(len(member._arrays()) for member in members) != len(arrays):
+                raise ValueError("every array belongs to a network")
+            return Ensemble(
+                members, {name: value for name, value in values.items() if name not in ("members", "format")}
             )
-            return cls(layers, values, encoder)
         except (SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(
                 f"the policy in {folder} is damaged or of another version: write it again with guiderail train --resume"
             ) from error
+
+    @classmethod
+    def _of_arrays(cls, arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> Policy:
+        """Return the policy of arrays as `_arrays` returns them; raise a ValueError or KeyError if they do not fit."""
+        if len(arrays) % 2:
+            raise ValueError("a layer has a weight and a bias")
+        kinds = [name.split(".")[0] for name in arrays if name.endswith(".weight")]
+        layers, encoder = (
+            [(arrays[f"{kind}.{i}.weight"], arrays[f"{kind}.{i}.bias"]) for i in range(kinds.count(kind))]
+            for kind in ("layers", "encoder")
+        )
+        return cls(layers, description, encoder)
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        """Return weights and biases by name."""
+        arrays: dict[str, np.ndarray] = {}
+        for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):
+            for index, (weight, bias) in enumerate(stored):
+                arrays |= {f"{kind}.{index}.weight": weight, f"{kind}.{index}.bias": bias}
+        return arrays
 
     def save(self, folder: Path | str, write: Callable[[Path, bytes], Any] = Path.write_bytes) -> None:
         """Write `policy.safetensors` and `policy.json` into a folder, which is created if it is missing.
@@ -152,11 +177,7 @@ class Policy:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError(f"{folder} cannot be created ({error.strerror}): name another folder") from error
-        arrays: dict[str, np.ndarray] = {}
-        for kind, stored in (("layers", self._layers), ("encoder", self._encoder)):
-            for index, (weight, bias) in enumerate(stored):
-                arrays |= {f"{kind}.{index}.weight": weight, f"{kind}.{index}.bias": bias}
-        values = self.description | {"format": FORMAT}
+        arrays, values = self._arrays(), self.description | {"format": FORMAT}
         values["digest"] = _digest(arrays, values)
         write(folder / "policy.safetensors", save(arrays))
         write(folder / "policy.json", json.dumps(values, indent=2).encode() + b"\n")
@@ -203,6 +224,52 @@ class Policy:
             patches = np.lib.stride_tricks.sliding_window_view(image, (3, 3), axis=(1, 2))[:, ::2, ::2]
             image = np.maximum(np.tensordot(weight, patches, ((1, 2, 3), (0, 3, 4))) + bias[:, None, None], 0)
         return np.concatenate([image.ravel(), state])
+
+
+class Ensemble(Policy):
+    """Policy of several networks; its action is the mean of theirs.
+
+    Args:
+        members: Policies with the same observations and limits of actions, at least one.
+        description: Content of `policy.json`; default: the description of the first member.
+
+    Raises:
+        ValueError: If the members differ in their observations or limits of actions.
+    """
+
+    def __init__(self, members: Sequence[Policy], description: Mapping[str, Any] | None = None):
+        self.members = list(members)
+        first = self.members[0]
+        self.description = dict(first.description if description is None else description)
+        for member in self.members:
+            for name in ("observation_shape", "action_low", "action_high"):
+                if list(member.description[name]) != list(first.description[name]):
+                    raise ValueError(f"the policies of an ensemble need the same {name}")
+        self.description["members"] = [member.description for member in self.members]
+
+    @property
+    def layers(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Not available, because an ensemble has several networks.
+
+        Raises:
+            InputError: Always.
+        """
+        raise InputError("an ensemble has several networks: name one of the runs that it was made from")
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return {f"{i}.{name}": array for i, each in enumerate(self.members) for name, array in each._arrays().items()}
+
+    def actions(self, observation: np.ndarray) -> np.ndarray:
+        """Return the actions of all networks, (M, A), for one observation."""
+        return np.stack([member(observation) for member in self.members])
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        """Return the mean of the networks' actions, (A,), for one observation."""
+        return self.actions(observation).mean(axis=0)
+
+    def disagreement(self, observation: np.ndarray) -> float:
+        """Return the standard deviation of the networks' actions, mean over the entries of the action."""
+        return float(self.actions(observation).std(axis=0).mean())
 
 
 def _digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:

@@ -10,6 +10,7 @@ from .command_filter import CommandFilter as CommandFilter
 from .command_watchdog import CommandWatchdog as CommandWatchdog
 from .constraint_violation import ConstraintViolation as ConstraintViolation
 from .contact_detector import ContactDetector as ContactDetector
+from .continuous_pose import ContinuousPose as ContinuousPose
 from .energy_tank import EnergyTank as EnergyTank
 from .episode_monitor import EpisodeMonitor as EpisodeMonitor
 from .episode_monitor import TerminationTerm as TerminationTerm

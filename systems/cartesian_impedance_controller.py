@@ -1,18 +1,24 @@
 """Cartesian impedance control of a torque-controlled arm."""
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.math import RigidTransform_, RollPitchYaw_
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import BasicVector, BasicVector_, Context
 
-from guiderail.models.common.arrays import as_number, as_numbers
+from guiderail.models.common.arrays import as_number, as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
+from guiderail.systems.support.differentiable_impedance import differentiable_torques, values_of
 from guiderail.systems.support.drake_multibody import (
     check_plant,
     effort_limits,
@@ -101,7 +107,7 @@ class Payload:
             raise InputError(f"the center of a payload is three numbers, not {self.center}")
 
 
-class CartesianImpedanceController(LeafSystem):
+class CartesianImpedanceController(ConvertibleSystem):
     """Impedance controller: the tool center P of an arm acts as a spring and damper around a desired pose.
 
         τ = Jᵀ clip(K e − D V) + N τ_posture + g(q), clipped to the motors' limits
@@ -113,6 +119,9 @@ class CartesianImpedanceController(LeafSystem):
 
     Gains and payload are numeric parameters of the context: `set_gains` and `set_payload` change them between two steps
     of a simulation, and a context that is copied or restored has them.
+
+    `ToAutoDiffXd` converts a controller without bound, for derivatives with respect to state, desired pose, gains and
+    payload. The converted controller follows the present command, whether it is valid or not.
 
     .. pydrake_system::
 
@@ -156,7 +165,8 @@ class CartesianImpedanceController(LeafSystem):
     Raises:
         InputError: If an argument is out of range, the plant is not finalized, a frame belongs to another plant, T is
             not fixed in the world, the posture does not have n joints, or a joint does not have exactly one actuator.
-            At an evaluation, if the estimated state is not finite.
+            At an evaluation, if the estimated state is not finite. At a conversion, if the impedance is bounded or the
+            scalar type is not AutoDiffXd.
     """
 
     def __init__(
@@ -180,9 +190,8 @@ class CartesianImpedanceController(LeafSystem):
             raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
         self._stiffness_frame = stiffness_frame
-        self._parameters = [
-            self.DeclareNumericParameter(BasicVector(numbers)) for numbers in (*_to_numbers(gains), np.zeros(4))
-        ]
+        self._default_parameters = [*_to_numbers(gains), np.zeros(4)]
+        self._parameters = [self.DeclareNumericParameter(BasicVector(numbers)) for numbers in self._default_parameters]
         self._tuning = declare.cache(self, "gains_and_payload", self._calc_tuning, [self.all_parameters_ticket()])
         self._compensate_gravity = compensate_gravity
         self._torque_limits = effort_limits(plant)
@@ -270,47 +279,108 @@ class CartesianImpedanceController(LeafSystem):
         return transform_to_pose(self._tool_center.CalcPose(self._plant_context.Eval(context), self._target))
 
     def _calc_law(self, context: Context) -> JointTorques:
-        plant, (gains, payload) = self._plant, self._tuning.Eval(context)
+        gains, payload = self._tuning.Eval(context)
         plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
-        X_TP = self._tool_center.CalcPose(plant_context, self._target)
+        law = self._law_arguments(self._plant, plant_context, X_TPd, gains, payload.mass, np.array(payload.center))
+        return impedance_torques(**law, bound=self._bound(context))
+
+    def _law_arguments(
+        self, plant: Any, plant_context: Any, X_TPd: Any, gains: Any, mass: Any, center: np.ndarray
+    ) -> dict[str, Any]:
+        """Return the arguments of the law, for a plant of any scalar type; `mass` and `center` are of the payload."""
+        frames = (self._tool_center, self._target)
+        tool_center, target = (plant.get_frame(frame.index()) for frame in frames)
+        X_TP = tool_center.CalcPose(plant_context, target)
         R_TAxes = None
         if self._stiffness_frame is not None:
-            R_TAxes = self._stiffness_frame.CalcPose(plant_context, self._target).rotation().matrix()
+            axes = plant.get_frame(self._stiffness_frame.index())
+            R_TAxes = axes.CalcPose(plant_context, target).rotation().matrix()
         eta, epsilon = orientation_error(X_TPd.rotation(), X_TP.rotation())
         J = plant.CalcJacobianSpatialVelocity(
-            plant_context, JacobianWrtVariable.kV, self._tool_center, np.zeros(3), self._target, self._target
+            plant_context, JacobianWrtVariable.kV, tool_center, np.zeros(3), target, target
         )
         M = plant.CalcMassMatrix(plant_context)
         q, v = plant.GetPositions(plant_context), plant.GetVelocities(plant_context)
         gravity_torque = np.zeros_like(v)
         if self._compensate_gravity:
             gravity_torque = -plant.CalcGravityGeneralizedForces(plant_context)
-        if payload.mass > 0.0:
+        if mass > 0.0:
             world = plant.world_frame()
             J_center = plant.CalcJacobianTranslationalVelocity(
-                plant_context, JacobianWrtVariable.kV, self._tool_center, np.array(payload.center), world, world
+                plant_context, JacobianWrtVariable.kV, tool_center, center, world, world
             )
-            M = M + payload.mass * J_center.T @ J_center
+            M = M + mass * J_center.T @ J_center
             if self._compensate_gravity:
-                weight = payload.mass * plant.gravity_field().gravity_vector()
+                weight = mass * plant.gravity_field().gravity_vector()
                 gravity_torque = gravity_torque - J_center.T @ weight
-        return impedance_torques(
-            K=gains.stiffness,
-            damping_ratio=gains.damping_ratio,
-            wrench_limits=gains.wrench_limits,
-            R_axes=R_TAxes,
-            p_error=X_TPd.translation() - X_TP.translation(),
-            eta=eta,
-            epsilon=epsilon,
-            J=J[[3, 4, 5, 0, 1, 2]],
-            M=M,
-            v=v,
-            posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
-            gravity_torque=gravity_torque,
-            torque_limits=self._torque_limits,
-            bound=self._bound(context),
-        )
+        return {
+            "K": gains.stiffness,
+            "damping_ratio": gains.damping_ratio,
+            "wrench_limits": gains.wrench_limits,
+            "R_axes": R_TAxes,
+            "p_error": X_TPd.translation() - X_TP.translation(),
+            "eta": eta,
+            "epsilon": epsilon,
+            "J": J[[3, 4, 5, 0, 1, 2]],
+            "M": M,
+            "v": v,
+            "posture_torque": gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
+            "gravity_torque": gravity_torque,
+            "torque_limits": self._torque_limits,
+        }
+
+    def declare_converted(self, system: Any, scalar: type) -> None:
+        """Declare the ports, states and parameters of this system in `system`, a system of `AutoDiffXd`.
+
+        Raises:
+            InputError: If the impedance is bounded, or `scalar` is another type.
+        """
+        if scalar is not AutoDiffXd:
+            raise InputError("an impedance has no symbolic form: convert it to AutoDiffXd, or evaluate it with floats")
+        if self._gains.bound is not None:
+            raise InputError("the law of a bounded impedance is not smooth: convert a controller without bound")
+        default = self.CreateDefaultContext().get_discrete_state()
+        for number in range(default.num_groups()):
+            system.DeclareDiscreteState(default.value(number))
+        parameters = [system.DeclareNumericParameter(BasicVector_[scalar](n)) for n in self._default_parameters]
+        ports = [self.get_input_port(index) for index in range(self.num_input_ports())]
+        inputs = {port.get_name(): system.DeclareVectorInputPort(port.get_name(), port.size()) for port in ports}
+        state, desired_pose = inputs["estimated_state"], inputs["desired_pose"]
+        plant = self._plant.ToAutoDiffXd()
+
+        def calc_law(context: Any) -> tuple[JointTorques, np.ndarray]:
+            if inputs["max_wrench"].HasValue(context):
+                raise InputError("the law of a bounded impedance is not smooth: do not connect max_wrench")
+            numbers = [context.get_numeric_parameter(index).CopyToVector() for index in parameters]
+            stiffness, limits, posture, (ratio, posture_stiffness, posture_damping), payload = numbers
+            gains = SimpleNamespace(
+                stiffness=stiffness.reshape(6, 6),
+                wrench_limits=limits,
+                posture=posture,
+                damping_ratio=ratio,
+                posture_stiffness=posture_stiffness,
+                posture_damping=posture_damping,
+            )
+            plant_context, pose, present = plant.CreateDefaultContext(), desired_pose.Eval(context), state.Eval(context)
+            for name, values in (("state", present), ("desired pose", pose)):
+                if not is_finite(values_of(values)):  # Drake would abort the process
+                    raise InputError(f"derivatives of an impedance need a finite {name}, not {values_of(values)}")
+            plant.SetPositionsAndVelocities(plant_context, present)
+            X_TPd = RigidTransform_[scalar](RollPitchYaw_[scalar](pose[5], pose[4], pose[3]), pose[:3])
+            tool_center, target = (plant.get_frame(frame.index()) for frame in (self._tool_center, self._target))
+            X_TP = tool_center.CalcPose(plant_context, target)
+            measured = [*X_TP.translation(), *RollPitchYaw_[scalar](X_TP.rotation()).vector()[::-1]]
+            law = self._law_arguments(plant, plant_context, X_TPd, gains, payload[0], payload[1:])
+            return differentiable_torques(**law), np.array(measured)
+
+        sources = [state, desired_pose, inputs["max_wrench"], system.all_parameters_ticket()]
+        law = declare.cache(system, "law", calc_law, sources)
+        declare.part_output(system, "generalized_force", law, lambda value: value[0].torque, len(self._torque_limits))
+        declare.part_output(system, "pose", law, lambda value: value[1], 6)
+        declare.part_output(system, "impedance_wrench", law, lambda value: value[0].wrench, 6)
+        declare.part_output(system, "saturation", law, lambda value: scalar(float(value[0].is_saturated)))
+        declare.scalar_output(system, "command_timed_out", lambda context: scalar(0.0), [system.nothing_ticket()])
 
     def _bound(self, context: Context) -> WrenchBound | None:
         return self._requested_bound.eval(context) if self._max_wrench_port.HasValue(context) else self._gains.bound

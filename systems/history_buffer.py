@@ -5,7 +5,8 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.laws.primitive import appended, continued_pose
+from guiderail.models.common.transforms import nearest_pose
+from guiderail.models.laws.primitive import appended
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import as_count, input_getter, output_getter
 
@@ -39,8 +40,8 @@ class HistoryBuffer(LeafSystem):
         length: Number P of stored outputs, at least 1; P·O is at most a million.
         period: Control period [s], positive.
         near: Pose (6,), [x y z Rz Ry Rx], such as the first mean of the reference; None: outputs are stored unchanged.
-            With it, the angles of the first output are on the full turn nearest to `near`, and those of each output on
-            the full turn nearest to the output before, so that the history has no jump at ±π.
+            With it, the angles of the first output are those of its orientation nearest to `near`, and the angles of
+            each output those nearest to the output before (`nearest_pose`), so that the history has no jumps.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if ``initial_output`` is not connected or not
@@ -82,7 +83,9 @@ class HistoryBuffer(LeafSystem):
         initial = self._initial_output_port.Eval(context)
         if not is_finite(initial):
             raise InputError(f"the output that fills a history at the start must be finite, not {initial}")
-        discrete_state.set_value(self._state, np.tile(continued_pose(initial, self._near), self._shape[0]))
+        discrete_state.set_value(
+            self._state, np.tile(initial if self._near is None else nearest_pose(initial, self._near), self._shape[0])
+        )
 
     def _shift(self, context: Context, discrete_state: DiscreteValues) -> None:
         stored = declare.initialized(self, context, self._state).reshape(self._shape)

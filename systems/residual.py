@@ -1,15 +1,18 @@
 """Sum of a reference and a residual, for residual RL."""
 
+from typing import Any
+
 import numpy as np
-from pydrake.systems.framework import Context, LeafSystem
+from pydrake.systems.framework import Context
 
 from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
-class Residual(LeafSystem):
+class Residual(ConvertibleSystem):
     """Add the residual of a policy to a reference (thesis, section 4.4.1).
 
         desired_pose = reference + K action
@@ -24,7 +27,8 @@ class Residual(LeafSystem):
         - desired_pose
 
     All ports are (O,); ``action`` is in [−1, 1]. Drake's `Adder` is not used, because its output counts as
-    time-dependent: downstream outputs would be computed again at every plant step.
+    time-dependent: downstream outputs would be computed again at every plant step. `ToAutoDiffXd` and `ToSymbolic`
+    convert the system.
 
     Args:
         gain: Diagonal of K, (O,), in units of the reference per unit of action.
@@ -38,14 +42,20 @@ class Residual(LeafSystem):
         self._gain = as_numbers(gain, "gain")
         if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():
             raise InputError(f"a residual's gain must be one finite number per output, not {gain}")
-        self._reference_port = self.DeclareVectorInputPort("reference", self._gain.size)
-        self._action_port = self.DeclareVectorInputPort("action", self._gain.size)
-        sources = [self._reference_port, self._action_port]
-        declare.output(self, "desired_pose", self._gain.size, self._desired_pose, sources)
+        self.declare_converted(self, float)
 
     get_reference_input_port = input_getter("reference", "reference, (O,)")
     get_action_input_port = input_getter("action", "policy's action, (O,)")
     get_desired_pose_output_port = output_getter("desired_pose", "desired pose, (O,)")
 
-    def _desired_pose(self, context: Context) -> np.ndarray:
-        return self._reference_port.Eval(context) + self._gain * self._action_port.Eval(context)
+    def declare_converted(self, system: Any, scalar: type) -> None:
+        """Declare the ports of this system in `system`; the law is that of every scalar type."""
+        gain = self._gain
+        reference = system.DeclareVectorInputPort("reference", gain.size)
+        action = system.DeclareVectorInputPort("action", gain.size)
+
+        def desired_pose(context: Context) -> np.ndarray:
+            with np.errstate(invalid="ignore"):  # NumPy warns about formulas
+                return reference.Eval(context) + gain * action.Eval(context)
+
+        declare.output(system, "desired_pose", gain.size, desired_pose, [reference, action])

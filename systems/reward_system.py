@@ -4,12 +4,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
+from typing import Any
 
 import numpy as np
-from pydrake.systems.framework import Context, LeafSystem, OutputPort
+from pydrake.systems.framework import Context, OutputPort
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
+from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
 
 
@@ -28,7 +30,7 @@ class RewardTerm:
     value: Callable[..., float]
 
 
-class RewardSystem(LeafSystem):
+class RewardSystem(ConvertibleSystem):
     """Sum of named reward terms, with an output port for each term.
 
         r = Σ_i r_i    (as in equation 4.22)
@@ -43,7 +45,8 @@ class RewardSystem(LeafSystem):
         - one per term
 
     All outputs are (1,). The system has no state: values of the previous control step come from a `ZeroOrderHold` of
-    the control period.
+    the control period. `ToAutoDiffXd` and `ToSymbolic` convert the system if the functions of the terms accept arrays
+    of these numbers: without ``float()``, and for `ToSymbolic` without comparisons.
 
     Args:
         terms: Reward terms, at least one, with different names, neither empty nor "reward".
@@ -93,6 +96,35 @@ class RewardSystem(LeafSystem):
         if name not in self._term_ports:
             raise InputError(f"the reward has no term '{name}', only {', '.join(self._term_ports)}")
         return self._term_ports[name]
+
+    def declare_converted(self, system: Any, scalar: type) -> None:
+        """Declare the ports of this system in `system`; the terms are computed with numbers of the type `scalar`."""
+        signals = SignalPorts(system, *(term.inputs for term in self._terms))
+        sources = signals.tickets or {system.nothing_ticket()}
+
+        def term_output(term: RewardTerm) -> Callable[[Context], Any]:
+            def value(context: Context) -> Any:
+                present = signals.eval(context)
+                return self._converted_value(term, {name: present[name] for name in term.inputs}, scalar)
+
+            return value
+
+        functions = [term_output(term) for term in self._terms]
+        declare.scalar_output(
+            system, "reward", lambda context: sum((f(context) for f in functions), scalar(0.0)), sources
+        )
+        for term, function in zip(self._terms, functions, strict=True):
+            declare.scalar_output(system, term.name, function, sources)
+
+    def _converted_value(self, term: RewardTerm, signals: Mapping[str, np.ndarray], scalar: type) -> Any:
+        try:
+            value = np.asarray(term.value(**signals)).item()
+            return value if isinstance(value, scalar) else scalar(float(value))
+        except (TypeError, ValueError, AttributeError, RuntimeError) as error:
+            raise InputError(
+                f"reward term {term.name!r}{self._of_task} cannot be computed with {scalar.__name__}: use operators "
+                "and NumPy, without float() and math, and without comparisons for Expression"
+            ) from error
 
     def _calc_terms(self, context: Context) -> np.ndarray:
         signals = self._signals.eval(context)

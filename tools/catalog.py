@@ -6,7 +6,14 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from guiderail.diagrams.envs.config import EnvConfig
-from guiderail.diagrams.envs.options import CommonOptions, PrimitiveOptions, TemplateOptions, describe_options
+from guiderail.diagrams.envs.options import (
+    CommonOptions,
+    Options,
+    PrimitiveOptions,
+    TemplateOptions,
+    describe_options,
+    option_fields,
+)
 from guiderail.diagrams.guidance.guidance import INPUTS as GUIDANCE_INPUTS
 from guiderail.diagrams.guidance.guidance import OUTPUTS as GUIDANCE_OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, possible_guidance
@@ -75,6 +82,68 @@ def describe_task(name: str) -> dict[str, Any]:
         "options": describe_options(declared.Options),
         "reset_options": describe_options(declared.Reset),
     }
+
+
+BASIC = (
+    "difficulty", "guidance", "station", "robot", "reward", "observation", "action_repeat", "fixture_offset",
+    "demonstrations", "force_limit", "action_scale", "sensing",
+)  # fmt: skip
+"""Options that `guiderail list TASK` prints first, at most twelve."""
+
+_STRUCTURED = {
+    "disturbances": "disturbances of a simulated station, by its entries",
+    "exploration": "exploration in training episodes, by its entries",
+    "selection": "selection of the exported actor, by its entries",
+    "sensing": "see the basic options; its entries:",
+}
+"""Descriptions of structured options and settings where they have no value of their own."""
+
+
+def describe_task_groups(name: str) -> dict[str, dict[str, str]]:
+    """Describe the options of a task in groups: basic, task, motion, station, disturbances, difficulties and reset.
+
+    An entry of a structured option follows its option; its name is indented.
+
+    Raises:
+        InputError: If there is no task of that name.
+    """
+    texts = describe_task_options(name)
+    if name not in TASKS.names():
+        return {"options": texts}
+    parts = EnvConfig.resolve(name, {}).parts
+    groups = dict.fromkeys(BASIC, "basic")
+    for part in ("task", "disturbances", "station"):
+        groups = dict.fromkeys(option_fields(type(parts[part])), part) | groups
+    for kind in map(STATIONS.get, TASKS.get(name).stations()):
+        groups = dict.fromkeys(option_fields(kind.options or Options), "station") | groups
+    result: dict[str, dict[str, str]] = {
+        group: {} for group in ("basic", "task", "motion", "station", "disturbances", "difficulties", "reset")
+    }
+    result["basic"] = {key: texts[key] for key in BASIC if key in texts}
+    for key, text in texts.items():
+        group = "difficulties" if key.startswith("difficulty=") else groups.get(key, "motion")
+        result["reset" if key.startswith("reset: ") else group][key.removeprefix("reset: ")] = text
+    return {group: indent_entries(rows) for group, rows in result.items() if rows}
+
+
+def indent_entries(rows: Mapping[str, Any]) -> dict[str, Any]:
+    """Return rows by name with each entry of a structured option after its option, as "  .entry"."""
+    result: dict[str, Any] = {}
+    for name in dict.fromkeys(name.partition(".")[0] for name in rows):
+        entries = {f"  .{key.partition('.')[2]}": row for key, row in rows.items() if key.startswith(f"{name}.")}
+        result |= {name: rows.get(name, _STRUCTURED.get(name, ""))} | entries
+    return result
+
+
+def describe_guidance_options(name: str) -> dict[str, str]:
+    """Describe a kind of guidance as text: requirements, ports, and the options of environments with it."""
+    kind, described = GUIDANCE.get(name), _describe_guidance(name)
+    models: list[Any] = [PrimitiveOptions] if any("demonstrations" in names for names in kind.needs) else []
+    models += [TemplateOptions] if any("template" in names for names in kind.needs) else []
+    rows = {"description": kind.label, "needs": " or ".join(" and ".join(names) for names in kind.needs)}
+    rows |= {key: ", ".join(described[key]) for key in ("inputs", "outputs")}
+    described_options = [row for model in (*models, kind.options) for row in describe_options(model)]
+    return rows | indent_entries({row["name"]: _describe_option(row, row["default"]) for row in described_options})
 
 
 def describe_task_options(name: str) -> dict[str, str]:

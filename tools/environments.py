@@ -29,7 +29,7 @@ from guiderail.diagrams.envs.options import (
 )
 from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.options import Disturbances
-from guiderail.diagrams.stations.registry import STATIONS, stations_for
+from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
     TASKS,
     check_task_name,
@@ -39,7 +39,8 @@ from guiderail.diagrams.tasks.registry import (
 )
 from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.plugins import find_plugins
+from guiderail.models.common.registry import did_you_mean, find_class
 
 _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder
 
@@ -124,15 +125,14 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def declared_models(task: str) -> list[type[Options]]:
-    """Return the pydantic models of all options that a registered task may have, with any guidance and station."""
-    models: list[type[Options] | None] = [CommonOptions, TASKS.declared(task, "Options")]
-    models += [PrimitiveOptions, TemplateOptions]
-    workcell_kind = TASKS.declared(task, "workcell_kind") if TASKS.declares(task, "workcell_kind") else "insertion"
-    models += [Disturbances] if workcell_kind == "insertion" else []
-    stations = stations_for(workcell_kind)
-    models += [STATIONS.declared(name, "options") for name in stations if STATIONS.declares(name, "options")]
-    models += [GUIDANCE.declared(name, "options") for name in GUIDANCE.names() if GUIDANCE.declares(name, "options")]
-    return list(dict.fromkeys(model for model in models if model is not None))
+    """Return the pydantic models of all options that a registered task may have, with any guidance and station.
+
+    Options of guidance and stations whose package declares no plug-in for them are missing.
+    """
+    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS, "Options")]
+    models += [PrimitiveOptions, TemplateOptions, Disturbances]
+    models += [point.load() for kind in ("station_options", "guidance_options") for _, point in find_plugins(kind)]
+    return list(dict.fromkeys(models))
 
 
 def flat_environment(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
@@ -152,11 +152,10 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
     registered = ((TASKS, [task]), (GUIDANCE, GUIDANCE.names()), (STATIONS, STATIONS.names()))
     if not all(registry.is_packaged(name) for registry, names in registered for name in names):
         return
-    if not TASKS.declares(task, "Options"):
-        return
-    for option, choices in (("reward", "rewards"), ("observation", "observations")):
-        if option in options and TASKS.declares(task, choices):
-            check_choice(option, options[option], list(TASKS.declared(task, choices)), task)
+    declared = find_class("task_options", task, TASKS, "Options")
+    for option, choices in (("reward", declared.rewards), ("observation", declared.observations)):
+        if option in options and choices:
+            check_choice(option, options[option], list(choices), task)
     models = declared_models(task)
     options = flat_options(models, options)
     for option in options:

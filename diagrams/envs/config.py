@@ -121,31 +121,16 @@ def freeze(value: Any) -> tuple[str, Any]:
 
 def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     name = task.name
-    stations = task.stations()
-    if not stations:
-        kinds = {STATIONS.get(station).workcell_kind for station in STATIONS.usable()}
-        raise InputError(
-            f"no station works on a workcell of the kind {brief(task.workcell_kind)}, which {name} has: "
-            f"{did_you_mean(task.workcell_kind, kinds)}"
-        )
-    guidance = possible_guidance(task.provides())
-    if not guidance:
-        raise InputError(f"no guidance can be built for {name}: write its reference(), template() or approach()")
     difficulty = check_choice("difficulty", options.get("difficulty", STANDARD), list(task.difficulties), name)
     settings = task.defaults, task.difficulties[difficulty], options
-    chosen: dict[str, Any] = {
-        # The default is a station of this package, so that another package's registration changes no environment.
-        "station": min(stations, key=lambda station: not STATIONS.is_packaged(station)),
-        "reward": task.rewards[0],
-        "observation": task.observations[0],
-    }
+    chosen: dict[str, Any] = {"reward": task.rewards[0], "observation": task.observations[0]}
     for given in settings:
-        chosen |= {key: given[key] for key in ("guidance", *chosen) if key in given}
+        chosen |= {key: given[key] for key in ("guidance", "station", *chosen) if key in given}
     if "guidance" not in chosen:
-        chosen["guidance"] = default_guidance(guidance)
-    if chosen["station"] in [*STATIONS.broken]:
-        STATIONS.get(chosen["station"])  # raises an InputError
-    check_choice("station", chosen["station"], stations, name)
+        chosen["guidance"] = _default_guidance(task)
+    if "station" not in chosen:
+        chosen["station"] = _default_station(task)
+    _check_station(task, chosen["station"])
     check_choice("reward", chosen["reward"], list(task.rewards), name)
     check_choice("observation", chosen["observation"], list(task.observations), name)
 
@@ -153,7 +138,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     known = {option for model in models.values() for option in option_fields(model)}
     _check_declared_options(task, known)
     defaults, preset, options = (flat_options(models.values(), given) for given in settings)
-    _check_given_options(task, stations, options, known)
+    _check_given_options(task, options, known)
     merged = {**defaults, **preset, **options, **chosen}
     parts: dict[str, Any] = {
         part: validate_options(
@@ -165,6 +150,32 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     config = EnvConfig(name, **{option: getattr(common, option) for option in CommonOptions.model_fields}, parts=parts)
     config.make_task()  # its constructor refuses incompatible options
     return config
+
+
+def _default_guidance(task: type[Task]) -> str:
+    guidance = possible_guidance(task.provides())
+    if not guidance:
+        raise InputError(f"no guidance can be built for {task.name}: write its reference(), template() or approach()")
+    return default_guidance(guidance)
+
+
+def _default_station(task: type[Task]) -> str:
+    """Return a station of guiderail if there is one, so that another package's registration changes no environment."""
+    stations = task.stations()
+    if not stations:
+        kinds = {kind.workcell_kind for kind in STATIONS.entries().values()}
+        raise InputError(
+            f"no station works on a workcell of the kind {brief(task.workcell_kind)}, which {task.name} has: "
+            f"{did_you_mean(task.workcell_kind, kinds)}"
+        )
+    return min(stations, key=lambda station: not STATIONS.is_packaged(station))
+
+
+def _check_station(task: type[Task], name: Any) -> None:
+    """Raise an InputError unless the task supports a station; only this station is imported if it does."""
+    is_known = isinstance(name, str) and name in STATIONS.names() and name not in task.excluded_stations
+    if not is_known or STATIONS.get(name).workcell_kind != task.workcell_kind:
+        check_choice("station", name, task.stations(), task.name)
 
 
 def _check_declared_options(task: type[Task], known: set[str]) -> None:
@@ -186,11 +197,11 @@ def _check_declared_options(task: type[Task], known: set[str]) -> None:
                 )
 
 
-def _check_given_options(task: type[Task], stations: list[str], options: Mapping[str, Any], known: set[str]) -> None:
+def _check_given_options(task: type[Task], options: Mapping[str, Any], known: set[str]) -> None:
     """Refuse given options that are not `known`; the error message names another station that has the option."""
     unknown = sorted(set(options) - known, key=str)
     if not unknown:
         return
-    elsewhere = [name for name in stations if unknown[0] in option_fields(STATIONS.get(name).options or Options)]
+    elsewhere = [name for name in task.stations() if unknown[0] in option_fields(STATIONS.get(name).options or Options)]
     remedy = f"it is an option of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
     raise InputError(f"{task.name} has no option {brief(unknown[0])} here: {remedy}")

@@ -23,9 +23,10 @@ from guiderail.diagrams.envs.assemble import (
 from guiderail.diagrams.envs.config import EnvConfig, freeze
 from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.pool import BuiltDiagram, DiagramPool
-from guiderail.diagrams.envs.task_checks import call_checked, workcell_of
+from guiderail.diagrams.envs.task_checks import call_checked, turns_near_half, workcell_of
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
+from guiderail.diagrams.stations.continuous_station import ContinuousStation
 from guiderail.diagrams.stations.disturbances import disturbed
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import StationKind
@@ -70,6 +71,10 @@ def make_station(task: Task) -> Station:
             f"station={kind.name!r} has a control period of {station.nominal_period:g} s: leave control_period out, or "
             "let the station's builder take the parameter control_period"
         )
+    if station.wraps_angles and kind.is_simulated and "demonstrations" in task.provides():
+        means = call_checked(task, "reference").means
+        if turns_near_half(means):
+            station = ContinuousStation(station, means[0])
     return station
 
 

@@ -40,10 +40,14 @@ class Options(BaseModel):
     Attributes:
         entries: Names of the fields that are entries of a structured option, by field. The field `history_variance`
             with the name "history.variance" is the entry "variance" of the option `history`.
+        rewards: In the options of a task, the values of `Task.rewards`, so that they are known before it is imported.
+        observations: In the options of a task, the values of `Task.observations`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
     entries: ClassVar[Mapping[str, str]] = {}
+    rewards: ClassVar[tuple[str, ...]] = ()
+    observations: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def diagram_key(cls, options: Mapping[str, Any]) -> Hashable:

@@ -122,10 +122,15 @@ def workcell_of(task: Task) -> Any:
     return workcell
 
 
+def turns_near_half(means: np.ndarray) -> bool:
+    """Return True if angles of a motion (N, 6) come near ±180°."""
+    return bool(np.abs(means[:, 3:]).max(initial=0.0) > np.pi - HALF_TURN_MARGIN)
+
+
 def refuse_half_turns(means: np.ndarray) -> None:
     """Raise an `InputError` if angles of a motion (N, 6) come near ±180°, where the station's angles jump."""
-    furthest = np.abs(means[:, 3:]).max(initial=0.0)
-    if furthest > np.pi - HALF_TURN_MARGIN:
+    if turns_near_half(means):
+        furthest = np.abs(means[:, 3:]).max()
         raise InputError(
             f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and this station's angles jump by a full turn at "
             f"180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"

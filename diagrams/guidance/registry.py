@@ -77,8 +77,6 @@ def _check(name: str, kind: object) -> None:
 
 GUIDANCE: Registry[GuidanceKind] = Registry(
     "guidance",
-    package="guiderail.diagrams.guidance",
-    decorator="register_guidance",
     plugin="guidance",
     check=_check,
 )
@@ -136,7 +134,7 @@ def is_demonstrated(guidance: str | None) -> bool:
 
 def possible_guidance(provided: Collection[str]) -> list[str]:
     """Return the sorted names of all kinds of guidance whose requirements are `provided`."""
-    return [name for name in GUIDANCE.usable() if not missing_requirements(GUIDANCE.declared(name, "needs"), provided)]
+    return [name for name, kind in GUIDANCE.entries().items() if not missing_requirements(kind.needs, provided)]
 
 
 def default_guidance(possible: Collection[str]) -> str:

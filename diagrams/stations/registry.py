@@ -43,8 +43,6 @@ def _check(name: str, kind: object) -> None:
 
 STATIONS: Registry[StationKind] = Registry(
     "station",
-    package="guiderail.diagrams.stations",
-    decorator="register_station",
     plugin="station",
     check=_check,
 )
@@ -86,4 +84,4 @@ def register_station(
 
 def stations_for(workcell_kind: str) -> list[str]:
     """Return the names of the stations for a kind of workcell."""
-    return [name for name in STATIONS.usable() if STATIONS.declared(name, "workcell_kind") == workcell_kind]
+    return [name for name, kind in STATIONS.entries().items() if kind.workcell_kind == workcell_kind]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, ClassVar
@@ -273,12 +273,22 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
     return ALIGNMENT_REWARD * float(nearer) / MM
 
 
-def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def sides_of_the_rim(
+    observation: str,
+    action_dims: Iterable[int],
+    more: Callable[[np.ndarray], Iterable[np.ndarray]] = lambda across: (),
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Return the seven symmetries of a plug on the rim: three turns about the axis, and four reflections.
 
     Vectors across the axis are rotated or reflected. Torques and tilts are axial vectors, so that a reflection also
     changes their sign. Components of pose and wrench along and about the axis are unchanged; a reflection changes the
     sign of the fixture's turn in a privileged observation.
+
+    Args:
+        observation: Name of the observation.
+        action_dims: Indices of the outputs that an action moves.
+        more: Function from the transformation of vectors across the axis (2, 2) to the matrices of further entries of
+            the observation.
 
     Returns:
         Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if
@@ -293,7 +303,7 @@ def sides_of_the_rim(observation: str, action_dims: Iterable[int]) -> tuple[np.n
         pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
         contact_terms = () if observation == "state" else (across, across)  # center of pressure, and commanded x and y
-        observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms))
+        observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms, *more(across)))
         actions.append(pose[np.ix_(outputs, outputs)])
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
     if any((np.abs(action).sum(0) != 1).any() for action in actions):

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 IMPORT_HINT = ", or --import the file that registers it"
 TASKS: Registry[type[Task]] = Registry(
     "task",
-    package="guiderail.diagrams.tasks",
-    decorator="register_task",
     plugin="task",
     check=lambda name, task: _check(name, task),
 )

@@ -16,19 +16,23 @@ from guiderail.models.common.errors import InputError
 _VARIABLE = "DRAKE_ALLOW_NETWORK"
 _DIRECTIVES = (".yaml", ".yml")
 _PACKAGE = "package.xml"  # file of a ROS package
+_OWN_URL, _MODELS = "package://guiderail/", Path(__file__).parents[1]  # URL and folder of this package's models
 
 
 def add_models(plant: MultibodyPlant, path: Path | str) -> list[ModelInstanceIndex]:
     """Add the models of a local SDF or URDF file, or of a file of Drake model directives (.dmd.yaml), to a plant.
 
-    Directives may refer to packages (folders with a `package.xml`) in the folder of their file. `package://` in a model
-    refers to packages above its file, packages next to these, and packages in the folders of ROS_PACKAGE_PATH.
+    `path` may also name a model of this package, such as package://guiderail/robots/iiwa14.urdf. Directives may refer
+    to packages (folders with a `package.xml`) in the folder of their file. `package://` in a model refers to packages
+    above its file, packages next to these, and packages in the folders of ROS_PACKAGE_PATH.
 
     Raises:
         InputError: If the file is of another type, or the file or one of its meshes cannot be read.
     """
     with _allow_package_map():
         parser = _make_parser(plant)
+        if str(path).startswith(_OWN_URL):
+            path = _MODELS / str(path).removeprefix(_OWN_URL)
         _refuse_crossed_limits(Path(path))
         if Path(path).suffix in _DIRECTIVES:
             parser.package_map().PopulateFromFolder(str(Path(path).resolve().parent))
@@ -118,7 +122,7 @@ def _make_parser(plant: MultibodyPlant) -> Parser:
     """Return a parser without the package `drake_models`, whose files Drake would download."""
     parser = Parser(plant)
     parser.package_map().Remove("drake_models")
-    parser.package_map().Add("guiderail", str(Path(__file__).parents[1]))
+    parser.package_map().Add("guiderail", str(_MODELS))
     return parser
 
 

@@ -1,9 +1,14 @@
-"""Plug-ins: entries of installed packages, all in one group of entry points, and the sibling distributions.
+"""Plug-ins: one table of names and string targets, for this package, its siblings and installed packages.
 
-A package declares a plug-in in the group "guiderail" of its entry points, as "KIND:NAME" = "module:attribute":
+`BUILT_IN` has the plug-ins of this package. Another package declares plug-ins in the group "guiderail" of its entry
+points, as "KIND:NAME" = "module:attribute":
 
     [project.entry-points.guiderail]
     "station:mujoco" = "guiderail_mujoco.station:MujocoStation"
+    "station_options:mujoco" = "guiderail.diagrams.stations.options:ContactOptions"
+
+The kinds task_options, station_options, guidance_options and learner_config name the class of an entry's options in a
+module that imports neither Drake nor PyTorch, so that options can be checked before slow imports.
 """
 
 from collections.abc import Iterator
@@ -16,7 +21,7 @@ from guiderail.models.common.errors import InputError
 GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
-    "parts": ("create-task",),
+    "parts": ("create-task", "create-tasks"),
     "studies": ("study", "robustness", "certify", "report"),
     "data": ("dataset",),
     "lerobot": (),
@@ -25,9 +30,64 @@ SIBLINGS = {
 """Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""
 
 
+_DIAGRAMS, _LEARNING, _ROBOTS = "guiderail.diagrams", "guiderail.tools.learning", "guiderail.models.robots"
+BUILT_IN = {
+    "task:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.task:BncConnector",
+    "task:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.task:GridClamp",
+    "task:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.task:NarrowPassage",
+    "task:Pouring": f"{_DIAGRAMS}.tasks.pouring.task:Pouring",
+    "task_options:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.options:BncOptions",
+    "task_options:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.options:GridClampOptions",
+    "task_options:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.options:NarrowPassageOptions",
+    "task_options:Pouring": f"{_DIAGRAMS}.tasks.pouring.options:PouringOptions",
+    "station:arm": f"{_DIAGRAMS}.stations.arm:ArmStation",
+    "station:gantry": f"{_DIAGRAMS}.stations.gantry:GantryStation",
+    "station:plane": f"{_DIAGRAMS}.stations.plane:PlaneStation",
+    "station:pouring": f"{_DIAGRAMS}.stations.pouring:PouringStation",
+    "station_options:arm": f"{_DIAGRAMS}.stations.options:ArmOptions",
+    "station_options:gantry": f"{_DIAGRAMS}.stations.options:GantryOptions",
+    "guidance:kgrl": f"{_DIAGRAMS}.guidance.primitive:KgrlGuidance",
+    "guidance:kmp": f"{_DIAGRAMS}.guidance.primitive:KmpGuidance",
+    "guidance:none": f"{_DIAGRAMS}.guidance.sct:unguided",
+    "guidance:residual": f"{_DIAGRAMS}.guidance.residual:residual",
+    "guidance:residual_cbf": f"{_DIAGRAMS}.guidance.residual:residual_cbf",
+    "guidance:residual_covariance": f"{_DIAGRAMS}.guidance.primitive:residual_covariance",
+    "guidance:residual_tangent": f"{_DIAGRAMS}.guidance.residual:residual_tangent",
+    "guidance:safe_residual": f"{_DIAGRAMS}.guidance.residual:safe_residual",
+    "guidance:sct": f"{_DIAGRAMS}.guidance.sct:sct",
+    "guidance:skgrl": f"{_DIAGRAMS}.guidance.primitive:SkgrlGuidance",
+    "robot:iiwa14": f"{_ROBOTS}.iiwa:IIWA14",
+    "robot:panda": f"{_ROBOTS}.panda:PANDA",
+    "robot:ur5e": f"{_ROBOTS}.ur5e:UR5E",
+    "end_effector:connector_tool": f"{_ROBOTS}.end_effectors:CONNECTOR_TOOL",
+    "end_effector:parallel_gripper": f"{_ROBOTS}.end_effectors:PARALLEL_GRIPPER",
+    "kernel:matern52": "guiderail.models.primitives.kernels:Matern52",
+    "kernel:squared_exponential": "guiderail.models.primitives.kernels:SquaredExponential",
+    "learner:bc": f"{_LEARNING}.cloning:BcLearner",
+    "learner:crossq": f"{_LEARNING}.off_policy:CrossQLearner",
+    "learner:ppo": f"{_LEARNING}.on_policy:PpoLearner",
+    "learner:sac": f"{_LEARNING}.off_policy:SacLearner",
+    "learner:td3": f"{_LEARNING}.off_policy:Td3Learner",
+    "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
+    "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
+    "learner_config:bc": f"{_LEARNING}.config:BcConfig",
+    "learner_config:crossq": f"{_LEARNING}.config:CrossQConfig",
+    "learner_config:ppo": f"{_LEARNING}.config:PpoConfig",
+    "learner_config:sac": f"{_LEARNING}.config:OffPolicyConfig",
+    "learner_config:td3": f"{_LEARNING}.config:Td3Config",
+    "learner_config:tqc": f"{_LEARNING}.config:OffPolicyConfig",
+    "learner_config:trpo": f"{_LEARNING}.config:TrpoConfig",
+}
+"""Plug-ins of this package: "module:attribute" by "kind:name"."""
+
+
 def find_plugins(kind: str) -> Iterator[tuple[str, metadata.EntryPoint]]:
-    """Yield the name and the entry point of each plug-in of a kind, without importing it."""
-    for point in metadata.entry_points(group=GROUP):
+    """Yield the name and the entry point of each plug-in of a kind, those of this package first, without importing it.
+
+    The entry points of this package belong to no distribution.
+    """
+    built_in = [metadata.EntryPoint(name, target, GROUP) for name, target in BUILT_IN.items()]
+    for point in (*built_in, *metadata.entry_points(group=GROUP)):
         prefix, _, name = point.name.partition(":")
         if prefix == kind and name:
             yield name, point
@@ -45,9 +105,9 @@ def load_plugin(kind: str, name: str, sibling: str) -> Any:
     raise MissingSiblingError(f"this {kind}", sibling)
 
 
-def is_from_sibling(point: metadata.EntryPoint) -> bool:
-    """Return True if an entry point belongs to a sibling distribution of guiderail."""
-    return point.dist is not None and point.dist.name in {f"guiderail-{name}" for name in SIBLINGS}
+def is_packaged(point: metadata.EntryPoint) -> bool:
+    """Return True if an entry point belongs to guiderail or to a sibling distribution."""
+    return point.dist is None or point.dist.name in {f"guiderail-{name}" for name in SIBLINGS}
 
 
 def is_sibling_module(module: str) -> bool:

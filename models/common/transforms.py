@@ -246,6 +246,26 @@ def _wrapped(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
+def nearest_pose(pose: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the numbers of a pose (6,) that are nearest to `near`, (6,), among those of the same orientation.
+
+    An orientation has the angles (a, b, c) and (a + π, π − b, c + π), and each of them plus full turns.
+    """
+    angles, last = pose[3:], near[3:]
+    angles = angles - 2 * math.pi * np.round((angles - last) / (2 * math.pi))
+    other = np.array([angles[0] + math.pi, math.pi - angles[1], angles[2] + math.pi])
+    other -= 2 * math.pi * np.round((other - last) / (2 * math.pi))
+    if (other - last) @ (other - last) < (angles - last) @ (angles - last):
+        angles = other
+    return np.concatenate([pose[:3], angles])
+
+
+def angle_between(first: np.ndarray, second: np.ndarray) -> float:
+    """Return the angle of the rotation between the orientations of two finite poses (6,), in [0, π] [rad]."""
+    R_first, R_second = pose_to_transform(first).rotation(), pose_to_transform(second).rotation()
+    return axis_angle(R_first.inverse() @ R_second)[1]
+
+
 def wrench_of_generalized_force(pose: np.ndarray, force: np.ndarray) -> np.ndarray:
     """Convert a generalized force (6,) along a pose's coordinates to the wrench (6,) at P in T that does the same work.
 

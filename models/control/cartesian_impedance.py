@@ -147,7 +147,7 @@ def impedance_torques(
     _, M_inverse_JT, failed = lapack.dposv(M, J.T, lower=1)
     if failed:
         raise np.linalg.LinAlgError("the arm's mass matrix is not positive definite")
-    Lambda_inverse = J @ M_inverse_JT + _REGULARIZATION
+    Lambda_inverse = regularized(J @ M_inverse_JT)
     R_inverse = _root_of_inverse(Lambda_inverse)
     L_modes, eigenvalues = _modes(K, R_inverse)
     velocity = J @ v
@@ -174,6 +174,16 @@ def impedance_torques(
     unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
     torque = _clipped(unlimited_torque, torque_limits)
     return JointTorques(torque, wrench, is_limited or bool((torque != unlimited_torque).any()))
+
+
+def regularized(Lambda_inverse: np.ndarray) -> np.ndarray:
+    """Return an inverse inertia (6, 6) that is positive definite also for a singular arm."""
+    return Lambda_inverse + _REGULARIZATION
+
+
+def has_regular_inertia(Lambda_inverse: np.ndarray) -> bool:
+    """Return True if the inertia Λ (6, 6) at the tool is that of a regular arm, in which no direction is lost."""
+    return _is_regular(_root_of_inverse(Lambda_inverse))
 
 
 def _mass_along(velocity: np.ndarray, Lambda_inverse: np.ndarray) -> float:

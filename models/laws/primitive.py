@@ -9,14 +9,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import is_whole
+from guiderail.models.common.arrays import is_finite, is_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.transforms import POSE_SIZE, pose_difference
+from guiderail.models.common.transforms import POSE_SIZE, angle_between, nearest_pose
 from guiderail.models.control.command_filters import CommandLaw
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws.law import Command, Law, checked_vector
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, UnsolvableError
-from guiderail.models.primitives.full_turns import continued_angles
 
 HISTORY_SOURCES = ("commanded", "measured")
 
@@ -57,19 +56,12 @@ def output_or_nearest(
     return (constraints.nearest(last, step), True) if output is None else (output, False)
 
 
-def continued_pose(pose: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-    """Return a pose (6,) with its angles on the full turns nearest to those of `last` (6,); for None, unchanged."""
-    if last is None:
-        return pose
-    return np.concatenate([pose[:3], continued_angles(pose[None, 3:], last[3:])[0]])
-
-
 def appended(history: np.ndarray, output: np.ndarray, *, is_pose: bool) -> np.ndarray:
     """Return the last P outputs (P, O), oldest first, after one more output (O,).
 
-    If outputs are poses with Euler angles, the new angles are on the full turns nearest to the newest stored ones.
+    If outputs are poses with Euler angles, the new angles are those nearest to the newest stored ones (`nearest_pose`).
     """
-    return np.concatenate([history[1:], (continued_pose(output, history[-1]) if is_pose else output)[None]])
+    return np.concatenate([history[1:], (nearest_pose(output, history[-1]) if is_pose else output)[None]])
 
 
 @dataclass(frozen=True)
@@ -81,16 +73,16 @@ class StateProgress:
 
         s_{k+1} = s_k + 1  if ‖y − x‖ ≤ tolerance  or  k + 1 − s_k > max_lag,  else  s_k
 
-    Here y is the last command and x the measured pose. For poses (6,), position and angles must each be within their
-    tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. An intended contact, such as in
-    a search, can therefore delay the motion by at most `max_lag` steps. The tolerance should cover the deviations that
-    contact and tracking cause while nothing blocks the robot.
+    Here y is the last command and x the measured pose. For poses (6,), the distance and the rotation between them must
+    each be within their tolerance. Progress never decreases and is at most `max_lag` steps behind the clock. An
+    intended contact, such as in a search, can therefore delay the motion by at most `max_lag` steps. The tolerance
+    should cover the deviations that contact and tracking cause while nothing blocks the robot.
 
     Raises:
         InputError: If an argument is out of range.
     """
 
-    tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and of the angles [rad], positive
+    tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and the rotation [rad], positive
     # Largest number of steps behind the clock, not negative; with 0, progress follows the clock. (The option `max_lag`
     # of an environment is a time in seconds.)
     max_lag: int
@@ -110,10 +102,12 @@ class StateProgress:
             command: Last command (O,).
             pose: Measured pose (O,); NaN counts as not near.
         """
-        is_pose = len(command) == POSE_SIZE
-        error = pose_difference(command, pose) if is_pose else command - pose
-        position, angles = (error[:3], error[3:]) if is_pose else (error, error[:0])
-        is_near = all(np.sqrt(e @ e) <= tol for e, tol in zip((position, angles), self.tolerance, strict=True))
+        is_pose, error = len(command) == POSE_SIZE, command - pose
+        is_near = is_finite(error)
+        if is_near:
+            distance = error[:3] if is_pose else error
+            angle = angle_between(command, pose) if is_pose else 0.0
+            is_near = bool(np.sqrt(distance @ distance) <= self.tolerance[0] and angle <= self.tolerance[1])
         return step + 1 if is_near or clock - step > self.max_lag else step
 
 
@@ -144,8 +138,8 @@ class PrimitiveLaw(Law):
         outputs: Indices of the outputs that an action moves, one entry each; all by default.
         history_source: "commanded" for a smooth motion; "measured" for a robot that tracks well or is pushed by an
             operator.
-        near: Pose (6,), if outputs are poses with Euler angles. The angles of the first pose of the history are on the
-            full turns nearest to it, and those of each later pose on the full turns nearest to the pose before.
+        near: Pose (6,), if outputs are poses with Euler angles. The angles of the first pose of the history are nearest
+            to it among those of the same orientation, and those of each later pose nearest to the pose before.
         command_filter: Filter of the commands; none by default. It starts at the pose; a `MotionConstraintFilter`
             starts at rest, or with the velocity of the last two outputs if `start` is given several. If it cannot brake
             within its largest acceleration before it leaves the constraints, the first command exceeds this
@@ -209,7 +203,7 @@ class PrimitiveLaw(Law):
         if pose.ndim != 1 and len(pose) not in lengths:
             raise InputError(f"pose must be {self.num_outputs} finite numbers, or the last {length} outputs")
         recent = np.atleast_2d(pose)
-        first = recent[-1] if self.near is None else continued_pose(recent[-1], self.near)
+        first = recent[-1] if self.near is None else nearest_pose(recent[-1], self.near)
         history = recent if len(recent) == length else np.tile(first, (length, 1))
         filtered, is_slowed = np.zeros(0), False
         if isinstance(self.command_filter, MotionConstraintFilter):

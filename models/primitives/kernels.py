@@ -24,9 +24,7 @@ class Kernel(Protocol):
         ...
 
 
-KERNELS: Registry[Callable[..., Kernel]] = Registry(
-    "kernel", package=__package__, decorator="register_kernel", plugin="kernel", check=check_callable
-)
+KERNELS: Registry[Callable[..., Kernel]] = Registry("kernel", plugin="kernel", check=check_callable)
 """Registry of kernels; the names are the values of an environment's option `kernel`.
 
 An entry is called with `length_scale=` and its further parameters, all of them numbers, and returns a kernel.

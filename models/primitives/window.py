@@ -160,7 +160,7 @@ class StepFactor:
         (A, L), self._uncorrected = self._uncorrected, None
         if len(A):
             U, s, Vt = np.linalg.svd(A, full_matrices=False)
-            keep = s > _NEGLIGIBLE * s[0]
+            keep = s > _NEGLIGIBLE * s.max(initial=0.0)  # a kernel without features has no singular values
             self._basis = np.ascontiguousarray(Vt[keep].T)
             self.constraint_rows = np.ascontiguousarray(U[:, keep] * s[keep])
         else:

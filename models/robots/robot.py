@@ -1,8 +1,8 @@
 """Robots and end effectors as data, and their registries.
 
 A robot of this package consists of a Python file and a model file. The Python file constructs a `Robot` and registers
-it by `register_robot`; `find_robot(name)` returns it. An installed package adds a robot by an entry point of the group
-`guiderail.robots` (end effectors: `guiderail.end_effectors`), a script by a call of `register_robot`.
+it by `register_robot`; `find_robot(name)` returns it. An installed package adds a robot by an entry point
+"robot:NAME" of the group `guiderail` ("end_effector:NAME"), a script by a call of `register_robot`.
 """
 
 import math
@@ -155,10 +155,9 @@ def _check_end_effector(name: str, end_effector: object) -> None:
         raise InputError(f"an end effector is registered as an EndEffector object, not {brief(end_effector)}")
 
 
-ROBOTS: Registry[Robot] = Registry("robot", package="guiderail.models.robots", plugin="robot", check=_check_robot)
+ROBOTS: Registry[Robot] = Registry("robot", plugin="robot", check=_check_robot)
 END_EFFECTORS: Registry[EndEffector] = Registry(
     "end effector",
-    package="guiderail.models.robots",
     plugin="end_effector",
     check=_check_end_effector,
 )

@@ -9,9 +9,9 @@ from typing import Any
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import write_table
+from guiderail_parts.pairs import Pair, find_pairs
 from research.command import Parser, print_result, run_program
 from research.parts.campaign import finish, learn, prepare, summarize, to_table
-from research.parts.pairs import Pair, find_pairs
 
 DIFFICULTIES = ("standard", "hard", "automate")
 

@@ -16,10 +16,9 @@ import pandas as pd
 import yaml
 
 from guiderail.models.common.errors import InputError
-from guiderail_parts.create_task import create_task
-from guiderail_parts.geometry.assembly_check import MAX_SHRINK, OverlapError
+from guiderail_parts.batch import create_with_shrink
 from guiderail_parts.isolation import IsolatedError, run_isolated
-from research.parts.pairs import Pair
+from guiderail_parts.pairs import Pair
 
 COMMAND = (sys.executable, "-m", "guiderail")
 
@@ -95,29 +94,18 @@ def prepare(pair: Pair, out: Path, timeout: float) -> dict[str, Any]:
 
 
 def _prepare(pair: Pair, folder: Path, log: Path) -> dict[str, Any]:
-    shrink = 0.0
     with log.open("a", encoding="utf-8") as file:
 
         def write(line: str) -> None:
             file.write(f"{line}\n")
             file.flush()
 
-        while True:
-            shutil.rmtree(folder, ignore_errors=True)
-            try:
-                measured = create_task(
-                    pair.plug, pair.socket, folder, unit=pair.unit, shrink=shrink, only_insert=True, log=write
-                )
-            except OverlapError as error:
-                write(str(error))
-                if error.shrink is None or shrink + error.shrink > MAX_SHRINK:
-                    raise StepError(str(error)) from error
-                shrink += error.shrink  # repeated until the parts do not overlap
-            except InputError as error:
-                write(str(error))
-                raise StepError(str(error)) from error
-            else:
-                return {**measured, "shrink_mm": 1e3 * shrink}
+        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            return create_with_shrink(pair, folder, write, only_insert=True)
+        except InputError as error:
+            write(str(error))
+            raise StepError(str(error)) from error
 
 
 def write_task(pair: Pair, out: Path, timeout: float, shrink: float) -> Path:

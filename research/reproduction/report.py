@@ -68,22 +68,18 @@ def write_report(tables: Path = TABLES, page: Path = PAGE) -> Path:
 
 def format_report(all_entries: list[Entry]) -> str:
     """Return the report as Markdown: a table of the verdicts, and a section for each entry."""
-    lines = ["| figure or table | verdict | measure | runs here (thesis) |", "|---|---|---|---|"]
-    lines += [
-        f"| [{_name(entry)}](#{_anchor(entry)}) | {entry.verdict} | {entry.measure} | {entry.runs} |"
-        for entry in all_entries
-    ]
+    lines = ["| figure or table | verdict | runs here (thesis) |", "|---|---|---|"]
+    lines += [f"| [{_name(entry)}](#{_anchor(entry)}) | {entry.verdict} | {entry.runs} |" for entry in all_entries]
     hours = sum(entry.hours or 0.0 for entry in all_entries)
     lines += ["", f"The stored training runs of this table took {hours:.1f} core-hours.", ""]
     for entry in all_entries:
         lines += [f"### {_name(entry)}", ""]
         lines += [f"- **Thesis**, {number}: {THESIS[number]}." for number in entry.numbers]
-        lines += [f"- **Here:** {sentence}." for sentence in entry.ours]
-        lines += [f"- **Verdict:** {entry.verdict}. Measure: {entry.measure}."]
-        lines += [f"- **Differences:** {entry.differences}."]
+        lines += [f"- **Here:** {'; '.join(entry.ours)}.", f"- **Measure:** {entry.measure}."]
+        lines += [f"- **Differences:** {entry.differences}."] if entry.differences != "none" else []
         cost = "" if entry.hours is None else f" ({entry.hours:.2f} core-hours)"
         stored = ", ".join(f"`research/{name}`" for name in entry.tables)
-        lines += [f"- **Tables:** {stored}.", f"- **Command:** `{entry.command}`{cost}", ""]
+        lines += [f"- `{entry.command}`{cost}; stored in {stored}.", ""]
     return "\n".join(lines)
 
 
@@ -562,14 +558,16 @@ def _images(tables: Path) -> Entry:
     evaluated = read_table(tables / "narrow_passage_images_evaluated.csv")
     baselines = {m: evaluated[evaluated["method"] == m] for m in ("demonstration", "uniform_random")}
     evaluated = evaluated[evaluated["method"] == "kgrl"]
-    greedy = []
-    for number, rows in evaluated.groupby("after_episodes"):
-        by_seed = rows.groupby("seed")[["return", "reward_obstacle_cost"]].mean()
-        greedy.append(
-            f"after {number} episodes the greedy policies have a mean return of {by_seed['return'].mean():.1f} (least "
-            f"of a run {by_seed['return'].min():.1f}) and an obstacle cost of "
-            f"{by_seed['reward_obstacle_cost'].mean():.1f}"
-        )
+    by_seed = evaluated.groupby(["after_episodes", "seed"])[["return", "reward_obstacle_cost"]].mean()
+    numbers = by_seed.index.unique("after_episodes")
+    returns = [by_seed.loc[number, "return"] for number in numbers]
+    costs = [by_seed.loc[number, "reward_obstacle_cost"].mean() for number in numbers]
+    greedy = (
+        f"after {_enumerate([str(number) for number in numbers])} episodes the greedy policies have mean returns of "
+        f"{', '.join(f'{rows.mean():.0f}' for rows in returns)} (least of a run "
+        f"{', '.join(f'{rows.min():.0f}' for rows in returns)}) and obstacle costs of "
+        f"{', '.join(f'{cost:.0f}' for cost in costs)}"
+    )
     last = evaluated[evaluated["after_episodes"] == evaluated["after_episodes"].max()]
     is_avoided = bool((last["reward_obstacle_cost"] == 0).all()) and bool(last["success"].all())
     pixels = _runs_of(read_table(tables / "narrow_passage_images.csv"), "kgrl_pixels")
@@ -582,15 +580,13 @@ def _images(tables: Path) -> Entry:
             f"{_band(runs, 'return', slice(25, 30))} in the last five; obstacle cost "
             f"{_band(runs, 'reward_obstacle_cost', slice(0, 5))} and "
             f"{_band(runs, 'reward_obstacle_cost', slice(25, 30))}",
-            *greedy,
+            greedy,
             "; ".join(
                 f"{name.replace('_', ' ')}: return {rows['return'].mean():.1f}, obstacle cost "
                 f"{rows['reward_obstacle_cost'].mean():.1f}"
                 for name, rows in baselines.items()
             ),
             f"without averaging the pixels: {len(pixels)} of 10 runs so far",
-            "an earlier version of this page said that the figure is not reproduced: it asked for consecutive "
-            "exploring episodes without any cost, which is stricter than the thesis's measure",
         ),
         f"{len(runs)} (not given)",
         "pixels are averaged five by five before the first layer; an action lasts five control steps; the preset "

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from guiderail.tools.files import write_atomically
 from research.command import Parser, run_program
-from research.results.methods import README_COLUMNS, hard_tasks_table, replace_table
+from research.results.methods import README_COLUMNS, README_TITLES, hard_tasks_table, replace_table
 from research.results.page import store, write_pages
 
 TABLES = Path(__file__).parent
@@ -35,7 +35,7 @@ def main(arguments: list[str]) -> None:
         print(page)
     if args.out is None:
         for page, table in (
-            (ROOT / "README.md", hard_tasks_table(tables, README_COLUMNS)),
+            (ROOT / "README.md", hard_tasks_table(tables, README_COLUMNS, README_TITLES)),
             (ROOT / "docs" / "results.md", hard_tasks_table(tables)),
         ):
             write_atomically(page, replace_table(page.read_text("utf-8"), table).encode())

@@ -21,16 +21,19 @@ from research.results.statistics import Scores, bootstrap_interval, interquartil
 from research.studies import study_path
 
 COLUMNS = (
-    "method", "training episodes (seeds)", "held-out success [%], each seed of 100", "IQM of the seeds [%] (95 %)",
-    "episodes to convergence",
-    "max. commanded violation", "peak force held out (in training) [N]",
+    "method", "training episodes (seeds)", "held-out success [%]", "IQM (95 %) [%]", "episodes to convergence",
+    "stopped in training [%]", "max. commanded violation", "peak force held out (in training) [N]",
 )  # fmt: skip
 HARD_TASKS_COLUMNS = (
     "task", "guided, success [%]", "residual RL, success [%]", "scripted / random, success [%]",
     "stopped in training, guided / residual RL [%]", "episodes with violations, guided / residual RL [%]",
     "training episodes per seed (seeds)",
 )  # fmt: skip
-README_COLUMNS = 5  # the README has only these first columns of the hard tasks
+# Columns and rows of the README's table of hard tasks: without an effect, and with an effect of template and primitive.
+README_COLUMNS = 5
+README_TITLES = ("Connector, hard", "Grid clamp, hard, force not bounded", "Narrow passage, hard")
+MISSING = "–"
+ALWAYS = (0, 2)  # columns that every table of methods has: name and success
 BEGIN, END = "<!-- Written by python -m research.results -->", "<!-- End of the written table -->"
 GUIDED = ("sct", "kgrl", "skgrl")
 RUN_OFFSET = " †"  # mark of results that were evaluated with the hidden offset of each run
@@ -47,22 +50,26 @@ def task_table(task: str, tables: Path) -> str:
     """
     parts = []
     for section in SECTIONS.get(task, ()):
-        rows = [(row.name, *_cells(seeds)) for row in section.rows if len(seeds := last_rows(tables, row))]
+        rows = [(row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))]
         if rows:
+            studies = ", ".join(f"`{study}`" for study in dict.fromkeys(row.study for row, _ in rows))
+            table = methods_table([(row.name, seeds) for row, seeds in rows])
             remarks = "".join(f"\n{line}\n" for write in REMARKS for line in write(section, tables))
-            parts.append(f"### {section.title}\n\n{_markdown(COLUMNS, rows)}\n{remarks}")
+            parts.append(f"### {section.title}\n\nStudies: {studies}.\n\n{table}\n{remarks}")
     return "\n".join(parts)
 
 
-def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS)) -> str:
+def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS), titles: Sequence[str] | None = None) -> str:
     """Return the Markdown table of the hard tasks: a row for each of their sections.
 
     Args:
         tables: Folder of the studies' tables.
         columns: Number of columns.
+        titles: Titles of the sections; by default all.
     """
     rows = []
     sections = [section for of_task in SECTIONS.values() for section in of_task if ", hard" in section.title]
+    sections = [section for section in sections if titles is None or section.title in titles]
     for section in sections:
         named = {row.name: (row, seeds) for row in section.rows if len(seeds := last_rows(tables, row))}
         guided = [named[name] for name in section.guided if name in named]
@@ -83,7 +90,7 @@ def hard_tasks_table(tables: Path, columns: int = len(HARD_TASKS_COLUMNS)) -> st
                 "; ".join(efforts),
             )[:columns]
         )
-    return _markdown(HARD_TASKS_COLUMNS[:columns], rows)
+    return markdown_table(HARD_TASKS_COLUMNS[:columns], rows)
 
 
 def replace_table(text: str, table: str) -> str:
@@ -109,30 +116,68 @@ def last_rows(tables: Path, row: Row) -> pd.DataFrame:
     return result.sort_values(["seed", "after_episodes"], kind="stable").drop_duplicates("seed", keep="last")
 
 
-def _markdown(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
-def _cells(seeds: pd.DataFrame) -> tuple[str, ...]:
-    """Return the cells of a method's row after its name."""
-    if not _is_trained(seeds):
+def methods_table(methods: Sequence[tuple[str, pd.DataFrame]]) -> str:
+    """Return the Markdown table of methods; a sentence replaces a column in which all methods are equal."""
+    rows = [(name, *_method_cells(seeds)) for name, seeds in methods]
+    trained = [is_trained(seeds) for _, seeds in methods]
+    values = [
+        {cell for cell, learns in zip(column, trained, strict=True) if learns or cell != MISSING}
+        for column in zip(*rows, strict=True)
+    ]
+    kept = [index for index, column in enumerate(values) if len(column) > 1 or index in ALWAYS]
+    equal = {COLUMNS[i]: "".join(column - {MISSING}) for i, column in enumerate(values) if i not in kept}
+    sentences = "; ".join(f"{name}: {value}" for name, value in equal.items() if value)
+    caption = f"The same for all methods: {sentences}.\n\n" if sentences else ""
+    return caption + markdown_table([COLUMNS[i] for i in kept], [[row[i] for i in kept] for row in rows])
+
+
+def _method_cells(seeds: pd.DataFrame) -> tuple[str, ...]:
+    """Return the cells of a method's row after its name: of all its seeds together, not of each."""
+    if not is_trained(seeds):
         parts = [_safety(seeds, "")]
-        return "–", "; ".join(map(_interval, seeds.to_dict("records"))), "–", "–", _violation(parts), _forces(parts)
+        success = _interval(seeds.iloc[0].to_dict()) if len(seeds) == 1 else success_cell(seeds)
+        return "–", success, "–", "–", "–", largest_violation(parts), _forces(parts)
     held_out = _is_evaluated(seeds)
-    episodes = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"]))
-    column = "success_rate" if held_out else "training_success_rate"
-    number = "" if not held_out or (seeds["episodes"] == 100).all() else f" of {_join(seeds['episodes'])}"
-    success = _join(100 * seeds[column]) + (number if held_out else " in training")
-    converged = _join(seeds["training_episodes_to_convergence"])
+    success = success_cell(seeds) if held_out else f"{mean_and_range(seeds, 'training_success_rate')} in training"
     parts = [_safety(seeds, prefix) for prefix in (("", "training_") if held_out else ("training_",))]
     forces = _forces(parts) if held_out else f"({_forces(parts)})"
-    return f"{episodes} ({span(seeds['seed'])})", success, _middle(seeds), converged, _violation(parts), forces
+    converged = _converged(seeds["training_episodes_to_convergence"])
+    return effort_cell(seeds), success, _middle(seeds), converged, _stopped(seeds), largest_violation(parts), forces
+
+
+def effort_cell(seeds: pd.DataFrame) -> str:
+    """Return the number of training episodes and the seeds; a dash for a policy that does not learn."""
+    if not is_trained(seeds):
+        return "–"
+    episodes = "/".join(f"{n:g}" for n in dict.fromkeys(seeds["training_episodes"]))
+    return f"{episodes} ({span(seeds['seed'])})"
+
+
+def success_cell(seeds: pd.DataFrame) -> str:
+    """Return the mean success with its range, and the number of episodes of each seed if it is not 100."""
+    numbers = [*dict.fromkeys(seeds["episodes"].astype(int))]
+    each = "" if numbers == [100] else f", of {'/'.join(map(str, numbers))} each"
+    return f"{mean_and_range(seeds)}{each}"
+
+
+def _converged(episodes: pd.Series) -> str:
+    """Return the median number of episodes to convergence, and its range; NaN means never."""
+    numbers = episodes.fillna(np.inf).to_numpy(float)
+    low, middle, high = (
+        "never" if np.isinf(value) else f"{value:g}" for value in (numbers.min(), np.median(numbers), numbers.max())
+    )
+    return middle if low == high else f"{middle} ({low}–{high})"
 
 
 def _scores(seeds: pd.DataFrame) -> list[np.ndarray] | None:
     """Return the held-out success of the seeds; None for too few seeds or a method that does not learn."""
-    if not (len(seeds) >= MIN_SEEDS and _is_trained(seeds) and _is_evaluated(seeds)):
+    if not (len(seeds) >= MIN_SEEDS and is_trained(seeds) and _is_evaluated(seeds)):
         return None
     return [seeds["success_rate"].to_numpy(dtype=float)]
 
@@ -190,7 +235,7 @@ def knowledge(section: Section, tables: Path) -> list[str]:
     failed = []
     for row in section.rows:
         seeds = last_rows(tables, row)
-        if _is_trained(seeds):
+        if is_trained(seeds):
             methods.setdefault(number := demonstrated_episodes(row), []).append(row.name)
             if number and not seeds.get("training_ended_in_success", pd.Series([1])).any():
                 failed.append(row.name)
@@ -249,7 +294,8 @@ def offsets(section: Section, tables: Path) -> list[str]:
     return [f"One hidden offset for each seed, in training and in held-out episodes: {'; '.join(fixed)}.{others}"]
 
 
-def _is_trained(seeds: pd.DataFrame) -> bool:
+def is_trained(seeds: pd.DataFrame) -> bool:
+    """Return True for a method that learns, and False for a baseline policy."""
     return "training_episodes" in seeds and bool(seeds["training_episodes"].notna().any())
 
 
@@ -263,10 +309,6 @@ _SAFETY = ("max_commanded_violation", "violating_episodes", "peak_force")
 
 def _safety(seeds: pd.DataFrame, prefix: str) -> pd.DataFrame:
     return seeds[[f"{prefix}{name}" for name in _SAFETY]].set_axis(_SAFETY, axis=1)
-
-
-def _join(values: pd.Series) -> str:
-    return ", ".join("never" if pd.isna(value) else f"{value:.3g}" for value in values)
 
 
 def span(seeds: Iterable[float]) -> str:
@@ -283,7 +325,7 @@ def _interval(row: Mapping[Any, Any]) -> str:
     return f"{rate:.3g} ({low:.1f}–{high:.1f}) of {row['episodes']:.0f}"
 
 
-def _violation(parts: Sequence[pd.DataFrame]) -> str:
+def largest_violation(parts: Sequence[pd.DataFrame]) -> str:
     """Return the largest commanded violation and the number of episodes with violations, held-out and training."""
     worst = max(float(part["max_commanded_violation"].max()) for part in parts)
     if worst <= TOLERANCE:
@@ -297,11 +339,11 @@ def _forces(parts: Sequence[pd.DataFrame]) -> str:
     return held_out + "".join(f" ({force})" for force in training)
 
 
-def _success(seeds: pd.DataFrame) -> str:
-    """Return the mean held-out success [%] with the range over several seeds; a single seed is marked."""
-    rates = 100 * seeds["success_rate"].astype(float)
+def mean_and_range(seeds: pd.DataFrame, column: str = "success_rate") -> str:
+    """Return the mean success [%] with the range over several seeds; a single seed is marked."""
+    rates = 100 * seeds[column].astype(float)
     interval = "" if rates.min() == rates.max() else f" ({rates.min():.0f}–{rates.max():.0f})"
-    is_single = len(seeds) == 1 and _is_trained(seeds)
+    is_single = len(seeds) == 1 and is_trained(seeds)
     is_exact = 99.5 <= rates.mean() < 100 or 0 < rates.mean() < 10  # 99.6 is not written as 100
     mean = f"{rates.mean():.1f}".removesuffix(".0") if is_exact else f"{rates.mean():.0f}"
     return f"{mean}{' (one seed)' if is_single else interval}"
@@ -309,7 +351,7 @@ def _success(seeds: pd.DataFrame) -> str:
 
 def _percent(result: tuple[Row, pd.DataFrame] | None) -> str:
     """Return the success of a row, marked if evaluated with the hidden offset of each run; a dash without a result."""
-    return f"{_success(result[1])}{RUN_OFFSET if has_run_offset(result[0]) else ''}" if result else "–"
+    return f"{mean_and_range(result[1])}{RUN_OFFSET if has_run_offset(result[0]) else ''}" if result else "–"
 
 
 def _label(row: Row) -> str:

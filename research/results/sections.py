@@ -52,8 +52,6 @@ _ALL = ("demonstration", "uniform_random", "best_constant", "scripted")
 _ALL_ZERO = ("zero", "uniform_random", "best_constant", "scripted")
 _NOT_CONSTANT = ("demonstration", "uniform_random", "scripted")
 _NAMES_NOT_CONSTANT = (*BASELINES[:2], BASELINES[3])
-# Evaluation set of the study connector_hard_gantry by the label of its rows in the table of methods.
-_STATIONS = {"at 2.5 ms": "fresh", "MuJoCo": "MuJoCo", "iiwa": "iiwa", "Panda": "Panda", "UR5e": "UR5e"}
 
 SECTIONS: dict[str, list[Section]] = {
     "BncConnector": [
@@ -120,33 +118,6 @@ SECTIONS: dict[str, list[Section]] = {
                 Row("KGRL on the base policy", "connector_hard_base_policy", "kgrl"),
                 Row("Policy Decorator", "connector_hard_base_policy", "policy_decorator"),
                 Row("base policy alone", "connector_hard_base_policy", "base"),
-            ],
-        ),
-        Section(
-            "Connector, hard, learned on the gantry at 2.5 ms, evaluated there and elsewhere",
-            [
-                Row(f"KGRL, {where}", "connector_hard_gantry", "kgrl", evaluation)
-                for where, evaluation in _STATIONS.items()
-            ]
-            + [
-                row
-                for where, evaluation in _STATIONS.items()
-                for row in _baselines(
-                    "connector_hard_gantry",
-                    _NOT_CONSTANT,
-                    evaluation,
-                    [f"{name}, {where}" for name in _NAMES_NOT_CONSTANT],
-                )
-            ],
-        ),
-        Section(
-            "Connector, hard, trained in Drake, evaluated in MuJoCo",
-            [
-                Row("KGRL", "connector_hard_fine", "kgrl", "MuJoCo"),
-                Row("KGRL, randomized contact", "connector_hard_fine", "kgrl_randomized", "MuJoCo"),
-                Row("sKGRL, adaptive history", "connector_hard_fine", "skgrl_adaptive", "MuJoCo"),
-                Row("residual RL", "connector_hard_fine", "residual", "MuJoCo"),
-                *_baselines("connector_hard_fine", _NOT_CONSTANT, "MuJoCo", _NAMES_NOT_CONSTANT),
             ],
         ),
         Section(

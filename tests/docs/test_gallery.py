@@ -48,6 +48,29 @@ def test_endings_are_stored_for_every_panel(gallery):
         assert list(endings[name]) == [panel.title for panel in panels()], f"{name} is stale: make gallery"
 
 
+def test_readme_commands_train_what_the_picture_shows(gallery):
+    commands = gallery.readme_commands()
+    assert {f"{key}={value}" for key, value in gallery.ON_ARM.items() if key != "guidance"} <= {*commands["train"]}
+    assert commands["train"][1] == "BncConnector"
+    assert commands["train"][commands["train"].index("--out") + 1] == commands["visualize"][1]
+    assert (gallery.FOLDER / "readme.jpg").is_file()
+
+
+def test_captions_state_the_stored_endings(gallery):
+    endings = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
+    for page in (DOCS.parent / "README.md", DOCS / "index.md", DOCS / "gallery.md", DOCS / "start.md"):
+        captions = re.findall(r"!\[([^\]]*)\]\([\w/]*pictures/(\w+)\.(?:webp|jpg)\)", page.read_text(encoding="utf-8"))
+        assert captions, page.name
+        for caption, name in captions:
+            expected = "; ".join(f"{title}: {ending}" for title, ending in endings[name].items())
+            assert caption == expected, f"{page.name}, {name}: {expected}"
+
+
+def test_index_has_the_commands_of_the_readme():
+    (commands,) = re.findall(r"```sh\n(pip install.*?)```", (DOCS / "index.md").read_text("utf-8"), re.DOTALL)
+    assert commands in (DOCS.parent / "README.md").read_text("utf-8")
+
+
 def test_endings_in_the_passage_are_up_to_date(gallery):
     endings = json.loads((gallery.FOLDER / "gallery.json").read_text(encoding="utf-8"))
     name = "passage_constraint"

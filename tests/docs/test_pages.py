@@ -46,6 +46,13 @@ def test_every_page_is_in_the_contents():
         assert name == "index" or f"\n{name}\n" in contents, name
 
 
+def test_index_for_language_models_lists_every_page():
+    listed = LINK.findall((DOCS / "llms.txt").read_text(encoding="utf-8"))
+    assert all((DOCS / page).is_file() for page in listed)
+    pages = {page.relative_to(DOCS).as_posix() for page in WRITTEN} - {"index.md"}
+    assert pages <= {*listed}, pages - {*listed}
+
+
 def test_every_reference_page_is_in_a_toctree(generator):
     text = "".join(page.read_text(encoding="utf-8") for page in WRITTEN)
     assert all(f"reference/{name}\n" in text for name in generator.PAGES)
@@ -89,6 +96,12 @@ def test_reference_has_every_command_task_and_template_kind(reference):
     kinds = (*ACTIVE_CONSTRAINTS, *INPUT_MAPPINGS, *TRANSITION_DISTANCES)
     assert all(f"\n### {name}\n" in reference["templates"] for name in kinds)
     assert all(f"| `{metric.name}` |" in reference["metrics"] for metric in (*COLUMNS, *statistics_of().values()))
+
+
+def test_signatures_of_the_reference_have_types(reference):
+    signatures = re.findall(r"^    (\**\w+)(: [^=]+)?(?: ?=.*)?,$", reference["names"], re.MULTILINE)
+    assert len(signatures) > 100
+    assert not [name for name, hint in signatures if not hint]
 
 
 def test_template_fields_have_descriptions(reference):

@@ -7,8 +7,16 @@ import re
 import numpy as np
 from pydrake.common.value import Value
 from pydrake.systems.analysis import Simulator
-from pydrake.systems.framework import CacheIndex, DiscreteStateIndex, InputPort, OutputPort, ValueProducer
+from pydrake.systems.framework import (
+    CacheIndex,
+    DiscreteStateIndex,
+    InputPort,
+    OutputPort,
+    PortDataType,
+    ValueProducer,
+)
 
+from guiderail.models.common.errors import InputError
 from oracles.prerequisites import changed_outputs
 
 EXCEPTIONS = ("InputError", "PolicyError", "DivergedError", "AttributeError")
@@ -27,8 +35,9 @@ def classes(path):
 
 
 def system_names(path):
-    """Return the names of the classes of a file that derive from LeafSystem."""
-    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id == "LeafSystem" for b in c.bases)]
+    """Return the names of the classes of a file that derive from LeafSystem or ConvertibleSystem."""
+    bases = ("LeafSystem", "ConvertibleSystem")
+    return [c.name for c in classes(path) if any(isinstance(b, ast.Name) and b.id in bases for b in c.bases)]
 
 
 def ports(system):
@@ -148,5 +157,25 @@ def check_stale_outputs(system):
     assert not stale
 
 
-RULES = (check_getters, check_documentation, check_prerequisites, check_stale_outputs)
+def check_start(system):
+    """Check that a system whose last command is a state refuses to command without an initialization."""
+    source = inspect.getsource(inspect.getmodule(type(system)))
+    if "unset_state(" not in source and "LastValidPose(" not in source:
+        return
+    context = system.CreateDefaultContext()
+    for kind, name, port in ports(system):
+        if kind == "input" and port.get_data_type() == PortDataType.kVectorValued:
+            # A command that is not finite is replaced by the last one.
+            port.FixValue(context, np.full(port.size(), np.nan if name == "desired_pose" else 0.5))
+    errors = []
+    for kind, _, port in ports(system):
+        if kind == "output":
+            try:
+                port.Eval(context)
+            except InputError as error:
+                errors.append(str(error))
+    assert any("has no start: call Simulator.Initialize()" in error for error in errors), errors
+
+
+RULES = (check_start, check_getters, check_documentation, check_prerequisites, check_stale_outputs)
 """Checks of one system."""

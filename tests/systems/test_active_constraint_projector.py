@@ -305,6 +305,14 @@ def test_command_moves_inside_when_the_robot_starts_outside(start, steps, violat
     assert violations[-1] <= 1e-9
 
 
+def test_last_command_of_the_start_is_moved_towards_the_constraints():
+    """The measured start is outside; the first last command is already a command, within the speed of one period."""
+    start = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0])
+    rig = Rig(start)
+    last = rig.system.get_last_desired_pose_output_port().Eval(rig.context)
+    np.testing.assert_allclose(last, start + [0, 0, 0.5 * PERIOD, 0, 0, 0], atol=1e-9)
+
+
 def test_measured_violation_is_evaluated_at_the_measured_pose():
     rig = Rig()
     rig.step(START, measured=np.array([0.0, 0.0, 0.07, 0.0, 0.0, 0.0]))

@@ -70,6 +70,15 @@ def test_new_command_is_valid_at_once_after_a_timeout(phase):
     rig.check(SECOND, command_timed_out=0)
 
 
+def test_age_is_that_at_the_last_check_and_not_the_present_one():
+    """The outputs do not depend on time, so that an age from the present time would depend on when they are cached."""
+    rig = Rig(FIRST, time=-0.5 * PERIOD)
+    rig.advance(TIMEOUT - 0.5 * PERIOD)  # after the check at which the age is TIMEOUT − 0.5 PERIOD
+    rig.context.SetTime(rig.context.get_time() + 0.4 * PERIOD)
+    rig.context.SetAllCacheEntriesOutOfDate()
+    rig.check(FIRST, command_timed_out=0)
+
+
 def test_late_command_is_stored_before_it_times_out():
     rig = Rig(FIRST, time=0.0)
     rig.advance(4.5 * PERIOD)

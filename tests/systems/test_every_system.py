@@ -57,8 +57,8 @@ def system_by_name():
     template, frames = load_template("pouring"), {"mug_tip": RigidTransform()}
     body, other = arm.tool[0], plant.world_body()
     gains = systems.ImpedanceGains(np.eye(6), np.ones(6), np.zeros(7))
-    condition = systems.TerminationTerm("success", {"u": 2}, lambda u: False)
-    term = systems.RewardTerm("cost", {"u": 2}, lambda u: 0.0)
+    condition = systems.TerminationTerm("success", {"u": 2}, lambda u: bool(u[0] > 0.0))
+    term = systems.RewardTerm("cost", {"u": 2}, lambda u: float(np.nan_to_num(u[0])))
     instances = [
         systems.ActiveConstraintProjector(template, frames, PERIOD),
         systems.CartesianImpedanceController(plant, arm.target, arm.tool_center, gains, period=PERIOD),
@@ -67,6 +67,7 @@ def system_by_name():
         systems.CommandFilter(BarrierFilter(KeepOut([[5.0, 5.0]], [[6.0, 6.0]], BOX, margin=0.0)), PERIOD),
         systems.CommandWatchdog(PERIOD),
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
+        systems.ContinuousPose(np.zeros(6), PERIOD),
         systems.CenterOfPressure(0.5),
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
@@ -75,7 +76,7 @@ def system_by_name():
         systems.EpisodeMonitor([condition], PERIOD),
         systems.ExternalTorqueSensor(plant, body, np.ones(7), np.ones(7), period=PERIOD),
         systems.HistoryBuffer(2, 3, PERIOD),
-        systems.HistoryLengthSchedule([1, 2], PERIOD),
+        systems.HistoryLengthSchedule([1, 2, 3], PERIOD),
         systems.ForceMonitor(np.ones(6)),
         systems.JointTorqueWrench(plant, arm.target, arm.tool_center, period=PERIOD, time_constant=0.0),
         systems.LawSystem(Repeat(2, 1), 3, PERIOD),
@@ -157,6 +158,14 @@ def test_system_satisfies_the_rules(rule, system):
         ("ReferenceGovernor", "max_wrench", "reference_pose"),
         ("ActiveConstraintProjector", "frame_poses", "desired_pose"),
         ("SctInputMapping", "frame_poses", "requested_pose"),
+        ("SctInputMapping", "state", "requested_pose"),
+        ("ActiveConstraintProjector", "state", "desired_pose"),
+        ("SctStateMachine", "state 0", "transition_distance"),
+        ("EpisodeMonitor", "u", "termination"),
+        ("RewardSystem", "u", "reward"),
+        ("GripperCommand", "state 0", "desired_position"),
+        ("JointTorqueWrench", "positions", "update"),
+        ("HistoryBuffer", "output", "update"),
     ],
 )
 def test_changes_of_sources_have_an_effect(system_by_name, name, source, output):

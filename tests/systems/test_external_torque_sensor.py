@@ -118,6 +118,14 @@ def test_noise_and_drift_repeat_with_their_seed(arm):
     assert not np.allclose(other, first)
 
 
+def test_noise_and_drift_are_computed_from_the_seed(arm):
+    """A recorded episode is repeated with the same numbers."""
+    measured = measure(arm, noise=0.1, drift=0.2, seconds=1.5 * PERIOD, seed=3)[0]
+    samples = np.array([np.random.default_rng([3, count]).standard_normal((2, 7)) for count in (1, 2)])
+    walk = 0.2 * np.sqrt(PERIOD / 10.0) * samples[:, 1].sum(axis=0)
+    np.testing.assert_allclose(measured, CONTACT + 0.1 * samples[1, 0] + walk, atol=1e-12)
+
+
 def test_drift_is_a_random_walk_with_its_deviation(arm):
     ends = np.array([measure(arm, drift=1.0, seconds=0.995, seed=seed)[0] - CONTACT for seed in range(20)])
     assert ends.std() == pytest.approx(np.sqrt(0.1), rel=0.25)  # drift is the deviation after 10 s; here 1 s

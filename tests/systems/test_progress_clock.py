@@ -3,7 +3,13 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.laws import StateProgress
+from guiderail.models.common.transforms import (
+    RigidTransform,
+    axis_angle_rotation,
+    pose_to_transform,
+    transform_to_pose,
+)
+from guiderail.models.laws.primitive import StateProgress
 from guiderail.systems.progress_clock import ProgressClock
 
 PERIOD = 0.125
@@ -36,6 +42,27 @@ def test_angles_of_a_pose_have_a_separate_tolerance(angle, is_waiting):
     command, pose = np.zeros(6), np.array([0.0, 0.009, 0.0, 2.0 * np.pi, angle, 0.0])
     assert (RULE.next_step(3, 4, command, pose) == 3) == is_waiting
     assert RULE.next_step(3, 4, command, np.array([0.0, 0.0101, 0.0, 0.0, 0.0, 0.0])) == 3
+
+
+@pytest.mark.parametrize("seed", range(50))
+def test_progress_depends_on_the_rotation_and_not_on_its_numbers(seed):
+    """Full turns and the other angles of an orientation count as the same; also at the singular Ry = 90°."""
+    rng = np.random.default_rng(seed)
+    command = np.r_[np.zeros(3), rng.uniform(-4.0, 4.0, 3)]
+    if seed % 5 == 0:
+        command[4] = np.pi / 2 + 1e-6 * rng.standard_normal()
+    near, far = (
+        transform_to_pose(pose_to_transform(command) @ RigidTransform(axis_angle_rotation(axis, angle), np.zeros(3)))
+        for axis, angle in zip(rng.standard_normal((2, 3)), (0.09, 0.11), strict=True)
+    )
+    turns = 2 * np.pi * np.r_[np.zeros(3), rng.integers(-1, 2, 3)]
+    assert RULE.next_step(3, 4, command, near + turns) == 4
+    assert RULE.next_step(3, 4, command, far + turns) == 3
+
+
+@pytest.mark.parametrize("pose", [[np.nan] * 6, [0, 0, 0, np.inf, 0, 0]])
+def test_pose_that_is_not_finite_is_not_near(pose):
+    assert RULE.next_step(3, 4, np.zeros(6), np.array(pose)) == 3
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,10 @@ def print_result(result: Mapping[str, Any], as_json: bool, space: str = " ") -> 
         titles = ["policy", *("demonstration alone" if name == "demonstration" else name for name in columns)]
         typer.echo("  ".join([" " * width, *(f"{title:<{COLUMN}}" for title in titles)]).rstrip())
     for key, value in result.items():
-        if key == "baselines" or any(key.startswith(f"{name}_") for name in (*columns, "demonstration")):
+        if key == "baselines" or any(
+            key.startswith(f"{name}_") and key.removeprefix(f"{name}_") in result
+            for name in (*columns, "demonstration")
+        ):
             continue
         values = [value, *(result[f"{name}_{key}"] for name in columns if f"{name}_{key}" in result)]
         cells = ["none" if is_rounding(key, entry) else cell(entry) for entry in values]
@@ -102,11 +105,11 @@ def _names(place: str) -> Callable[[], list[str]]:
 
 
 def _declared_by_tasks(attribute: str) -> Callable[[], list[str]]:
-    """Return a function that lists what all registered tasks declare under `attribute`."""
+    """Return a function that lists what the options of all tasks of guiderail declare under `attribute`."""
 
     def list_names() -> list[str]:
-        tasks = import_module("guiderail.diagrams.tasks.registry").TASKS
-        return sorted({name for task in tasks.usable() for name in getattr(tasks.get(task), attribute)})
+        models = [point.load() for _, point in find_plugins("task_options")]
+        return sorted({name for model in models for name in getattr(model, attribute)})
 
     return list_names
 
@@ -290,7 +293,29 @@ TrustImports = Annotated[
         callback=_trust,
     ),
 ]
-Guidance = Annotated[str | None, option("Guidance: {guidance}.  [default: the task's]", choices="guidance")]
+Guidance = Annotated[
+    str | None, option("Guidance: {guidance}.  [default: that of the task or run]", choices="guidance")
+]
+Difficulty = Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")]
+ActionRepeat = Annotated[int | None, option("Control steps per action.")]
+Reward = Annotated[
+    str | None,
+    option(
+        "Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task.",
+        choices="rewards",
+    ),
+]
+Observation = Annotated[
+    str | None,
+    option(
+        "Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task.",
+        choices="observations",
+    ),
+]
+FixtureOffset = Annotated[
+    str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
+]
+Station = Annotated[str | None, option("Station: {stations}.  [default: that of the task or run]", choices="stations")]
 Algorithm = Annotated[str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")]
 Preset = Annotated[str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")]
 Settings = Annotated[
@@ -311,6 +336,14 @@ Baselines = Annotated[
     ),
 ]
 PolicyTask = Annotated[str | None, option("Task that a POLICY without a run acts in: {tasks}.", choices="tasks")]
+PolicyTasks = Annotated[
+    list[str] | None,
+    option(
+        "Task that a POLICY without a run acts in: {tasks}; repeatable, to evaluate it in each.",
+        "--task",
+        choices="tasks",
+    ),
+]
 TrustPolicy = Annotated[
     bool,
     option(

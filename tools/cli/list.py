@@ -21,9 +21,11 @@ def list_(
 ) -> None:
     """List tasks, guidance, stations, robots, drivers, kernels, learners, engines and presets.
 
-    With a task it lists the options of its environment and of a reset; with a learner or a preset, its settings; with
-    another name of a list, such as a guidance, its description; with metrics, the definition of every number in
-    a table. `guiderail list --json` also prints descriptions, ports, and options with their ranges.
+    With a task it lists the options of its environment and of a reset, the basic ones first; with a learner or a
+    preset, its settings; with a guidance, its ports and options; with another name of a list, its description; with
+    metrics, the definition of every number in a table. An entry of a structured option, such as .variance of history,
+    is given as history.variance=1e-8. `guiderail list --json` also prints descriptions, ports, and options with their
+    ranges.
     """
     from guiderail.diagrams.tasks.registry import IMPORT_HINT, TASKS
     from guiderail.tools.imports import import_modules
@@ -54,11 +56,15 @@ def list_(
         for message in () if as_json else cli.find_broken(name).values():
             typer.echo(f"broken: {message}")
     elif name in cli.LISTED["tasks"]():
-        from guiderail.tools.catalog import describe_task, describe_task_options
+        from guiderail.tools.catalog import describe_task, describe_task_groups, describe_task_options
 
-        is_described = as_json and name in TASKS.names()
-        print_result(describe_task(name) if is_described else describe_task_options(name), as_json, "_")
-    elif (described := _describe_entry(name)) is not None:
+        if as_json:
+            print_result(describe_task(name) if name in TASKS.names() else describe_task_options(name), as_json)
+            return
+        for group, options in describe_task_groups(name).items():
+            typer.echo(f"[{group}]")
+            print_result(options, as_json, "_")
+    elif (described := _describe_entry(name, as_json)) is not None:
         print_result(described, as_json, "_")
     else:
         known = did_you_mean(
@@ -67,17 +73,20 @@ def list_(
         raise InputError(f"there is no list of {name!r}: {known}")
 
 
-def _describe_entry(name: str) -> dict[str, Any] | None:
+def _describe_entry(name: str, as_json: bool) -> dict[str, Any] | None:
     """Return settings of a learner or a preset, or the description of another entry of a list; None if unknown."""
+    from guiderail.tools.catalog import describe_all, describe_guidance_options, indent_entries
+
     if name in cli.LISTED["presets"]() or name in cli.LISTED["learners"]():
         from guiderail.tools.learning.config import config_values, resolve_preset
 
         is_preset = name in cli.LISTED["presets"]()
-        return config_values(resolve_preset(name if is_preset else None, None if is_preset else name, None))
+        values = config_values(resolve_preset(name if is_preset else None, None if is_preset else name, None))
+        return values if as_json else indent_entries(values)
+    if name in cli.LISTED["guidance"]() and not as_json:
+        return describe_guidance_options(name)
     if not any(name in _usable(key) for key in cli.LISTED):
         return None
-    from guiderail.tools.catalog import describe_all
-
     for key, entries in describe_all().items():
         if key in cli.LISTED and isinstance(entries, dict) and name in entries:
             return {"kind": key, **entries[name]}

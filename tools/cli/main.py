@@ -20,6 +20,7 @@ from guiderail.tools.cli.app import app, print_message
 COMMANDS = {
     "train": ("train", "demo"),
     "evaluate": ("evaluate",),
+    "ensemble": ("ensemble",),
     "visualize": ("visualize",),
     "template": ("template",),
     "list": ("list",),

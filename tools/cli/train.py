@@ -12,8 +12,20 @@ from guiderail.tools.cli.app import argument, option, print_message, print_progr
 
 @cli.command("train NarrowPassage --guidance skgrl --episodes 60 --out runs/passage")
 def train(
-    task: Annotated[str | None, argument("Task to learn: {tasks}.", "TASK", "tasks")] = None,
+    tasks: Annotated[
+        list[str] | None,
+        argument(
+            "Task to learn: {tasks}. With several, each episode is in the environment of another.", "TASK...", "tasks"
+        ),
+    ] = None,
     out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
+    variants: Annotated[
+        Path | None,
+        option(
+            "YAML file of variants, options of the environment by name, such as 'fine: {time_step: 0.0025}': each "
+            "episode is in another variant."
+        ),
+    ] = None,
     guidance: cli.Guidance = None,
     algorithm: cli.Algorithm = None,
     episodes: Annotated[
@@ -31,19 +43,12 @@ def train(
         ),
     ] = None,
     env: cli.Env = None,
-    difficulty: Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")] = None,
-    action_repeat: Annotated[int | None, option("Control steps per action.")] = None,
-    reward: Annotated[
-        str | None, option("Reward: {rewards}; guiderail list TASK lists those of a task.", choices="rewards")
-    ] = None,
-    observation: Annotated[
-        str | None,
-        option("Observation: {observations}; guiderail list TASK lists those of a task.", choices="observations"),
-    ] = None,
-    fixture_offset: Annotated[
-        str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
-    ] = None,
-    station: Annotated[str | None, option("Station: {stations}.  [default: the task's]", choices="stations")] = None,
+    difficulty: cli.Difficulty = None,
+    action_repeat: cli.ActionRepeat = None,
+    reward: cli.Reward = None,
+    observation: cli.Observation = None,
+    fixture_offset: cli.FixtureOffset = None,
+    station: cli.Station = None,
     step_log: cli.WriteStepLog = None,
     log: Annotated[
         list[str] | None,
@@ -75,16 +80,21 @@ def train(
 ) -> None:
     """Train a policy and write a run folder.
 
+    With several tasks or variants, every episode is in another environment of this set, in a random order in which each
+    occurs equally often. The environments need equal observations, actions, rewards and guidance.
+
     The folder contains the configuration, a table with one row per episode, a log with one row per control step,
     a checkpoint, the policy, a learning curve and a page that shows held-out episodes. An interrupted run is resumed
     with --resume and ends in the same result.
     """
     if evaluate is not None and evaluate < 1:
         raise InputError(f"--evaluate is the number of held-out episodes: give at least 1, not {evaluate}")
-    task, folders = (None, ()) if task is None else cli.find_task(task, imports)
+    found = [cli.find_task(task, imports) for task in tasks or ()]
+    names, folders = [name for name, _ in found], tuple(folder for _, each in found for folder in each)
     modules = (*folders, *(imports or ()))
-    if task is not None and not modules and not resume:
-        check_task_name(task)  # before anything slow is imported
+    is_checked_early = bool(names) and not modules and not resume
+    for name in names if is_checked_early else ():
+        check_task_name(name)  # before anything slow is imported
     if imports:
         from guiderail.tools.imports import import_modules
 
@@ -105,7 +115,7 @@ def train(
         cli.check_same("num_envs", settings.setdefault("num_envs", str(num_envs)), str(num_envs))
     if out is None:
         raise InputError("the run needs a folder: name one with --out RUN")
-    if task is not None and not modules and not resume:
+    if is_checked_early:
         from guiderail.tools.environments import check_declared_options
         from guiderail.tools.files import refuse_existing_run
         from guiderail.tools.learning.config import check_choices
@@ -114,12 +124,13 @@ def train(
         refuse_existing_run(out)
         check_log_formats(log or ())
         kinds = {name: environment.get(name) for name in ("guidance", "station")}
-        check_choices(task, settings=settings, **kinds, **choices)
-        check_declared_options(task, environment)
-    if (folders or "demonstrations" in environment) and task is not None and not resume:
+        for name in names:
+            check_choices(name, settings=settings, **kinds, **choices)
+            check_declared_options(name, environment)
+    if (folders or "demonstrations" in environment) and len(names) == 1 and not resume:
         from guiderail.tools.environments import warn_of_deviation
 
-        if (warning := warn_of_deviation(task, environment)) is not None:
+        if (warning := warn_of_deviation(names[0], environment)) is not None:
             print_message(warning)
     cli.refuse_robot(environment.get("station"), "guiderail train-on-robot TASK --out RUN")
     open_supervision = None
@@ -132,8 +143,9 @@ def train(
     from guiderail.tools.learning.train import start_or_resume
 
     run = start_or_resume(
-        task,
+        names,
         out,
+        variants=variants,
         environment=environment,
         settings=settings,
         resume=resume,

@@ -40,6 +40,7 @@ from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.policies import as_policy, is_compatible
 from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.evaluation.subject import (
     Subject,
     counts_collisions,
@@ -49,6 +50,7 @@ from guiderail.tools.evaluation.subject import (
     make_baselines,
 )
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
+from guiderail.tools.learning.environment_set import member_configs
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
@@ -69,6 +71,7 @@ def evaluate_policies(
     collect: Collect | None = None,
     processes: int | None = 1,
     first_number: int | None = None,
+    steps: Path | None = None,
 ) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
     """Evaluate several policies on the same held-out episodes of one environment.
 
@@ -88,6 +91,7 @@ def evaluate_policies(
         processes: Largest number of processes; None for the number of cores.
         first_number: Number for `start_episode` in the first episode, incremented in each further one; by default
             `seed` - `HELD_OUT_SEED`. Numbers are taken modulo 2^32.
+        steps: Folder for the step log of the policy named `POLICY`; None for no step log.
 
     Yields:
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
@@ -113,7 +117,9 @@ def evaluate_policies(
             with naming_failures(title):
                 return act(observation)
 
-        callbacks = (act,) if isinstance(act, Callback) else ()
+        callbacks: tuple[Callback, ...] = (act,) if isinstance(act, Callback) else ()
+        if steps is not None and name == POLICY:
+            callbacks = (*callbacks, StepLog(env, steps, act))
         row = rollout(env, named_act, *callbacks, index=index, seed=seed + index, held_out=True, options=options)
         return row, None if collect is None else collect(env, row)
 
@@ -201,7 +207,7 @@ def evaluate_once(
 
 
 def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.DataFrame:
-    """Return held-out episodes of a run's policy in its own environment, one row each.
+    """Return held-out episodes of a run's policy, one row each, in its own environment or in each one of its set.
 
     The episodes are stored in the run's folder, and read from there if they are stored already. They are simulated in
     as many processes as there are cores.
@@ -211,23 +217,27 @@ def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.
             whole number of at least 1.
     """
     policy = Policy.load(folder.path)
-    rows = evaluate_once(
-        folder.path / POLICY_FOLDER,
-        POLICY,
-        config,
-        lambda env: policy,
-        config.environment,
-        about=policy_digest(folder.path),
-        episodes=episodes,
-        seed=HELD_OUT_SEED,
-        processes=None,
-    )
-    return pd.DataFrame() if rows is None else rows
+    tables = []
+    for name, member in (member_configs(config) or {"": config}).items():
+        rows = evaluate_once(
+            folder.path / POLICY_FOLDER,
+            POLICY,
+            member,
+            lambda env: policy,
+            member.environment,
+            about=policy_digest(folder.path),
+            episodes=episodes,
+            seed=HELD_OUT_SEED,
+            processes=None,
+        )
+        if rows is not None:
+            tables.append(rows.assign(environment=name) if name else rows)
+    return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame()
 
 
 def evaluate(
     policy: Path | str | PolicyFn | Any,
-    env: str | gymnasium.Env | None = None,
+    env: str | gymnasium.Env | Sequence[str | gymnasium.Env] | None = None,
     episodes: int = 100,
     *,
     baselines: Mapping[str, MakePolicy] | Sequence[str] | None = None,
@@ -238,6 +248,7 @@ def evaluate(
     resample_offsets: bool = False,
     save: Path | str | None = None,
     signal: str = "commanded",
+    steps: Path | str | None = None,
     describe_differences: Callable[[RunConfig], Sequence[str]] | None = None,
 ) -> Evaluation:
     """Evaluate a policy on held-out episodes, together with baseline policies on the same episodes.
@@ -255,8 +266,9 @@ def evaluate(
         env: Environment of a policy without a run: name of a task, an environment, or an id that is registered with
             Gymnasium. An environment of another package is reset with the seed of the episode. The episode succeeds if
             `info["is_success"]` or `info["success"]` is true at any step. If `info` has neither, the statistics of
-            success are None. The environment needs a limit of steps, such as `gymnasium.wrappers.TimeLimit`.
-        episodes: Number of held-out episodes.
+            success are None. The environment needs a limit of steps, such as `gymnasium.wrappers.TimeLimit`. A list of
+            these is a set of environments, as is None for a run that was trained over a set.
+        episodes: Number of held-out episodes; in a set, of each environment.
         baselines: Baseline policies: a list of their names, or functions that make them for an environment, by name.
             None is the default set of the task. If the guidance of a task has a demonstration, the demonstration alone
             is always evaluated; in an environment that is given as an object, it is the baseline policy "zero".
@@ -270,6 +282,8 @@ def evaluate(
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the
             commanded poses, because their difference from the measured poses causes the contact force.
+        steps: Folder to write the policy's step log into, with one row for each control step, in a set one folder for
+            each environment; it must not exist. The log of an ensemble has the column `disagreement`.
         describe_differences: Function from a configuration to sentences on how it differs from a reference.
 
     Returns:
@@ -279,7 +293,9 @@ def evaluate(
         `skipped_baselines`, those that do not fit the environment's observation or action; `best_baseline` and `p`, the
         largest of the one-sided p-values against each baseline policy, if there is a `Comparison`; `episodes` and
         `seed`; `episodes_to_convergence` and `trained_episodes` of the training, None without a run; `saved`, the
-        number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is given.
+        number of saved demonstrations, if `save` is given; `differences`, if `describe_differences` is given. In a set,
+        the statistics are those of all episodes, whose rows have the column `environment`, and `environments` has the
+        success rate of each policy in each environment.
         `collisions` and `collision_steps` are None if the task declares no collision signal.
 
     Raises:
@@ -290,9 +306,91 @@ def evaluate(
     """
     save = None if save is None else Path(save)
     _check_saved(save, signal)
+    if steps is not None:
+        check_new(Path(steps), "folder")
     episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
-    given_env, env = env, find_environment(env)
-    subject = find_subject(policy, env, environment or {}, trust_policy=trust_policy)
+    options: dict[str, Any] = {
+        "episodes": episodes, "seed": seed, "processes": processes, "baselines": baselines, "save": save,
+        "signal": signal, "environment": environment or {}, "resample_offsets": resample_offsets,
+        "describe_differences": describe_differences, "steps": None if steps is None else Path(steps),
+    }  # fmt: skip
+    envs: list[Any] = list(env) if isinstance(env, list | tuple) else [env]
+    if not envs:
+        raise InputError("a policy is evaluated in at least one environment: name a task")
+    places: dict[str, tuple[Subject, Any, bool]] = {}  # by name: subject, environment, and True if the caller closes it
+    for number, given in enumerate(envs):
+        found = find_environment(given)
+        subject = find_subject(policy, found, environment or {}, trust_policy=trust_policy)
+        name = f"environment {number}" if subject.config is None else subject.config.task
+        if name in places:
+            raise InputError(f"{name} is given twice: give each environment once")
+        places[name] = subject, found, found is given
+    subject, found, is_given = next(iter(places.values()))
+    if len(envs) > 1:
+        return _evaluate_set(places, options)
+    if subject.config is None or not subject.config.members:
+        return _evaluate_subject(subject, found, is_given, **options)
+    configs = member_configs(subject.config)
+    return _evaluate_set(
+        {name: (replace(subject, config=config), None, False) for name, config in configs.items()}, options
+    )
+
+
+def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: Mapping[str, Any]) -> Evaluation:
+    """Evaluate a policy in each of several environments, and combine the results; see `evaluate`."""
+    if options["save"] is not None:
+        raise InputError("demonstrations are saved from one environment: evaluate in one, or leave save out")
+    steps = options["steps"]
+    results = {
+        name: _evaluate_subject(*place, **{**options, "label": name, "steps": None if steps is None else steps / name})
+        for name, place in places.items()
+    }
+    first = next(iter(results.values()))
+    policies = [policy for policy in first.rows if all(policy in result.rows for result in results.values())]
+    rows = {
+        policy: pd.concat(
+            [result.rows[policy].assign(environment=name) for name, result in results.items()], ignore_index=True
+        )
+        for policy in policies
+    }
+    scopes = list(dict.fromkeys(result["evaluation_scope"] for result in results.values()))
+    counts = any(result["collisions"] is not None for result in results.values())
+    result: dict[str, Any] = {"evaluation_scope": "; ".join(scopes), **_statistics(rows, counts)}
+    tried = {name for each in results.values() for name in (*each["skipped_baselines"], *each.rows)}
+    result |= {"baselines": policies[1:], "skipped_baselines": sorted(tried - {*rows}), "seed": first["seed"]}
+    result |= {"episodes": sum(each["episodes"] for each in results.values())}
+    result |= {name: first[name] for name in ("episodes_to_convergence", "trained_episodes")}
+    if (comparison := compare(rows)) is not None:
+        result |= {"best_baseline": comparison.baseline, "p": comparison.p}
+    result["environments"] = {
+        name: {policy: statistics(each.rows[policy])["success_rate"] for policy in policies}
+        for name, each in results.items()
+    }
+    return Evaluation(result, rows, is_held_out=all(each.is_held_out for each in results.values()))
+
+
+def _evaluate_subject(
+    subject: Subject,
+    env: Any,
+    is_given: bool,
+    *,
+    episodes: int,
+    seed: int,
+    processes: int,
+    baselines: Mapping[str, MakePolicy] | Sequence[str] | None,
+    environment: Mapping[str, Any],
+    resample_offsets: bool,
+    save: Path | None,
+    signal: str,
+    describe_differences: Callable[[RunConfig], Sequence[str]] | None,
+    steps: Path | None,
+    label: str = "",
+) -> Evaluation:
+    """Evaluate a policy in one environment; see `evaluate`.
+
+    `env` is the environment or the name of the task, None for a run. `is_given` is True if the caller closes it.
+    `label` precedes the labels of the progress bars.
+    """
     config, folder = subject.config, subject.folder
     kwargs: dict[str, Any] = {"episodes": episodes, "seed": seed}
     if config is None:
@@ -303,7 +401,7 @@ def evaluate(
             )
         environment, scope = {}, "seeds of the environment as it was given"
     else:
-        environment = subject.changed_environment(environment or {})
+        environment = subject.changed_environment(environment)
         scope = evaluation_scope(config.task, environment, resample_offsets)
     if resample_offsets and config is not None:
         kwargs["options"] = {"new_run": True}
@@ -317,10 +415,12 @@ def evaluate(
     if POLICY in makers:
         raise InputError(f"a baseline policy cannot be called {POLICY!r}, which is the evaluated policy")
     evaluation_env = cast(gymnasium.Env, env) if config is None else make_environment(config.task, environment)
-    with nullcontext() if evaluation_env is given_env else closing(evaluation_env):
+    with nullcontext() if is_given else closing(evaluation_env):
         if config is not None:
-            if save is not None and not hasattr(evaluation_env.unwrapped, "trace"):
-                raise InputError(f"{config.task} is no task of this package and records no poses: leave --save out")
+            if (save is not None or steps is not None) and not hasattr(evaluation_env.unwrapped, "trace"):
+                raise InputError(
+                    f"{config.task} is no task of this package and records no poses: leave --save and --steps out"
+                )
             evaluation_env.reset(seed=config.seed)  # samples the hidden values of the run
         functions = baselines if isinstance(baselines, Mapping) else {}
         files = {
@@ -339,7 +439,7 @@ def evaluate(
                     policies[name] = make(evaluation_env)
         skipped = [name for name in missing if name not in policies]
         labels = {
-            name: f"series {number} of {1 + len(makers)}: {LABELS.get(name, name)}"
+            name: f"{label} series {number} of {1 + len(makers)}: {LABELS.get(name, name)}".lstrip()
             for number, name in enumerate((POLICY, *makers), start=1)
         }
         for name in stored:
@@ -347,7 +447,7 @@ def evaluate(
         evaluated, motions, started = dict(stored), [], time.monotonic()
         collect = None if save is None else partial(_successful_motion, signal)
         for name, rows, data in evaluate_policies(
-            evaluation_env, policies, labels=labels, processes=processes, collect=collect, **kwargs
+            evaluation_env, policies, labels=labels, processes=processes, collect=collect, steps=steps, **kwargs
         ):
             evaluated[name] = rows
             if name == POLICY:

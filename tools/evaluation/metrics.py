@@ -262,7 +262,8 @@ def reports_success(rows: pd.DataFrame) -> bool:
     return REPORTS_SUCCESS not in rows or bool((rows[REPORTS_SUCCESS] > 0).any())
 
 
-WORDS = ("termination", "fault")  # columns of text; `fault` exists on hardware only
+# Columns of text; `fault` exists on hardware only, and `environment` in runs over a set of environments.
+WORDS = ("termination", "fault", "environment")
 # Columns of whole numbers.
 COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
 

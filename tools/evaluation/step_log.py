@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.models.common.errors import InputError
-from guiderail.tools.evaluation.episode import EnvCallback
+from guiderail.tools.evaluation.episode import EnvCallback, Transition
 from guiderail.tools.files import write_atomically
 from guiderail.tools.tables import check_parquet
 
@@ -38,6 +38,7 @@ MEANINGS = {
     "fallback": ("", "True if guidance commanded a safe pose instead of the requested pose"),
     "state": ("", "number of the template's state, if there is a template"),
     "reward": ("reward", "reward of the control step"),
+    "disagreement": ("action", "standard deviation of the actions of an ensemble's networks, mean over the entries"),
 }
 _FLAGS = {"collision", "command_timed_out", "fallback"}
 
@@ -51,11 +52,26 @@ class StepLog(EnvCallback):
         seconds: Time spent on writing so far [s].
     """
 
-    def __init__(self, env: gymnasium.Env, folder: Path):
-        """Construct the callback for episodes in `env`; it writes one file per episode into `folder`."""
+    def __init__(self, env: gymnasium.Env, folder: Path, act: Any = None):
+        """Construct the callback for episodes in `env`; it writes one file per episode into `folder`.
+
+        If `act` is an `Ensemble`, the log has the column `disagreement`.
+        """
         super().__init__(env)
         self._folder = folder
+        self._disagreement: Callable[[np.ndarray], float] | None = getattr(act, "disagreement", None)
+        self._disagreements: list[float] = []  # of each control step of the episode
         self.seconds = 0.0
+
+    def on_episode_start(self) -> None:
+        """Start an episode."""
+        self._disagreements = []
+
+    def on_step(self, transition: Transition) -> None:
+        """Compute the disagreement of an ensemble for the control steps of an action."""
+        if self._disagreement is not None:
+            number = len(self.base.trace) - len(self._disagreements)
+            self._disagreements += [self._disagreement(transition.observation)] * number
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Write the episode's control steps; add no column to its row.
@@ -64,7 +80,10 @@ class StepLog(EnvCallback):
             InputError: If the file cannot be written.
         """
         start_time = time.perf_counter()
-        write_step_log(step_log_file(self._folder, row["episode"]), table(self.base.trace, row["episode"]))
+        steps = table(self.base.trace, row["episode"])
+        if self._disagreement is not None:
+            steps = steps.append_column("disagreement", pa.array(self._disagreements))
+        write_step_log(step_log_file(self._folder, row["episode"]), steps)
         self.seconds += time.perf_counter() - start_time
         return {}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from guiderail.tools.evaluation.episode import Callback, PolicyFn, Transition, h
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
 from guiderail.tools.evaluation.rollout import new_columns, rollout
 from guiderail.tools.learning.checkpoint import entries_of
+from guiderail.tools.learning.environment_set import select_environment
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 from guiderail.tools.learning.sb3 import load_module, module_arrays, restore_modules
@@ -57,7 +58,7 @@ class ParallelLearner(Learner):
         num_envs: int,
         seed: int,
         num_episodes: int,
-        demonstrator: tuple[PolicyFn, int] | None = None,
+        demonstrator: tuple[Callable[[gymnasium.Env], PolicyFn], int] | None = None,
         callbacks: tuple[Callback, ...] = (),
     ):
         """Construct the learner; the actors start with the first episode.
@@ -68,7 +69,8 @@ class ParallelLearner(Learner):
             num_envs: Number N of actors.
             seed: Seed of the run.
             num_episodes: Number of episodes of the run.
-            demonstrator: Policy that acts instead of the learner in the first episodes, and their number.
+            demonstrator: Function that makes the policy that acts instead of the learner in the first episodes, and
+                their number.
             callbacks: Callbacks of the episodes; they run in the actors' processes.
 
         Raises:
@@ -144,6 +146,7 @@ class ParallelLearner(Learner):
         """Simulate an episode; called in a fork."""
         (index, snapshot), learner = assignment, self._learner
         conditions, exploration, process = np.random.SeedSequence([self._seed, index]).spawn(3)
+        select_environment(self._env, index)
         self._env.unwrapped.np_random = np.random.default_rng(conditions)
         learner.random = np.random.default_rng(exploration)
         set_random_seed(int(process.generate_state(1)[0]))  # global generators, which Stable-Baselines3 uses
@@ -152,7 +155,7 @@ class ParallelLearner(Learner):
         learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
         act: PolicyFn = learner.act
         if self._demonstrator is not None and index < self._demonstrator[1]:
-            act = self._demonstrator[0]
+            act = self._demonstrator[0](self._env)
         recorder = _EpisodeRecorder(learner)
         row = rollout(self._env, act, recorder, *self._callbacks, index=index)
         return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)

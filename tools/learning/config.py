@@ -19,7 +19,7 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import did_you_mean, find_class
 from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
 
@@ -268,7 +268,7 @@ def resolve_preset(
     if preset is not None and preset not in PRESETS:
         raise InputError(f"there is no preset {brief(preset)}: {did_you_mean(preset, PRESETS)}")
     algorithm = algorithm or PRESETS[preset or DEFAULT_PRESET].algorithm
-    kind = LEARNERS.declared(algorithm, "Config")
+    kind = config_class(algorithm)
     if preset is None:
         preset = default_preset(algorithm)
     elif not issubclass(kind, OffPolicyConfig):
@@ -277,9 +277,19 @@ def resolve_preset(
     return make_config(algorithm, base | flat_options([kind], settings or {}))
 
 
+def config_class(algorithm: str) -> type[LearnerConfig]:
+    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported.
+
+    Raises:
+        InputError: If there is no such learner.
+    """
+    kind: type[LearnerConfig] = find_class("learner_config", algorithm, LEARNERS, "Config")
+    return kind
+
+
 def default_preset(algorithm: str) -> str | None:
     """Return the preset used if none is chosen; None for a learner that is not off-policy."""
-    return DEFAULT_PRESET if issubclass(LEARNERS.declared(algorithm, "Config"), OffPolicyConfig) else None
+    return DEFAULT_PRESET if issubclass(config_class(algorithm), OffPolicyConfig) else None
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
@@ -288,7 +298,7 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
     Raises:
         InputError: If there is no such learner or setting, or a value is out of range.
     """
-    kind = LEARNERS.declared(algorithm, "Config")
+    kind = config_class(algorithm)
     names = option_fields(kind)
     values = {**flat_options([kind], settings), "algorithm": algorithm}
     for name in values:
@@ -333,7 +343,7 @@ def check_choices(
             registry.get(name)  # raises an InputError
     if algorithm is not None or preset is not None:
         resolve_preset(preset, algorithm, settings)
-    kinds = [LEARNERS.declared(learner, "Config") for learner in LEARNERS.usable()]
+    kinds = [config_class(learner) for learner in LEARNERS.usable()]
     known = {name for kind in kinds for name in option_fields(kind)} - {"algorithm"}
     for name in flat_options(kinds, settings):
         if name not in known:

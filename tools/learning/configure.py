@@ -19,7 +19,7 @@ from guiderail.tools.learning.config import (
     make_config,
     resolve_preset,
 )
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, SetMember, as_arguments, installed_versions
 
 DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
 
@@ -38,11 +38,13 @@ def configure(
     imports: Sequence[str] = (),
     step_log: bool = True,
     human_in_the_loop: bool = False,
+    members: Sequence[SetMember] = (),
 ) -> RunConfig:
     """Return a checked configuration with everything resolved.
 
     The arguments are those of `start_or_resume`, with `imports` as `import_modules` returns them, and
-    `human_in_the_loop`: True if a supervisor corrects the policy. By default, the algorithm is the preset's, and the
+    `human_in_the_loop`: True if a supervisor corrects the policy. With `members`, task and environment are those of the
+    first member. By default, the algorithm is the preset's, and the
     preset is `default_preset`; `with_defaults` adds the learner that the task declares.
 
     Raises:
@@ -54,6 +56,7 @@ def configure(
     return RunConfig(
         task, as_arguments(resolved), learner, preset or default_preset(learner.algorithm), episodes, seed,
         installed_versions(), tuple(imports), step_log, task_content(task, resolved, imports), human_in_the_loop,
+        members=tuple(members),
     )  # fmt: skip
 
 
@@ -74,6 +77,7 @@ def resumed_config(
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
     settings: Mapping[str, Any] | None,
+    members: Sequence[SetMember] = (),
 ) -> RunConfig:
     """Return the configuration of the run to continue; raise an InputError if an argument contradicts it."""
     config = folder.config()
@@ -93,6 +97,11 @@ def resumed_config(
                 f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
                 "again in another folder"
             )
+    if members and tuple(members) != config.members:
+        raise InputError(
+            f"the run in {folder.path} has another set of environments: leave the tasks and --variants out, or train "
+            "again in another folder"
+        )
     values = config_values(config.learner) | flat_settings(settings)
     algorithm = values.pop("algorithm")
     if make_config(algorithm, values) != config.learner:

@@ -1,8 +1,8 @@
 """Interface of a learner, the registry of learners, and the log of losses and values that they record.
 
 A learner is one file: a subclass of `Learner` (or of `guiderail.tools.learning.off_policy.OffPolicyLearner`, for an
-algorithm of Stable-Baselines3) that is registered by `register_learner` or by an entry point of the group
-`guiderail.learners`.
+algorithm of Stable-Baselines3) that is registered by `register_learner` or by an entry point "learner:NAME"
+of the group `guiderail`.
 """
 
 from __future__ import annotations
@@ -178,10 +178,9 @@ def _check_learner(name: str, learner: Any) -> None:
 
 
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
-# takes seconds to import: `LEARNERS.declared(name, "Config")` reads the `Config` from the source if possible.
+# takes seconds to import: the plug-in "learner_config:NAME" is the `Config` without it.
 LEARNERS: Registry[Any] = Registry(
-    "algorithm", package="guiderail.tools.learning", decorator="register_learner", plugin="learner",
-    check=_check_learner,
+    "algorithm", plugin="learner", check=_check_learner,
 )  # fmt: skip
 register_learner = LEARNERS.register
 

@@ -35,6 +35,16 @@ _version = cache(metadata.version)  # cached, because it reads files
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class SetMember:
+    """Environment of a set that a run trains in."""
+
+    name: str  # name in the column `environment` of the table of episodes
+    task: str  # name of the task
+    environment: dict[str, Any]  # arguments of gymnasium.make
+    task_content: str = ""  # digest of the files that define the task; empty if there are none
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RunConfig:
     """Configuration of a run, with everything resolved: the same configuration gives the same run."""
 
@@ -53,31 +63,38 @@ class RunConfig:
     human_in_the_loop: bool = False  # True if a supervisor corrects the policy; see the option via_points
     simulated_driver: bool | None = None  # on a hardware station: True for a simulated driver, False for a robot
     source: str = ""  # in a study, state of the run that `init_from` named when training began; see `RunFolder.state`
+    # Environments of a set, of which each episode has another one; `task` and `environment` are those of the first.
+    # Empty for a single environment.
+    members: tuple[SetMember, ...] = ()
 
     @property
     def action_repeat(self) -> int:
-        """Control steps that an action lasts."""
-        return int(self.environment.get("action_repeat", 1))
+        """Control steps that an action lasts; in a set, the rounded mean over its environments."""
+        environments = [member.environment for member in self.members] or [self.environment]
+        return round(sum(int(each.get("action_repeat", 1)) for each in environments) / len(environments))
 
     @property
     def identity(self) -> str:
         """JSON text of all settings that determine an episode; a resumed run may change others, such as `episodes`."""
         environment = {name: value for name, value in self.environment.items() if name not in CHANGING}
         learner = config_values(self.learner) | ({"init_from": self.source} if self.source else {})
-        return json.dumps([self.task, self.seed, environment, learner], sort_keys=True)
+        members = [asdict(member) for member in self.members]
+        return json.dumps([self.task, self.seed, environment, learner, *members], sort_keys=True)
 
     def refuse_changed_task(self, path: Path, otherwise: str = "train again in another folder") -> None:
         """Raise an InputError if the task's files have changed since the run in the folder `path` began.
 
         The message ends with `otherwise`, the alternative to restoring the files.
         """
-        current = task_content(self.task, self.environment, self.imports)
-        if self.task_content and self.task_content != current:
-            imported = "".join(f" or {Path(module).name}" for module in self.imports if module.endswith(".py"))
-            raise InputError(
-                f"the files of {self.task}{imported} are not those that the run in {path} began with: restore them, or "
-                f"{otherwise}"
-            )
+        own = SetMember(self.task, self.task, self.environment, self.task_content)
+        for member in self.members or (own,):
+            current = task_content(member.task, member.environment, self.imports)
+            if member.task_content and member.task_content != current:
+                imported = "".join(f" or {Path(module).name}" for module in self.imports if module.endswith(".py"))
+                raise InputError(
+                    f"the files of {member.task}{imported} are not those that the run in {path} began with: restore "
+                    f"them, or {otherwise}"
+                )
 
 
 def installed_versions() -> dict[str, str]:
@@ -163,7 +180,7 @@ class RunFolder:
         learner: Any = stored.learner
         if stored.source and (path := getattr(config.learner, "init_from", "")):
             stored = replace(stored, learner=replace(learner, init_from=path))
-        for key in ("task", "environment", "learner", "seed"):
+        for key in ("task", "environment", "learner", "seed", "members"):
             if getattr(stored, key) != getattr(config, key):
                 raise InputError(f"{self.path} holds a run with another {key}: name another folder with --out")
 
@@ -175,6 +192,9 @@ class RunFolder:
             del values["simulated_driver"]
         if not config.source:
             del values["source"]
+        values["members"] = [asdict(member) for member in config.members]
+        if not config.members:
+            del values["members"]
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
     def config(self) -> RunConfig:
@@ -196,6 +216,8 @@ class RunFolder:
         try:
             values = load_yaml(file, "configuration")
             values["environment"] = as_arguments(values["environment"])
+            for member in values.get("members", ()):
+                member["environment"] = as_arguments(member["environment"])
             settings = dict(values["learner"])
             config = RunConfig(**values)
             import_stored(config.imports, file)

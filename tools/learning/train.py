@@ -10,7 +10,7 @@ from difflib import get_close_matches
 from inspect import signature
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import gymnasium
 import pandas as pd
@@ -20,7 +20,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import check_environment, register_environment, task_named
-from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
 from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
@@ -32,8 +32,9 @@ from guiderail.tools.learning.config import (
     check_episodes,
 )
 from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
+from guiderail.tools.learning.environment_set import EnvironmentSet, Variants, find_members, load_variants
 from guiderail.tools.learning.learner import check_log_formats
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, SetMember
 
 if TYPE_CHECKING:
     from guiderail.tools.learning.supervision import Supervise
@@ -108,10 +109,11 @@ def _names_code(config: Mapping[str, Any]) -> bool:
 
 
 def train(
-    task: str | gymnasium.Env | None = None,
+    task: str | gymnasium.Env | Sequence[str | gymnasium.Env] | None = None,
     guidance: str | None = None,
     *,
     out: Path | str,
+    variants: Variants | Path | str | None = None,
     episodes: int | None = None,
     seed: int | None = None,
     algorithm: str | None = None,
@@ -129,9 +131,12 @@ def train(
         task: Name of the task, or the path of a task folder; with `resume` it may be left out. An environment of
             another package: its id, or an environment such as a `GuidedEnv`, with a limit of steps. Its observations
             and actions are vectors (Box). The run of an environment that is given as an object can be evaluated and
-            resumed in this process only.
+            resumed in this process only. A list of these is a set: each episode is in another one of its environments,
+            which have equal spaces and the same guidance.
         guidance: Name of the guidance; None for the task's default.
         out: Folder of the run; with `resume`, the folder of the run to continue.
+        variants: Options of environments by a name, or a YAML file of them, for a set of environments: each task is
+            combined with each variant. The option `task` of a variant names another task.
         episodes: Total number of episodes; None for 60.
         seed: Seed of all random numbers, in [0, 2³¹); None for 0.
         algorithm: Registered name of the learner; None for the preset's, or without a preset the task's.
@@ -153,24 +158,26 @@ def train(
         InputError: If a name is unknown, a value is out of range, the folder is not empty, an argument contradicts the
             run to resume, an episode fails, or learning diverges.
     """
-    if isinstance(task, gymnasium.Env):
-        task = register_environment(task)
-    if not (isinstance(task, str | PathLike) or (task is None and resume)):
-        raise InputError(
-            f"training needs the name of a task or its folder, an environment, or the id of an environment registered "
-            f"with Gymnasium, not {brief(task)}"
-        )
+    given: list[Any] = list(task) if isinstance(task, list | tuple) else [] if task is None else [task]
+    tasks = [register_environment(each) if isinstance(each, gymnasium.Env) else each for each in given]
+    for each in tasks or ([] if resume and task is None else [task]):
+        if not isinstance(each, str | PathLike):
+            raise InputError(
+                f"training needs the name of a task or its folder, an environment, or the id of an environment "
+                f"registered with Gymnasium, not {brief(each)}"
+            )
     if not isinstance(out, str | PathLike):
         raise InputError(f"out is the path of the run's folder, not {brief(out)}")
     if not (settings is None or isinstance(settings, Mapping)):
         raise InputError(f"settings of the learner are values by name, not {brief(settings)}")
-    name, imports = (None, ()) if task is None else task_named(str(task))
+    names = [task_named(str(each)) for each in tasks]
     environment = options if guidance is None else {"guidance": guidance, **options}
-    if name is not None:
-        _refuse_misspelled(name, environment, options)
+    if names:
+        _refuse_misspelled(names[0][0], environment, options)
     return start_or_resume(
-        name, Path(out), environment=environment, algorithm=algorithm, preset=preset, settings=settings,
-        episodes=episodes, seed=seed, log=log, resume=resume, imports=imports, sb3_callbacks=callbacks,
+        [name for name, _ in names], Path(out), variants=variants, environment=environment, algorithm=algorithm,
+        preset=preset, settings=settings, episodes=episodes, seed=seed, log=log, resume=resume,
+        imports=[folder for _, folders in names for folder in folders], sb3_callbacks=callbacks,
         pictures=pictures,
     )  # fmt: skip
 
@@ -186,10 +193,11 @@ def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mappi
 
 
 def start_or_resume(
-    task: str | None,
+    task: str | Sequence[str] | None,
     out: Path,
     *,
     environment: Mapping[str, Any],
+    variants: Variants | Path | str | None = None,
     algorithm: str | None = None,
     preset: str | None = None,
     settings: Mapping[str, Any] | None = None,
@@ -208,7 +216,7 @@ def start_or_resume(
     A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes. An
     argument that is None has its default. The arguments are those of `train` and:
 
-    - `task`: name of the task; None with `resume`.
+    - `task`: name of the task, or names of several for a set of environments; None with `resume`.
     - `environment`: options of the environment by name.
     - `imports`: modules or files (.py) that register the task, the learner, …
     - `step_log`: True to write every control step to the step log; the default.
@@ -219,7 +227,7 @@ def start_or_resume(
     The task's scripted policy acts in the learner's `demonstration_episodes`.
 
     Raises:
-        InputError: As `train`, or if `task` is missing without `resume`.
+        InputError: As `train`, or if there is no task without `resume`.
     """
     folder = RunFolder(out)
     episodes = None if episodes is None else check_episodes(episodes)
@@ -228,14 +236,21 @@ def start_or_resume(
     choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
     choices["human_in_the_loop"] = None if open_supervision is None else True
     given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
+    tasks = [task] if isinstance(task, str) else list(task or ())
+    name = tasks[0] if tasks else None
+    members: tuple[SetMember, ...] = ()
+    if len(tasks) > 1 or (variants is not None and tasks):
+        members, folders = find_members(tasks, environment, load_variants(variants), imports)
+        imports = tuple(dict.fromkeys((*imports, *folders)))
+        name, environment = members[0].task, members[0].environment
     if resume:
-        config = resumed_config(folder, task, environment, given, settings)
-    elif task is None:
+        config = resumed_config(folder, name, environment, given, settings, members)
+    elif name is None:
         raise InputError("training needs a task: name a task, such as guiderail train NarrowPassage --out RUN")
     else:
         folder.refuse_existing()
         given["settings"] = settings
-        config = configure(task, environment, imports=imports, **with_defaults(task, given))
+        config = configure(name, environment, imports=imports, members=members, **with_defaults(name, given))
     num_demonstrated = config.learner.demonstration_episodes
     if isinstance(config.learner, OffPolicyConfig) and num_demonstrated >= config.episodes:
         _LOGGER.warning(
@@ -248,9 +263,10 @@ def start_or_resume(
         warn_of_unfinished_source(config)
     from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
 
-    demonstrator = make_baseline(config.task, "scripted") if num_demonstrated else None
+    demonstrator = _make_demonstrator(config) if num_demonstrated else None
     supervise = open_supervision() if config.human_in_the_loop and open_supervision is not None else None
-    with EpisodeProgress(config.episodes, name=config.task) as progress:
+    label = f"{len(config.members)} environments" if config.members else config.task
+    with EpisodeProgress(config.episodes, name=label) as progress:
         run_training(
             folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervise=supervise,
             log=formats, sb3_callbacks=sb3_callbacks,
@@ -259,6 +275,14 @@ def start_or_resume(
         return Run(out)
     _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
     return Run(out, draw_pictures(out))
+
+
+def _make_demonstrator(config: RunConfig) -> MakePolicy:
+    """Return the function that makes the scripted policy of an environment's task; see `make_baseline` for errors."""
+    makers = {member.name: make_baseline(member.task, "scripted") for member in config.members}
+    if not makers:
+        return make_baseline(config.task, "scripted")
+    return lambda env: makers[cast(EnvironmentSet, env.unwrapped).current](env)
 
 
 def draw_pictures(out: Path) -> dict[str, str]:

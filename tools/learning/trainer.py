@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import OtherTask, make_environment, trained_task
+from guiderail.tools.environments import trained_task
 from guiderail.tools.evaluation.episode import Callback, PolicyFn
 from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.policies import is_compatible
@@ -25,6 +25,12 @@ from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, remove_step_logs
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.environment_set import (
+    EnvironmentSet,
+    make_run_environment,
+    select_environment,
+    trained_set,
+)
 from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
@@ -93,6 +99,8 @@ def run_training(
         raise InputError(
             "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
         )
+    if config.human_in_the_loop and config.members:
+        raise InputError("a supervisor corrects one environment: leave --human-in-the-loop out, or name one task")
     if config.human_in_the_loop and supervise is None:
         raise InputError("this run has a supervisor: give --human-in-the-loop")
     if config.learner.demonstration_episodes and demonstrator is None:
@@ -103,13 +111,13 @@ def run_training(
     torch.set_num_threads(1)  # faster for two runs at once, and sums do not depend on the number of cores
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1))
-        env = stack.enter_context(closing(make_environment(config.task, config.environment)))
+        env = stack.enter_context(closing(make_run_environment(config)))
         if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
             raise InputError(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
                 "the setting demonstration_episodes out"
             )
-        task = trained_task(env, config.task)
+        task = trained_set(env, config) if isinstance(env, EnvironmentSet) else trained_task(env, config.task)
         arguments = learner_arguments(config, task)
         kind = LEARNERS.get(config.learner.algorithm)
         with _naming_failures(config, f"constructing the learner {getattr(kind, '__name__', brief(kind))}"):
@@ -147,11 +155,11 @@ def run_training(
             number = config.learner.demonstration_episodes
             learner = ParallelLearner(
                 learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
-                demonstrator=(demonstrator(env), number) if demonstrator is not None and number else None,
+                demonstrator=(demonstrator, number) if demonstrator is not None and number else None,
                 callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
             )  # fmt: skip
         learner.records_metrics = bool(log)
-        if isinstance(task, OtherTask):
+        if not hasattr(env.unwrapped, "trace"):
             config = replace(config, step_log=False)  # only an environment of this package has a trace
         if not resume:
             folder.create(config)
@@ -208,6 +216,7 @@ def _train(
         if _ends_with_successes(rows, config.learner.stop_after_successes):
             break
         started = time.perf_counter()
+        environment_name = select_environment(env, episode)
         act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner_act
         if config.learner.num_envs:
             row = cast("ParallelLearner", learner).episode(episode)
@@ -218,6 +227,8 @@ def _train(
             env = supervised.env
         if _has_diverged(learner):
             raise divergence_error()
+        if environment_name is not None:
+            row["environment"] = environment_name
         if num_demonstrated:
             row["is_demonstration"] = int(episode < num_demonstrated)
         row["wall_time"] = time.perf_counter() - started

@@ -15,6 +15,8 @@ from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
+    OBSERVATIONS,
+    REWARDS,
     FixtureOffsetOptions,
     ForceOptions,
     PriorOptions,
@@ -87,6 +89,8 @@ SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in 
 
 class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
+
+    rewards, observations = REWARDS, OBSERVATIONS
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"

@@ -35,9 +35,7 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    OBSERVATIONS,
     REPEATABILITY_STD,
-    REWARDS,
 )
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
@@ -235,8 +233,7 @@ class BncConnector(DemonstratedInsertion):
     workpiece, fixture = "plug", "jack"
     insertion_length = 12.0 * MM
     simulated_rewards = ("aligned",)
-    rewards = REWARDS
-    observations = OBSERVATIONS
+    rewards, observations = BncOptions.rewards, BncOptions.observations
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
     defaults = {
         "guidance": "skgrl",

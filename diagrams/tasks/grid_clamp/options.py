@@ -17,7 +17,6 @@ from guiderail.models.objects.grid_clamp.sdf import FRICTION
 COLLISION_FORCE = 35.0
 START_HEIGHT = (0.015, 0.018)  # [m] default: the preceding skill ends with the pegs' tips 3 to 6 mm above the table
 HEIGHTS = (0.013, 0.060)  # [m] accepted start heights: above the table, and well inside the cuboid
-REWARDS = ("shaped", "no_force", "sparse", "aligned")
 NOMINAL = GridClampDimensions()
 StartHeight = Annotated[
     Pair, increases(*HEIGHTS, f"give two heights from {HEIGHTS[0]} to {HEIGHTS[1]} m, the lower one first")
@@ -26,6 +25,9 @@ StartHeight = Annotated[
 
 class GridClampOptions(ForceOptions):
     """Options of GridClamp."""
+
+    rewards = ("shaped", "no_force", "sparse", "aligned")
+    observations = ("state",)
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offsets of table and clamp: sampled per run or per episode; none: clamp within 0.15 mm"

@@ -17,7 +17,7 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, fr
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell
-from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, REWARDS, GridClampOptions
+from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, GridClampOptions
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
@@ -242,7 +242,7 @@ class GridClamp(InsertionTask):
     Options = GridClampOptions
     options: GridClampOptions
     workpiece, fixture = "clamp", "table"
-    rewards = REWARDS
+    rewards, observations = GridClampOptions.rewards, GridClampOptions.observations
     simulated_rewards = ("aligned",)
     snaps_in = True
     difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}

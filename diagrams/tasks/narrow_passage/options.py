@@ -26,6 +26,9 @@ HARD: Mapping[str, Any] = {
 class NarrowPassageOptions(Options):
     """Options of NarrowPassage."""
 
+    rewards = ("sparse", "shaped")
+    observations = ("state", "image")
+
     gap_width: Number = Field(
         round(DEFAULT_GEOMETRY.gap_x[1] - DEFAULT_GEOMETRY.gap_x[0], 9),
         ge=0.02,

@@ -102,9 +102,8 @@ class NarrowPassage(Task):
     Reset = NarrowPassageReset
     has_held_out_distribution = True
     options: NarrowPassageOptions
-    rewards = ("sparse", "shaped")
-    observations = ("state", "image")
-    defaults = {"guidance": "skgrl", "action_repeat": 5}
+    rewards, observations = NarrowPassageOptions.rewards, NarrowPassageOptions.observations
+    defaults = {"station": "plane", "guidance": "skgrl", "action_repeat": 5}
     difficulties = {STANDARD: {}, "hard": HARD}
     clip = 1.0
     statistics = (

@@ -94,6 +94,9 @@ MOST_BALLS = 8  # largest number of balls
 class PouringOptions(Options):
     """Options of Pouring."""
 
+    rewards = ("shaped", "sparse", "hand_shaped")
+    observations = ("state",)
+
     balls: Integer = Field(2, ge=2, le=MOST_BALLS, description="number of balls")
     balls_in: Integer | None = Field(
         None, ge=1, le=MOST_BALLS, description="balls that have to be in the mug; default: all"

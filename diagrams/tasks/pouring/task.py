@@ -195,8 +195,8 @@ class Pouring(Task):
     Reset = PouringReset
     has_held_out_distribution = True
     options: PouringOptions
-    rewards = ("shaped", "sparse", "hand_shaped")
-    defaults = {"guidance": "sct", "action_repeat": 10}
+    rewards, observations = PouringOptions.rewards, PouringOptions.observations
+    defaults = {"guidance": "sct", "station": "pouring", "action_repeat": 10}
     difficulties = {STANDARD: {}, "hard": HARD, "thesis": THESIS}
     learner = {"algorithm": "sac", "preset": "pouring"}
     num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis

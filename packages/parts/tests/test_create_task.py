@@ -1,6 +1,7 @@
 """Command `create-task`: task folders of two meshes, their checks, difficulties, search and fitted bounds."""
 
 import json
+import shutil
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -20,6 +21,8 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
 from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.train import start_or_resume
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts import trial
 from guiderail_parts.contact import rank
@@ -278,7 +281,7 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
         observation[TIME], observation[Z] = time - 1.0, height / (0.5 * file.motion.travel) - 1.0
         return search(observation)
 
-    on_rim, inserted = file.motion.rim, 0.5 * file.motion.rim
+    on_rim, inserted = file.motion.first_contact, 0.5 * file.motion.first_contact
     step = 0.1 * file.search.speed
     for time, height, x in (
         (0.0, on_rim, 0.0),
@@ -296,7 +299,7 @@ def test_scripted_search_integrates_the_center_of_pressure(folder):
 def test_scripted_search_follows_the_plug_below_the_rim(folder):
     file = read_task_file(folder)
     times, poses = file.motion.plan_search()
-    inserted, duration = 0.5 * file.motion.rim, times[-1]
+    inserted, duration = 0.5 * file.motion.first_contact, times[-1]
     grid = np.arange(0.0, duration, 0.01)
     time = grid[
         np.argmax(np.interp(grid, times, poses[:, 2]) < inserted)
@@ -343,7 +346,7 @@ def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
     file = read_task_file(turning)
     search, observation = ScriptedSearch(file, lambda: 20.0), np.zeros(17)
     observation[CENTER_OF_PRESSURE] = 1.0, 0.0
-    observation[Z] = file.motion.rim / (0.5 * file.motion.travel) - 1.0
+    observation[Z] = file.motion.first_contact / (0.5 * file.motion.travel) - 1.0
     turns = []
     for time in np.arange(0.0, 20.0, 0.1):
         observation[TIME] = 0.1 * time - 1.0
@@ -364,7 +367,7 @@ def test_screw_is_inserted_by_a_turn_with_its_pitch(tmp_path, capsys):
     assert file.measured["inserted"]
     assert file.measured["penetration_mm"] < 0.5 * file.measured["clearance_mm"]
     with pytest.raises(ValueError, match="the advance must be more than"):
-        MotionNumbers.model_validate({"travel": 0.02, "rim": 0.004, "turn": -180.0, "advance": 0.004})
+        MotionNumbers.model_validate({"travel": 0.02, "first_contact": 0.004, "turn": -180.0, "advance": 0.004})
 
 
 def test_search_turn_is_refused_when_out_of_range(tmp_path):
@@ -592,3 +595,87 @@ def test_plug_without_a_stop_is_not_pushed_past_the_target(tmp_path):
     created = yaml.safe_load((tmp_path / "task" / "task.yaml").read_text())
     assert created["motion"]["push"] == 0.0
     assert int(created["measured"]["demonstrations_seated"][0]) >= 3
+
+
+def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
+    other = tmp_path / "other"
+    shutil.copytree(folder, other)
+    text = (other / "task.yaml").read_text()
+    (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
+    options = "--set", "net_arch=8", "--set", "gradient_steps=1", "--no-pictures", "--out", tmp_path / "run"
+    call("train", folder, other, "--episodes", 2, *options, "--json")
+    run = RunFolder(tmp_path / "run")
+    assert sorted(run.episodes()["environment"]) == ["parts/other", "parts/peg"]
+    assert len({member.task_content for member in run.config().members}) == 2
+    capsys.readouterr()
+    call("evaluate", tmp_path / "run", "--episodes", 1, "--baselines", "scripted", "--json")
+    result = json.loads(capsys.readouterr().out)
+    assert {*result["environments"]} == {"parts/other", "parts/peg"}
+    assert {*result["environments"]["parts/peg"]} == {"policy", "demonstration", "scripted"}
+    call("evaluate", tmp_path / "run", "--task", folder, "--task", other, "--episodes", 1, "--baselines", "none")
+    assert "parts/other" in capsys.readouterr().out
+    changed = (other / "task.yaml").read_text().replace("force_limit: 35.0", "force_limit: 30.0", 1)
+    (other / "task.yaml").write_text(changed)
+    with pytest.raises(InputError, match="the files of parts/other are not those that the run"):
+        start_or_resume(None, tmp_path / "run", environment={}, episodes=3, resume=True)
+
+
+def shared(folder, **options):
+    options = {"difficulty": "hard", "guidance": "kgrl", "observation": "shared"} | options
+    return make_env(str(folder), **options)
+
+
+def test_shared_observation_is_relative_to_the_measured_contact(folder):
+    file, env = read_task_file(folder), shared(folder)
+    assert file.motion.first_contact == pytest.approx(15e-3, abs=0.1e-3)  # depth of the drawn hole
+    observations, poses, commands = [], [], []
+    observation, _ = env.reset(seed=0)
+    for _ in range(40):
+        observation, _, terminated, truncated, _ = env.step(np.zeros(2))
+        observations.append(observation)
+        poses.append(env.trace.measured[-1].copy())
+        commands.append(env.trace.commanded[-1].copy())
+        if terminated or truncated:
+            break
+    observations, poses, commands = map(np.array, (observations, poses, commands))
+    height = np.clip((poses[:, 2] - file.motion.first_contact) / 5e-3, -3, 3)
+    np.testing.assert_allclose(observations[:, 17], height, atol=1e-5)
+    lag = np.clip((poses - commands)[:, 2] / 5e-3, -3, 3)
+    assert np.corrcoef(observations[:, 20], lag)[0, 1] > 0.99
+    per_action = env.action_repeat * env.diagram.control_period
+    for delay, entries in ((0.2, slice(21, 24)), (0.6, slice(24, 27))):
+        back = round(delay / per_action)
+        moved = np.clip((poses[back:] - poses[:-back])[:, :3] / 1e-3, -3, 3)
+        np.testing.assert_allclose(observations[back:, entries], moved, atol=1e-4)
+    env.close()
+
+
+def test_search_acts_equally_on_the_shared_observation(folder):
+    actions = {}
+    for name in ("center_of_pressure", "shared"):
+        env = shared(folder, observation=name)
+        search = env.diagram.task.scripted_policies("hard")["scripted_search"]
+        observation, _ = env.reset(seed=1)
+        actions[name] = []
+        while True:
+            actions[name].append(search(observation))
+            observation, _, terminated, truncated, _ = env.step(actions[name][-1])
+            if terminated or truncated:
+                break
+        env.close()
+    first, second = (np.array(each) for each in actions.values())
+    assert len(first) == len(second)
+    np.testing.assert_allclose(first, second, atol=1e-3)
+
+
+def test_shared_observation_has_the_symmetries_of_the_part(folder):
+    env, other = shared(folder), shared(folder, observation="center_of_pressure")
+    symmetry, known = env.diagram.near_symmetry, other.diagram.near_symmetry
+    np.testing.assert_array_equal(symmetry.observations[:, :17, :17], known.observations)
+    across = symmetry.observations[0][15:17, 15:17]  # commanded x and y
+    np.testing.assert_array_equal(symmetry.observations[0][18:20, 18:20], across)
+    for start in (21, 24):
+        np.testing.assert_array_equal(symmetry.observations[0][start : start + 2, start : start + 2], across)
+    assert (symmetry.observations[:, [17, 20, 23, 26], [17, 20, 23, 26]] == 1).all()
+    env.close()
+    other.close()

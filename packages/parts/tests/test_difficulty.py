@@ -110,7 +110,7 @@ class ObservationEnv(gymnasium.Env):
 
 
 def test_episode_is_truncated_when_the_plug_is_on_the_rim():
-    file = SimpleNamespace(motion=MotionNumbers(travel=0.010, rim=0.007))
+    file = SimpleNamespace(motion=MotionNumbers(travel=0.010, first_contact=0.007))
     times = file.motion.plan_search()[0]
     stop = times[3] + difficulty.SEATING_TIME  # [s]
     rows = [(stop - 0.01, 0.007), (stop + 0.01, 0.0064), (stop + 0.01, 0.0066)]
@@ -120,7 +120,7 @@ def test_episode_is_truncated_when_the_plug_is_on_the_rim():
 
 def test_failed_calibration_returns_the_unchanged_file(tmp_path):
     messages = []
-    motion = MotionNumbers(travel=0.010, rim=0.007)
+    motion = MotionNumbers(travel=0.010, first_contact=0.007)
     file = SimpleNamespace(measured={"force": 5.0}, clearance=0.0, force_limit=35.0, motion=motion)
     assert calibrate(tmp_path / "missing", file, 1e-2, 2, messages.append) is file
     assert messages[0].startswith("difficulty=hard is not calibrated: there is no task folder")

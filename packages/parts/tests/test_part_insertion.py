@@ -60,7 +60,7 @@ def write(folder, **changes):
         "name": f"parts/{folder.name}",
         "plug": part("plug"),
         "socket": part("socket", pieces=[{"file": "socket.obj"}]),
-        "motion": {"travel": 0.02, "rim": 0.01},
+        "motion": {"travel": 0.02, "first_contact": 0.01},
         "demonstrations": {"components": 3},
     }
     (folder / "task.yaml").write_text(yaml.safe_dump(content | changes))
@@ -119,9 +119,12 @@ def test_invalid_task_is_refused_with_the_name_of_its_file(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"motion": {"travel": 0.02, "rim": 0.01, "push": -0.004}}, "motion.push must be at least 0, not -0.004"),
-        ({"motion": {"rim": 0.01}}, "motion.travel is missing"),
-        ({"motion": {"travel": 0.02, "rim": 0.01, "pusch": 0}}, "motion has no option 'pusch'.*push"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -0.004}},
+            "motion.push must be at least 0, not -0.004",
+        ),
+        ({"motion": {"first_contact": 0.01}}, "motion.travel is missing"),
+        ({"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}}, "motion has no option 'pusch'.*push"),
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "modulus": -1.0}])}, r"plug\.pieces\[0\]\.modulus must be"),
         ({"plug": part("plug", center="middle")}, "plug.center must be 3 numbers, such as .*, not 'middle'"),
         ({"place": [0.5]}, r"place must be 3 numbers, such as 0.55,0,0.15, not \[0.5\]"),
@@ -253,8 +256,8 @@ def test_scenario_adds_its_models_to_the_plant(tmp_path):
 
 @pytest.mark.parametrize(("travel", "is_accepted"), [(0.01, False), (0.0504, False), (0.0505, True)])
 def test_plug_starts_above_the_rim(travel, is_accepted):
-    with nullcontext() if is_accepted else pytest.raises(InputError, match="rim must be at least"):
-        motion = validate_options(MotionNumbers, {"travel": travel, "rim": 0.05}, "here")
+    with nullcontext() if is_accepted else pytest.raises(InputError, match="first_contact must be at least"):
+        motion = validate_options(MotionNumbers, {"travel": travel, "first_contact": 0.05}, "here")
         for times, _ in (motion.plan_search(), motion.plan_straight_insertion()):
             assert np.diff(times).min() >= 0.0
 
@@ -351,15 +354,24 @@ FREE = [None] * 6  # no bound on any output
         ({"bounds": {"lower": [*FREE[:5], 0.3], "upper": FREE}}, "exclude the pose of the seated plug"),
         ({"bounds": {"lower": FREE, "upper": [*FREE[:2], 0.015, *FREE[3:]]}}, "exclude the demonstrations' start, z"),
         ({"bounds": {"lower": [-2, -2, *FREE[2:]], "upper": [2, 2, *FREE[2:]]}}, "bounds are in meters and radians"),
-        ({"tolerance": {"height": 0.5}}, r"height must be less than motion\.rim, 0\.01 m"),
-        ({"tolerance": {"height": 0.01}}, r"height must be less than motion\.rim, 0\.01 m"),
+        ({"tolerance": {"height": 0.5}}, r"height must be less than motion\.first_contact, 0\.01 m"),
+        ({"tolerance": {"height": 0.01}}, r"height must be less than motion\.first_contact, 0\.01 m"),
         ({"tolerance": {"steps": 52}}, r"tolerance\.steps in .* is 52, longer than an episode"),
         ({"tolerance": {"lateral": 1.0}}, r"tolerance\.lateral must be at most 0\.01, not 1\.0"),
-        ({"motion": {"travel": 0.02, "rim": 0.0005}}, r"motion\.rim must be more than 0\.0005, not 0\.0005"),
-        ({"motion": {"travel": 0.02, "rim": 0.01, "push": -1.0}}, r"motion\.push must be at least 0, not -1\.0"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.0005}},
+            r"motion\.first_contact must be more than 0\.0005, not 0\.0005",
+        ),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "push": -1.0}},
+            r"push must be at least 0, not -1\.0",
+        ),
         ({"plug": part("plug", pieces=[{"file": "plug.obj", "friction": 3}])}, r"plug\.pieces\[0\]\.friction must be"),
-        ({"motion": {"travel": 0.02}}, r"motion\.rim is missing: give it"),
-        ({"motion": {"travel": 0.02, "rim": 0.01, "pusch": 0}}, r"motion has no option 'pusch': did you mean push"),
+        ({"motion": {"travel": 0.02}}, r"motion\.first_contact is missing: give it"),
+        (
+            {"motion": {"travel": 0.02, "first_contact": 0.01, "pusch": 0}},
+            r"motion has no option 'pusch': did you mean push",
+        ),
         ({"recommended": {"learner": {"algoritm": "tqc"}}}, "there is no key 'algoritm': did you mean algorithm"),
         ({"recommended": {"learner": {"algorithm": 3}}}, r"recommended\.learner cannot .*: algorithm must be a name"),
         ({"measured": {"clearance_mm": "abc"}}, "clearance_mm must be a number from 0 to 500, or null"),
@@ -432,6 +444,6 @@ def test_pushes_of_a_hold_test_are_within_the_bounds(x, clearance, pushes, tmp_p
 
 def test_turned_plug_is_pulled_by_the_hold_test(tmp_path):
     task = EnvConfig.resolve(
-        str(write(tmp_path / "turned", motion={"travel": 0.02, "rim": 0.01, "turn": 30.0})), {}
+        str(write(tmp_path / "turned", motion={"travel": 0.02, "first_contact": 0.01, "turn": 30.0})), {}
     ).make_task()
     assert [test.displacement for test in task.hold_tests(np.zeros(6))] == [(0.0, 0.0, HOLD_DISTANCE)]

@@ -5,6 +5,7 @@ import sys
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.plugins import BUILT_IN
 from guiderail.models.common.registry import Registry, check_callable
 
 
@@ -76,19 +77,13 @@ def test_entry_point_is_refused_when_its_name_is_registered(install):
         registry.get("cone")
 
 
-@pytest.mark.parametrize("decorator", ["register_shape", None])
-def test_built_in_is_returned_when_an_entry_point_has_its_name(decorator, install, tmp_path, caplog):
-    (tmp_path / "own").mkdir()
-    (tmp_path / "own" / "cones.py").write_text(
-        "import lab_shapes\n\nregister_shape = lab_shapes.REGISTRY.register\n"
-        "@register_shape('cone')\ndef Cone():\n    pass\n"
-    )
+def test_built_in_is_returned_when_an_entry_point_has_its_name(install, tmp_path, caplog, monkeypatch):
+    (tmp_path / "own_cones.py").write_text("def Cone():\n    pass\n")
+    monkeypatch.setitem(BUILT_IN, "shape:cone", "own_cones:Cone")
     install("lab_broken", "raise RuntimeError\n", cone="Cone")
-    registry = make_registry(package="own", decorator=decorator)
-    sys.modules["lab_shapes"] = type(sys)("lab_shapes")
-    sys.modules["lab_shapes"].REGISTRY = registry
+    registry = make_registry()
     for _ in range(2):
-        assert registry.get("cone").__module__ == "own.cones"
+        assert registry.get("cone").__module__ == "own_cones"
     assert registry.broken == {}
     assert registry.usable() == ["cone"]
     assert [record.getMessage() for record in caplog.records] == [

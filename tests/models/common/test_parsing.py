@@ -43,3 +43,11 @@ def test_package_of_a_mesh_is_found(place, depth, tmp_path, monkeypatch):
     else:
         assert len(add_models(plant, model)) == 1
         assert scene_graph.model_inspector().num_geometries() == 1
+
+
+def test_models_of_this_package_have_urls():
+    plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)
+    add_models(plant, "package://guiderail/robots/iiwa14.urdf")
+    assert plant.HasBodyNamed("iiwa_flange")
+    with pytest.raises(InputError, match=r"nothing\.urdf"):
+        add_models(plant, "package://guiderail/robots/nothing.urdf")

@@ -1,16 +1,31 @@
-"""Registries refuse unknown and duplicate names, and read declarations without importing their modules."""
+"""Registries refuse unknown and duplicate names; the table of plug-ins has every entry of guiderail."""
 
 import sys
 from dataclasses import dataclass
-from importlib import import_module
-from types import SimpleNamespace
+from importlib.metadata import EntryPoint
 
 import pytest
 
 import guiderail
-from guiderail.diagrams.tasks.registry import register_task
+from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.stations.registry import STATIONS
+from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.plugins import BUILT_IN
 from guiderail.models.common.registry import Registry
+from guiderail.models.primitives.kernels import KERNELS
+from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS
+from guiderail.tools.learning.learner import LEARNERS
+
+REGISTRIES = {
+    "task": TASKS, "station": STATIONS, "guidance": GUIDANCE, "kernel": KERNELS, "robot": ROBOTS,
+    "end_effector": END_EFFECTORS, "learner": LEARNERS,
+}  # fmt: skip
+OPTIONS = {
+    "task_options": (TASKS, "Options"),
+    "station_options": (STATIONS, "options"),
+    "learner_config": (LEARNERS, "Config"),
+}
 
 
 @pytest.mark.parametrize("name", [{}, [], None, 3, ["sphere"]])
@@ -72,42 +87,42 @@ def test_register_replaces_an_entry_of_the_same_file_only(tmp_path):
     assert shapes.get("sphere") is second
 
 
-def test_declared_reads_literals_without_an_import(tmp_path, monkeypatch):
-    (tmp_path / "local_shapes").mkdir()
-    (tmp_path / "local_shapes/__init__.py").touch()
-    (tmp_path / "local_shapes/polygons.py").write_text(
-        'SIDES = 4\n\n\n@register_shape("triangle", sides=3)\ndef triangle():\n    raise AssertionError\n\n\n'
-        '@register_shape("square", sides=SIDES)\ndef square():\n    pass\n'
-    )
+def test_register_refuses_a_name_of_the_table_before_its_import(tmp_path, monkeypatch):
+    (tmp_path / "polygons.py").write_text("def triangle():\n    pass\n")
     monkeypatch.syspath_prepend(tmp_path)
-    shapes = Registry("shape", package="local_shapes", decorator="register_shape")
-    assert shapes.names() == ["square", "triangle"]
-    assert shapes.declared("triangle", "sides") == 3
-    with pytest.raises(NameError, match="register_shape"):  # `sides` is not a literal: the module is imported
-        shapes.declared("square", "sides")
-    triangle = _function_from(tmp_path / "local_shapes/polygons.py")
-    shapes.register("triangle", SimpleNamespace(sides=30, build=triangle))
-    assert shapes.declared("triangle", "sides") == 30
-
-
-def test_register_refuses_a_declared_name_before_its_import(tmp_path, monkeypatch):
-    (tmp_path / "lazy_shapes").mkdir()
-    (tmp_path / "lazy_shapes/__init__.py").touch()
-    (tmp_path / "lazy_shapes/polygons.py").write_text(
-        'from lazy_shapes.kinds import register_shape\n\n\n@register_shape("triangle")\ndef triangle():\n    pass\n'
-    )
-    (tmp_path / "lazy_shapes/kinds.py").write_text(
-        "from guiderail.models.common.registry import Registry\n\n"
-        'SHAPES = Registry("shape", package="lazy_shapes", decorator="register_shape")\n'
-        "register_shape = SHAPES.register\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    shapes = import_module("lazy_shapes.kinds").SHAPES
-    with pytest.raises(InputError, match=r"there is a shape 'triangle' already, from lazy_shapes\.polygons: choose"):
+    monkeypatch.setitem(BUILT_IN, "shape:triangle", "polygons:triangle")
+    shapes = Registry("shape", plugin="shape")
+    assert shapes.names() == ["triangle"]
+    assert shapes.is_packaged("triangle")
+    with pytest.raises(InputError, match=r"there is a shape 'triangle' already, from polygons: choose"):
         shapes.register("triangle", _function_from(tmp_path / "other.py"))
-    assert "lazy_shapes.polygons" not in sys.modules
+    assert "polygons" not in sys.modules
     triangle = shapes.get("triangle")
-    assert triangle.__module__ == "lazy_shapes.polygons"
+    assert triangle.__module__ == "polygons"
     with pytest.raises(InputError, match="there is a shape 'triangle' already"):
         shapes.register("triangle", _function_from(tmp_path / "other.py"))
     assert shapes.get("triangle") is triangle
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_every_target_of_the_table_is_registered_under_its_name(name):
+    kind, _, entry = name.partition(":")
+    target = EntryPoint(name, BUILT_IN[name], "").load()
+    if kind in REGISTRIES:
+        value = REGISTRIES[kind].get(entry)
+        assert target in (value, getattr(value, "build", None))
+    else:
+        registry, attribute = OPTIONS[kind]
+        assert getattr(registry.get(entry), attribute) is target
+
+
+def test_every_own_entry_is_in_the_table():
+    for kind, registry in REGISTRIES.items():
+        for name in registry.names():
+            registry.get(name)
+        own = {name for name, entry in registry._entries.items() if _module(entry).startswith("guiderail.")}
+        assert own == {name.partition(":")[2] for name in BUILT_IN if name.startswith(f"{kind}:")}
+
+
+def _module(entry):
+    return str(getattr(getattr(entry, "build", entry), "__module__", ""))

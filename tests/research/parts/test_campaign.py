@@ -10,8 +10,8 @@ pytest.importorskip("igl")
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.tables import write_table
+from guiderail_parts.pairs import find_pairs
 from research.parts.campaign import StepError, describe_calibration, finish, summarize, to_table
-from research.parts.pairs import find_pairs
 
 
 def test_find_pairs_finds_plugs_with_their_sockets(tmp_path):

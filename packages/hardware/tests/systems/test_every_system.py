@@ -25,7 +25,10 @@ def system_by_name():
     """Return one instance of each system by name, with all optional ports."""
     plant, _ = controller_model(BncWorkcell())
     safety = systems.SafetyLimits((1.0,) * 7, (1.0,) * 7, (1.0,) * 7, decay_time=1.0)
-    browser = SimpleNamespace(AddSlider=lambda *arguments: None)
+    gamepad = SimpleNamespace(index=None, axes=[])
+    browser = SimpleNamespace(
+        AddSlider=lambda *arguments: None, GetGamepad=lambda: gamepad, GetSliderValue=lambda name: 0.5
+    )
     instances = [
         systems.HeartbeatMonitor(period=PERIOD, timeout=0.5),
         systems.PoseMotionLimiter(FRANKA_LIMITS, period=PERIOD),

@@ -69,7 +69,7 @@ class ChunkSafetyLimiter(LeafSystem):
         self._chunk_port = self.DeclareVectorInputPort("chunk", num_steps * self._outputs)
         self._pose_port = self.DeclareVectorInputPort("pose", self._outputs)
         # [last three commands and rest of the limited chunk (3 + K, O); rate; fallback; number of the control step]
-        self._state = self.DeclareDiscreteState((3 + num_steps) * self._outputs + 3)
+        self._state = declare.unset_state(self, (3 + num_steps) * self._outputs + 3)
         self._plan = declare.cache(self, "plan", self._calc_plan, [self._chunk_port, self._state])
         declare.part_output(self, "desired_pose", self._plan, lambda plan: plan.outputs[0], self._outputs)
         declare.part_output(self, "rate", self._plan, lambda plan: plan.rate)
@@ -92,7 +92,7 @@ class ChunkSafetyLimiter(LeafSystem):
         discrete_state.set_value(self._state, np.append(motion, np.zeros(3)))
 
     def _calc_plan(self, context: Context) -> _Plan:
-        *motion, rate, fallback, step = context.get_discrete_state().value(self._state)
+        *motion, rate, fallback, step = declare.initialized(self, context, self._state)
         past, rest = np.split(np.reshape(motion, (-1, self._outputs)), [3])
         if step % self._replan_steps != 0:
             return _Plan(rest, rate, fallback)

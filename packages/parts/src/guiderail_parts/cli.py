@@ -1,4 +1,4 @@
-"""`guiderail create-task`."""
+"""`guiderail create-task` and `guiderail create-tasks`."""
 
 from pathlib import Path
 from typing import Annotated
@@ -77,3 +77,45 @@ def create_task(
         labels = {"modulus": "modulus [Pa]", "force": "force [N]", "hard_force_limit": "hard force limit [N]"}
         created = {labels.get(name, name): value for name, value in created.items()}
     print_result(created, as_json)
+
+
+@command("create-tasks meshes --unit m --out parts --processes 2", "create-tasks")
+def create_tasks(
+    pairs: Annotated[
+        Path,
+        argument(
+            "CSV table with the columns name, plug and socket, and optionally options of create-task; or folder with "
+            "a subfolder for each pair, with files named plug and socket.",
+            "TABLE|FOLDER",
+        ),
+    ],
+    out: Annotated[Path, option("Folder of the task folders; the same command continues an interrupted one.")],
+    unit: Annotated[str | None, option("Unit of .stl, .obj and .ply meshes: mm, cm, m or inch.")] = None,
+    hard_episodes: Annotated[
+        int, option("Episodes per baseline policy and setting that calibrate difficulty=hard; 0: no calibration.")
+    ] = 10,
+    processes: Annotated[int, option("Number of pairs that are prepared at the same time.")] = 1,
+    retry: Annotated[bool, option("Prepare refused pairs again.", "--retry")] = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Create insertion tasks from many pairs of meshes.
+
+    Each pair is prepared as by create-task. If the parts overlap, the plug is shrunk by the proposed distance. A
+    refused pair does not end the command: its reason is in the table parts.csv and parts.md, and its messages are in
+    logs/.
+    """
+    from guiderail_parts.batch import TABLE
+    from guiderail_parts.batch import create_tasks as create
+    from guiderail_parts.pairs import find_pairs, read_pairs
+
+    results = create(
+        find_pairs(pairs, unit) if pairs.is_dir() else read_pairs(pairs, unit),
+        out,
+        processes=processes,
+        retry=retry,
+        hard_episodes=hard_episodes,
+        log=(lambda text: None) if as_json else print_progress,
+    )
+    failures = {name: result["error"] for name, result in results.items() if "error" in result}
+    summary = {"pairs": len(results), "created": len(results) - len(failures), "table": str(out / f"{TABLE}.md")}
+    print_result(summary | ({"failures": failures} if as_json else {}), as_json)

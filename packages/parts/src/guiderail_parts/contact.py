@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -156,10 +157,11 @@ def choose_contact(
         if any(choice.aligned.success for choice in choices):
             break
     if not choices:
-        raise InputError(
-            f"these parts can't be simulated ({'; '.join(reasons)}): remove details without contact, such as threads "
-            "and lettering, and export them again"
-        )
+        advice = "remove details without contact, such as threads and lettering, and export them again"
+        if find_spec("pytetwild") is None:
+            advice = f'pip install "guiderail[repair]", which makes tetrahedral meshes of intricate parts, or {advice}'
+            reasons = [reason for reason in reasons if "pytetwild" not in reason]
+        raise InputError(f"these parts can't be simulated ({'; '.join(reasons)}): {advice}")
     best = max(choices, key=lambda choice: rank(choice, allowed))
     _write_pieces(folder, best.contact, surfaces)
     return replace(best, seconds=seconds)

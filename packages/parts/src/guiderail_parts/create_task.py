@@ -36,12 +36,12 @@ from guiderail_parts.geometry.assembly_check import (
     plan_motion,
 )
 from guiderail_parts.geometry.assembly_check import shrink as shrink_part
-from guiderail_parts.geometry.demonstrator import NUM_DEMONSTRATIONS
+from guiderail_parts.geometry.demonstrator import NUM_DEMONSTRATIONS, TOUCH
 from guiderail_parts.geometry.mesh_file import UNITS, Part, find_unit, find_units, load_part, obj_text
 from guiderail_parts.geometry.preparation import MIN_YAW, ContactSurface, choose_tolerance, decimate, prepare_surfaces
 
 if TYPE_CHECKING:
-    from guiderail_parts.task_file import PartTaskFile, SearchNumbers
+    from guiderail_parts.task_file import MotionNumbers, PartTaskFile, SearchNumbers
 
 AXES = {"+x": (1, 0, 0), "-x": (-1, 0, 0), "+y": (0, 1, 0), "-y": (0, -1, 0), "+z": (0, 0, 1), "-z": (0, 0, -1)}
 DENSITY = 2700.0  # assumed density of the parts, here of aluminum [kg/m³]; a gantry has no gravity
@@ -53,6 +53,7 @@ MAX_SEARCH_TURN = 10.0  # largest unknown turn of the socket [degrees]
 COMMANDED_TURN = 1.5  # bound of the commanded turn, as a multiple of the unknown turn of the socket
 MAX_SEATED_TURN = 20.0  # largest turn of a seated plug if the insertion has no turn [degrees]
 MAX_EPISODES = 100  # largest number of episodes of each policy for each setting of a calibration
+ROUNDING = 1e-6  # numbers of task.yaml are rounded to this length [m]
 MAX_CENTER = 1.0  # largest distance of the insertion axis from the plug's center of mass [m]
 
 
@@ -211,9 +212,9 @@ def create_task(
         make_file = partial(_task_file, parts, surfaces, values)
         choice = choose_contact(folder, surfaces, make_file, tolerance, clearance, log)
         task = make_file(choice.contact, choice.push)
-        measured, search = _measure(folder, task, choice, prepared, start, log)
+        measured, search, first_contact = _measure(folder, task, choice, prepared, start, log)
         if not only_insert:
-            task = task.model_copy(update={"search": search})
+            task = task.model_copy(update={"search": search, "motion": _touching_at(task, first_contact, log)})
             from guiderail_parts.trial import add_convex_pieces
 
             if not (scenarios or choice.contact.snapping):
@@ -324,10 +325,13 @@ def _measure(
     prepared: dict[str, Any],
     start: float,
     log: Callable[[str], None],
-) -> tuple[dict[str, Any], SearchNumbers]:
-    """Return the measurements of the chosen contact, and the numbers that the scripted search uses."""
+) -> tuple[dict[str, Any], SearchNumbers, float | None]:
+    """Return the measurements of the chosen contact, the numbers of the scripted search, and the first contact [m].
+
+    The first contact is None if no misaligned plug was blocked.
+    """
     from guiderail_parts.task_file import SearchNumbers
-    from guiderail_parts.trial import insert, measure_lever_sign
+    from guiderail_parts.trial import insert, measure_first_contact, measure_lever_sign
 
     inserted_s, contact, aligned = _seconds_since(start), choice.contact, choice.aligned
     misaligned = choice.misaligned or tuple(
@@ -367,7 +371,19 @@ def _measure(
         "inserted_s": inserted_s,
     }
     sign = measure_lever_sign([(xy, trial.recording) for xy, trial in zip(MISALIGNMENTS, misaligned, strict=True)])
-    return measured, SearchNumbers.model_validate({"lever_sign": sign})
+    return measured, SearchNumbers.model_validate({"lever_sign": sign}), measure_first_contact(misaligned)
+
+
+def _touching_at(file: PartTaskFile, first_contact: float | None, log: Callable[[str], None]) -> MotionNumbers:
+    """Return the motion with the measured first contact [m]; unchanged if it is None or out of range."""
+    if first_contact is None:
+        log("no misaligned plug is blocked, so the height of the first contact is that at which the meshes overlap")
+        return file.motion
+    motion, rim = file.motion, file.motion.first_contact
+    lowest = TOUCH + (motion.advance or 0.5 * file.tolerance.height)
+    height = round(float(np.clip(first_contact, lowest + ROUNDING, rim)), 6)
+    log(f"first contact: {1e3 * height:.2f} mm above the target; the meshes overlap from {1e3 * rim:.2f} mm")
+    return motion.model_copy(update={"first_contact": height})
 
 
 def _write_task(
@@ -447,7 +463,7 @@ def _task_file(
             MotionNumbers,
             {
                 "travel": path.travel,
-                "rim": path.rim,
+                "first_contact": path.rim,  # until the trial insertions measure it
                 "turn": float(path.turn / DEGREE),
                 "advance": path.advance,
                 "search_turn": values["search_turn"],

@@ -18,6 +18,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail_parts.geometry.demonstrator import SEARCH_END
 from guiderail_parts.isolation import IsolatedError, run_isolated
 from guiderail_parts.task import IN_SOCKET, TIME, Z, load_task_folder
 from guiderail_parts.task_file import PartTaskFile, read_task_file
@@ -29,7 +30,6 @@ MARGIN = 0.75 * MM  # distance from the offset to the bound of commands [m]
 MIN_FORCE, FORCE_RATIO = 10.0, 2.5  # smallest force limit [N]; ratio of force limit to peak force when aligned
 MAX_TURN = 3.0  # largest turn of the socket [degrees]
 MAX_SECONDS = 300  # CPU time after which a calibration is stopped [s]
-SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
 SEATING_TIME = 1.0  # time after the search in which the push may still seat the plug [s]
 NAME = "create-task/calibration"  # name of the task in the process that calibrates it
 
@@ -145,7 +145,7 @@ class StopOnRim(gymnasium.Wrapper):
         numbers = file.motion
         times, _ = numbers.plan_search()
         self._progress = 2.0 * (times[SEARCH_END] + SEATING_TIME) / times[-1] - 1.0
-        self._height = 2.0 * (numbers.rim - IN_SOCKET) / numbers.travel - 1.0
+        self._height = 2.0 * (numbers.first_contact - IN_SOCKET) / numbers.travel - 1.0
 
     def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """Return the result of the environment's step, truncated if the plug is still on the rim."""

@@ -12,12 +12,15 @@ import numpy as np
 from pydantic import Field
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import DiagramBuilder, OutputPort
+from pydrake.systems.primitives import Multiplexer
+from scipy.linalg import block_diag
 
-from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import STANDARD, Number
 from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
-from guiderail.diagrams.stations.station import CONTROL_PERIOD
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
 from guiderail.diagrams.tasks.insertion import (
@@ -29,6 +32,7 @@ from guiderail.diagrams.tasks.insertion import (
 )
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
+    COMMAND_SCALE,
     HISTORY_VARIANCE,
     OBSERVATIONS,
     REWARDS,
@@ -36,6 +40,7 @@ from guiderail.diagrams.tasks.options import (
     ForceOptions,
 )
 from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.parsing import add_models
@@ -44,6 +49,7 @@ from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
+from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.tools.learning.config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
@@ -132,13 +138,20 @@ COLORS = {PLUG: "0.85 0.65 0.25 1", SOCKET: "0.62 0.64 0.68 1"}
 
 # Indices into the observation [time, pose, wrench, center of pressure, command].
 TIME, POSITION, Z, CENTER_OF_PRESSURE, COMMAND = 0, slice(1, 3), 3, slice(13, 15), slice(15, 17)
-IN_SOCKET = 0.5 * MM  # depth below the rim from which a plug is in the socket [m]
+IN_SOCKET = 0.5 * MM  # depth below the first contact from which a plug is in the socket [m]
 BLOCKED = 1.5 * MM  # height above the demonstrated command from which a plug in the socket is blocked [m]
 MIN_PUSH = 1.5 * MM  # smallest displacement of the command by a push on a seated plug, in addition to the play [m]
 FOLLOWING = 3.0  # rate of change of the action per 2 mm of distance between the command and a plug in the socket [1/s]
 # Largest distance from the demonstrations' start to the bounds, inside which an episode starts [m], [rad].
 MAX_START_SHIFT = np.array([*[1.0 * MM] * 3, *[2.0 * DEGREE] * 3])
 WRENCH_SCALE = np.array([5.0, 5.0, 8.0, 0.05, 0.05, 0.2])
+
+
+# Observation "shared": scales of heights and distances [m], and delays of the progress [s].
+NEAR, SLIDING, PROGRESS = 5.0 * MM, 1.0 * MM, 1.0 * MM
+DELAYS = (0.2, 0.6)
+COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale as in the other observations [N]
+LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
 class PartOptions(FixtureOffsetOptions, ForceOptions):
@@ -204,7 +217,7 @@ class ScriptedSearch:
         self._action = np.zeros(self._size)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return an action, (2,) or (3,) with a `search_turn`, for an observation with the center of pressure.
+        """Return an action, (2,) or (3,) with a `search_turn`, for "center_of_pressure" or "shared".
 
         Raises:
             InputError: If the observation has no center of pressure.
@@ -217,8 +230,13 @@ class ScriptedSearch:
             self._action, self._direction, passed = np.zeros(self._size), 1.0, 0.0
         self._time = time
         lever = observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
+        if len(observation) >= LAG.stop:  # "shared"
+            lever = lever * self._file.search.lever_sign
+            distance = observation[LAG] * (SLIDING + self._file.clearance) / COMMAND_SCALE
+        else:
+            distance = observation[POSITION] - observation[COMMAND]
         height, length = 0.5 * self._file.motion.travel * (observation[Z] + 1.0), float(np.linalg.norm(lever))
-        on_rim, search = height > self._file.motion.rim - IN_SOCKET, self._file.search
+        on_rim, search = height > self._file.motion.first_contact - IN_SOCKET, self._file.search
         change = np.zeros(self._size)
         if length > 0.0 and (on_rim or height - np.interp(time, self._times, self._heights) > BLOCKED):
             change[:2] = search.lever_sign * search.speed * lever / max(length, MM)
@@ -226,7 +244,7 @@ class ScriptedSearch:
                 self._direction = -np.sign(self._action[-1])
             change[2:] = self._direction * search.turn_speed
         elif not on_rim:
-            change[:2] = FOLLOWING * (observation[POSITION] - observation[COMMAND])
+            change[:2] = FOLLOWING * distance
         self._action = np.clip(self._action + passed * change, -1.0, 1.0)
         return self._action.copy()
 
@@ -234,7 +252,11 @@ class ScriptedSearch:
 class PartInsertion(DemonstratedInsertion):
     """Insert a plug into a socket.
 
-    Rewards: see `DemonstratedInsertion`.
+    Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
+    a policy of many parts: "center_of_pressure" with forces relative to the force limit, lateral positions relative to
+    the reach of an action, and the lever arm with the part's measured sign; then the height above the measured first
+    contact, the distance of the plug from the command (laterally relative to the clearance), and the plug's progress
+    in the last 0.2 and 0.6 s, which shows whether anything moves.
     """
 
     Options = PartOptions
@@ -242,7 +264,7 @@ class PartInsertion(DemonstratedInsertion):
     workpiece, fixture = PLUG, SOCKET
     simulated_rewards = ("aligned",)
     rewards = REWARDS
-    observations = OBSERVATIONS
+    observations = (*OBSERVATIONS, "shared")
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]  # content of `task.yaml`
 
@@ -352,7 +374,59 @@ class PartInsertion(DemonstratedInsertion):
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale_of_turn = max(abs(turn), 3 * DEGREE, self.file.motion.search_turn * DEGREE)
         scale = np.array([2 * MM, 2 * MM, height, scale_of_turn, 1.5 * DEGREE, 1.5 * DEGREE])
-        return self.scaled_terms(center, scale, WRENCH_SCALE)
+        if self.config.observation != "shared":
+            return self.scaled_terms(center, scale, WRENCH_SCALE)
+        half, reach, file = 0.5 * self.num_steps * self.control_period, self._reach, self.file
+        scale[:2] = reach
+        lag = np.array([*[SLIDING + file.clearance] * 2, NEAR])
+        return (
+            ObservationTerm("time", half, half),
+            ObservationTerm("pose", center, scale),
+            ObservationTerm("wrench", 0.0, WRENCH_SCALE * self.options.largest_force_limit / COMMON_FORCE_LIMIT),
+            ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE * file.search.lever_sign),
+            ObservationTerm("desired_pose", 0.0, reach, (0, 1)),
+            ObservationTerm("pose", file.motion.first_contact, NEAR, (2,)),
+            ObservationTerm("lag", 0.0, lag),
+            ObservationTerm("progress", 0.0, PROGRESS),
+            *self.force_limit_terms(),
+        )
+
+    @cached_property
+    def _reach(self) -> float:
+        """Lateral displacement of the command by a constant action of 1, mean over the motion [m]."""
+        lateral = self.reference().standard_deviations[:, :2]
+        return float(np.sqrt(3.0) * self.config.options.get("action_scale", 1.0) * np.sqrt((lateral**2).mean()))
+
+    def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
+        """Return the signals of `DemonstratedInsertion`; for "shared" also `lag` (3,) and `progress` (6,) [m].
+
+        `lag` is the position of the plug minus that of the command. `progress` is the displacement since each of
+        `DELAYS`.
+        """
+        signals = super().signals(builder, station)
+        if self.config.observation != "shared":
+            return signals
+        pose = station.get_pose_output_port()
+        command = builder.GetSubsystemByName("guidance").GetOutputPort("desired_pose")
+        position = np.eye(3, POSE_SIZE)
+        both = add_system(builder, "pose_and_command", Multiplexer([POSE_SIZE, POSE_SIZE]), pose, command)
+        lag = affine(np.hstack([position, -position]), np.zeros(3))
+        add_system(builder, "lag", lag, both.get_output_port())
+        selected = add_system(builder, "position", affine(position, np.zeros(3)), pose).get_output_port()
+        steps = [max(round(delay / station.control_period), 1) for delay in DELAYS]
+        history = HistoryBuffer(3, max(steps), station.control_period)
+        add_system(builder, "positions", history, output=selected, initial_output=selected)
+        joined = add_system(
+            builder, "position_and_history", Multiplexer([3, 3 * max(steps)]), selected,
+            history.get_history_output_port(),
+        )  # fmt: skip
+        D = np.zeros((3 * len(steps), 3 + 3 * max(steps)))
+        for row, delay in enumerate(steps):
+            D[3 * row : 3 * row + 3, :3] = np.eye(3)
+            oldest = 3 + 3 * (max(steps) - delay)
+            D[3 * row : 3 * row + 3, oldest : oldest + 3] = -np.eye(3)
+        progress = add_system(builder, "progress", affine(D, np.zeros(len(D))), joined.get_output_port())
+        return {**signals, "lag": lag.get_output_port(), "progress": progress.get_output_port()}
 
     def termination_terms(self) -> list[TerminationTerm]:
         """Return success at the target, and collision above the force limit."""
@@ -369,7 +443,8 @@ class PartInsertion(DemonstratedInsertion):
         return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
-        symmetries = sides_of_the_rim(self.config.observation, self.action_dims())
+        more = _shared_sides if self.config.observation == "shared" else _no_sides
+        symmetries = sides_of_the_rim(self.config.observation, self.action_dims(), more)
         selected = [index for index, name in enumerate(SYMMETRIES) if name in names]
         if symmetries is None or not selected or self.has_image:
             return None
@@ -396,6 +471,17 @@ class PartInsertion(DemonstratedInsertion):
             arm_views={"the parts": near, "the arm": ARM_VIEW},
             line_radius=0.0001,
         )
+
+
+def _no_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return no matrices, for observations without further entries."""
+    return ()
+
+
+def _shared_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Return the matrices of the last entries of "shared" for a rotation or reflection across the axis (2, 2)."""
+    moved = block_diag(across, np.eye(1))
+    return (np.eye(1), *[moved] * (1 + len(DELAYS)))
 
 
 def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:

@@ -91,7 +91,9 @@ class MotionNumbers(Options):
     """Motion of the plug along z of the target frame."""
 
     travel: Number = Field(gt=0, le=0.5, description="height of the start above the target [m]")
-    rim: Number = Field(gt=TOUCH, le=0.5, description="height at which the plug stands on the rim [m]")
+    first_contact: Number = Field(
+        gt=TOUCH, le=0.5, description="height at which a misaligned plug first touches the socket, as measured [m]"
+    )
     turn: Number = Field(0.0, ge=-180, le=180, description="turn about z at the bottom [degrees]")
     advance: Number = Field(0.0, ge=0, le=0.5, description="height lost during the turn, as by a screw [m]")
     search_turn: Number = Field(
@@ -101,31 +103,33 @@ class MotionNumbers(Options):
         4.0 * MM, ge=0, le=30 * MM, description="depth of the command below the target during the insertion [m]"
     )
     press: Number = Field(
-        2.5 * MM, ge=0, le=10 * MM, description="depth of the command below the rim during a search [m]"
+        2.5 * MM, ge=0, le=10 * MM, description="depth of the command below first_contact during a search [m]"
     )
 
-    @field_validator("rim")
+    @field_validator("first_contact")
     @classmethod
-    def _check_rim(cls, value: float, info: ValidationInfo) -> float:
+    def _check_first_contact(cls, value: float, info: ValidationInfo) -> float:
         travel = info.data.get("travel", np.inf)
         if travel - value - TOUCH < 0.0:
-            raise ValueError(f"rim must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m")
+            raise ValueError(
+                f"first_contact must be at least {TOUCH:g} m less than travel, {travel:g} m, not {value:g} m"
+            )
         return value
 
     @field_validator("advance")
     @classmethod
     def _check_advance(cls, value: float, info: ValidationInfo) -> float:
-        if value and value >= info.data.get("rim", np.inf) - TOUCH:
-            raise ValueError(f"the advance must be more than {TOUCH:g} m less than rim")
+        if value and value >= info.data.get("first_contact", np.inf) - TOUCH:
+            raise ValueError(f"the advance must be more than {TOUCH:g} m less than first_contact")
         return value
 
     def plan_straight_insertion(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times (N,) [s] and poses (N, 6) of a straight insertion."""
-        return plan_straight_insertion(self.travel, self.rim, self.turn * DEGREE, self.push, self.advance)
+        return plan_straight_insertion(self.travel, self.first_contact, self.turn * DEGREE, self.push, self.advance)
 
     def plan_search(self) -> tuple[np.ndarray, np.ndarray]:
         """Return times (N,) [s] and poses (N, 6) of a demonstration with a search on the rim."""
-        return plan_search(self.travel, self.rim, self.turn * DEGREE, self.push, self.press, self.advance)
+        return plan_search(self.travel, self.first_contact, self.turn * DEGREE, self.push, self.press, self.advance)
 
 
 class Tolerance(Options):
@@ -334,8 +338,8 @@ class PartTaskFile(Options):
     @field_validator("tolerance")
     @classmethod
     def _check_height(cls, value: Tolerance, info: ValidationInfo) -> Tolerance:
-        if "motion" in info.data and value.height >= info.data["motion"].rim:
-            raise ValueError(f"height must be less than motion.rim, {info.data['motion'].rim:g} m")
+        if "motion" in info.data and value.height >= info.data["motion"].first_contact:
+            raise ValueError(f"height must be less than motion.first_contact, {info.data['motion'].first_contact:g} m")
         return value
 
     @field_validator("bounds")

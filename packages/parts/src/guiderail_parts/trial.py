@@ -200,6 +200,19 @@ def measure_lever_sign(pushed: Sequence[tuple[tuple[float, float], Recording]]) 
     return 1 if towards > 0.0 else -1
 
 
+def measure_first_contact(trials: Sequence[Trial]) -> float | None:
+    """Return the height at which a misaligned plug first touches the socket [m]; None if no trial was blocked.
+
+    It is the median over the blocked `trials`. Meshes can overlap in height long before the parts touch.
+    """
+    heights = [
+        recording["pose"][touches.argmax(), 2]
+        for recording in (trial.recording for trial in trials if trial.is_blocked)
+        if (touches := np.asarray(recording["wrench"])[:, 2] >= MIN_CONTACT_FORCE).any()
+    ]
+    return float(np.median(heights)) if heights else None
+
+
 _SOLID = {"plug": Rgba(0.85, 0.65, 0.25, 1.0), "socket": Rgba(0.62, 0.64, 0.68, 0.45)}
 _SCALE = 10.0  # magnification, because the page's camera cannot get close to small parts
 
@@ -251,7 +264,7 @@ def demonstrate(folder: Path, file: PartTaskFile) -> tuple[int, int]:
     """Write the demonstrations; return the number that seat the plug, and the number that were checked in time."""
     numbers, script = file.motion, file.motion.plan_search()
     times = CONTROL_PERIOD * np.arange(round(script[0][-1] / CONTROL_PERIOD) + 1)
-    press_from = numbers.rim - numbers.press - 1e-3
+    press_from = numbers.first_contact - numbers.press - 1e-3
     search_turn = numbers.search_turn * DEGREE
     sessions = [demonstrator_motions(seed, script, press_from, times, search_turn) for seed in range(MAX_SESSIONS)]
     sockets = np.column_stack([socket_offsets(), socket_turns(search_turn)])

@@ -205,9 +205,9 @@ def _read_key(key: Path | None) -> bytes | None:
     if key is None:
         return None
     try:
-        content = key.read_bytes()
+        content = checker.content(key)
     except OSError as error:
-        raise InputError(f"the key {key} can't be read ({error.strerror}): check the path") from error
+        raise InputError(f"the key {key} can't be read ({error.strerror or error}): check the path") from error
     if len(content) < MIN_KEY_BYTES:
         raise InputError(f"a key needs at least {MIN_KEY_BYTES} bytes: create one with head -c 32 /dev/urandom > {key}")
     return content

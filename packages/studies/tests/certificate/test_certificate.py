@@ -5,6 +5,7 @@ import hashlib
 import io
 import itertools
 import json
+import os
 import runpy
 import sys
 import warnings
@@ -13,6 +14,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import certificate_extremes
 import numpy as np
 import pytest
 
@@ -617,6 +619,74 @@ def test_checker_exits_with_1_or_2_for_invalid_files(valid_files, content, tmp_p
     assert code == (1 if content in MALFORMED else 2)
     assert out.startswith("no: " if content in MALFORMED else "no: the files make no sense")
     assert out.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", [CERTIFICATE, "primitive.npz", "constraints.npz", "witness.npz"])
+def test_checker_exits_with_2_when_a_file_is_a_pipe(valid_files, name, tmp_path, capsys, monkeypatch):
+    folder = write(tmp_path, valid_files)
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    code, out = run_checker(folder, capsys, monkeypatch)
+    assert code == 2
+    assert "not a regular file" in out
+
+
+def test_checker_exits_with_2_when_the_key_is_a_pipe(valid_files, tmp_path, capsys, monkeypatch):
+    os.mkfifo(tmp_path / "key")
+    monkeypatch.setattr(sys, "argv", ["checker.py", str(write(tmp_path, valid_files)), str(tmp_path / "key")])
+    with pytest.raises(SystemExit, match="2"):
+        runpy.run_path(checker.__file__, run_name="__main__")
+    assert "not a regular file" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("history", [0, 1, 4])
+def test_first_commands_have_the_speed_from_the_start(history, tmp_path):
+    """Before the first command the robot rests at the start, without a history too."""
+    loop = make_loop(history)
+    result = certify(loop)
+    checker.check(write(tmp_path, make_files(loop, result)))
+    largest = np.zeros((2, STEPS))
+    for sides in itertools.product([-1.0, 1.0], repeat=3):
+        start = loop.start + sides[0] * loop.start_within
+        actions = np.concatenate([sides[1:], np.zeros(STEPS - 2)])
+        motion = np.vstack([start, start, execute(loop, actions, start)])[:, 0]
+        values = [np.abs(np.diff(motion, order))[-STEPS:] / PERIOD**order for order in (1, 2)]
+        largest = np.maximum(largest, values)
+    assert largest[0, 0] == pytest.approx(result.free.speed[0, 0], rel=1e-9)
+    assert largest[1, :2] == pytest.approx(result.free.acceleration[:2, 0], rel=1e-9)
+
+
+@pytest.mark.parametrize("parameter", ["speed", "acceleration"])
+def test_checker_rejects_a_first_step_without_the_way_from_the_start(valid_files, tmp_path, parameter):
+    for regime in ("free", "always"):
+        changed = change_claims(valid_files, **{f"{regime}__{parameter}": change_entry((0, 0), factor=0.9)})
+        with pytest.raises(checker.Rejected, match=f"step 0: {regime} {parameter}"):
+            checker.check(write(tmp_path, changed))
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"lambda": 1e-22, "beta": 0.0}, "λ \\+ β is too small"),
+        ({"lambda": 1e-300, "beta": 0.0}, "out of range"),
+        ({"length_scale": 1e300}, "out of range"),
+        ({"history_variance": 1e-45}, "out of range"),
+        ({"history_variance": 1e-38, "history": 3}, "too small for its length"),
+        ({"gains": np.array([1e200, 0.0])}, "out of range"),
+        ({"means": np.full((STEPS, 2), 1e50)}, "out of range"),
+    ],
+)
+def test_checker_rejects_numbers_that_it_cannot_bound(valid_files, tmp_path, changed, reason):
+    """Directions of the kernel below the rounding errors must be small compared with λ + β."""
+    changes = {name: lambda old, value=value: np.array(value, dtype=old.dtype) for name, value in changed.items()}
+    with pytest.raises(checker.Rejected, match=reason):
+        checker.check(write(tmp_path, change_data(valid_files, "primitive.npz", **changes)))
+
+
+def test_certificates_near_numerical_limits_have_no_false_claims():
+    outcomes, wrong = certificate_extremes.run(60)
+    assert wrong == []
+    assert outcomes["accepted, executed"] > 20
 
 
 def test_checker_exits_with_1_only_when_a_file_is_changed(valid_files, tmp_path, capsys, monkeypatch):

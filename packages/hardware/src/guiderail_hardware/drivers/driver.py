@@ -185,8 +185,6 @@ class PoseDriver(Driver):
 
 DRIVERS: Registry[type[Driver]] = Registry(
     "driver of a robot",
-    package="guiderail_hardware.drivers",
-    decorator="register_driver",
     plugin="driver",
     check=lambda name, driver: check_class(name, driver, Driver),
 )

@@ -66,7 +66,7 @@ class PoseMotionLimiter(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
         # [position and rotation vector; velocity; acceleration; last valid target; quaternion at the start]
-        self._state = self.DeclareDiscreteState(28)
+        self._state = declare.unset_state(self, 28)
         ports = (self._desired_pose_port, self._pose_port, self._blend_factor_port)
         self._next_state = declare.cache(self, "next_state", self._calc_next_state, [*ports, self._state])
         declare.output(self, "limited_pose", 6, self._limited_pose, [self._next_state])
@@ -78,7 +78,7 @@ class PoseMotionLimiter(LeafSystem):
     get_limited_pose_output_port = output_getter("limited_pose", "pose within the limits of the motion, (6,)")
 
     def _calc_next_state(self, context: Context) -> np.ndarray:
-        state = context.get_discrete_state().value(self._state).copy()
+        state = declare.initialized(self, context, self._state).copy()
         if not self._blend_factor_port.Eval(context)[0] > 0.0:  # NaN counts as 0
             measured = self._pose_port.Eval(context)
             if is_finite(measured):

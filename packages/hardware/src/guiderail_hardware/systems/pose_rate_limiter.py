@@ -51,7 +51,7 @@ class PoseRateLimiter(LeafSystem):
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
-        self._last_pose = self.DeclareDiscreteState(6)
+        self._last_pose = declare.unset_state(self, 6)
         sources = [self._desired_pose_port, self._pose_port, self._blend_factor_port, self._last_pose]
         declare.output(self, "limited_pose", 6, self._limited_pose, sources)
         declare.update(self, period, self._update, self._reset)
@@ -62,7 +62,7 @@ class PoseRateLimiter(LeafSystem):
     get_limited_pose_output_port = output_getter("limited_pose", "rate-limited pose, (6,)")
 
     def _limited_pose(self, context: Context) -> np.ndarray:
-        last = context.get_discrete_state().value(self._last_pose)
+        last = declare.initialized(self, context, self._last_pose)
         if not self._blend_factor_port.Eval(context)[0] > 0.0:  # NaN counts as 0
             measured = self._pose_port.Eval(context)
             return measured if is_finite(measured) else last

@@ -11,9 +11,12 @@ from guiderail.models.objects.bnc_connector.demonstrations import poses, random_
 
 DESCENT_SPEED = 18.0 * MM  # [m/s]
 INSERTION_SPEED = 12.0 * MM  # [m/s]
-TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM  # distance from the rim within which the plug moves slowly [m], its speed [m/s]
+# Distance from the first contact within which the plug moves slowly [m], and its speed there [m/s].
+TOUCH, TOUCH_SPEED = 0.5 * MM, 4.0 * MM
 TURN_SPEED = 45.0 * DEGREE  # [rad/s]
-SEARCH = 1.8  # time on the rim [s]
+SEARCH = 1.8  # time at the first contact [s]
+SEARCH_END = 3  # index of the end of the search in the times of `plan_search`
+NARROWING, NARROWING_TIME = 3.0 * MM, 0.25  # distance [m] and time [s] in which deviations become narrow
 PAUSE = 0.3  # time after each part of the motion [s]
 NUM_DEMONSTRATIONS = 10  # with only five, the variance along the search would vary by a factor of four
 SPREAD = 1.7 * MM  # radius of the circle of the demonstrations' sockets around the nominal position [m]
@@ -27,23 +30,23 @@ _CENTERING = 0.9  # fraction of the mean of the random curves that is subtracted
 
 
 def plan_straight_insertion(
-    travel: float, rim: float, turn: float, push: float, advance: float = 0.0
+    travel: float, first_contact: float, turn: float, push: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and poses (N, 6) [m, rad] of a straight insertion.
 
-    The plug moves down, slowly past the rim, is pushed, turns, and moves to the target.
+    The plug moves down, slowly past the first contact, is pushed, turns, and moves to the target.
 
     Args:
         travel: Height of the start [m].
-        rim: Height of a plug that stands on the rim [m].
+        first_contact: Height at which a misaligned plug touches the socket [m].
         turn: Angle of the turn at the bottom [rad].
         push: Distance of the command below the target [m].
         advance: Height lost during the turn [m].
     """
-    low = rim - TOUCH
+    low = first_contact - TOUCH
     points = [
         (PAUSE, travel, -turn),
-        ((travel - rim - TOUCH) / INSERTION_SPEED, rim + TOUCH, -turn),
+        ((travel - first_contact - TOUCH) / INSERTION_SPEED, first_contact + TOUCH, -turn),
         (2.0 * TOUCH / TOUCH_SPEED, low, -turn),
         ((low + push - advance) / INSERTION_SPEED, advance - push, -turn),
         (PAUSE, advance - push, -turn),
@@ -55,28 +58,29 @@ def plan_straight_insertion(
 
 
 def plan_search(
-    travel: float, rim: float, turn: float, push: float, press: float, advance: float = 0.0
+    travel: float, first_contact: float, turn: float, push: float, press: float, advance: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return times (N,) [s] and poses (N, 6) [m, rad] of a demonstration without its random deviations.
 
-    The plug moves to the rim, stays there for the time `SEARCH`, is inserted, and turns. `demonstrator_motions` adds
-    the lateral motion of the search.
+    The plug moves to the first contact, stays there for the time `SEARCH`, is inserted, and turns.
+    `demonstrator_motions` adds the lateral motion of the search.
 
     Args:
         travel: Height of the start [m].
-        rim: Height of a plug that stands on the rim [m].
+        first_contact: Height at which a misaligned plug touches the socket [m].
         turn: Angle of the turn at the bottom [rad].
         push: Distance of the command below the target [m].
-        press: Distance of the command below the rim in the search [m].
+        press: Distance of the command below the first contact in the search [m].
         advance: Height lost during the turn [m].
     """
-    down = (travel - rim + press) / DESCENT_SPEED + 0.3
+    pressed = first_contact - press
+    down = (travel - first_contact + press) / DESCENT_SPEED + 0.3
     points = [
         (0.0, travel, -turn),
         (0.2, travel, -turn),
-        (down, rim - press, -turn),
-        (SEARCH, rim - press - 0.5 * MM, -turn),
-        ((rim - press + push - advance) / INSERTION_SPEED + 0.3, advance - push, -turn),
+        (down, pressed, -turn),
+        (SEARCH, pressed - 0.5 * MM, -turn),
+        (abs(pressed + push - advance) / INSERTION_SPEED + 0.3, advance - push, -turn),
         (PAUSE, advance - push, -turn),
     ]
     if turn:
@@ -91,15 +95,18 @@ def demonstrator_motions(
     """Return different searches (D, N, 6) at `times` (N,) [s], from times and poses of `plan_search` and a seed.
 
     The random deviations are wide while the command is above the height `press_from` [m], and become narrow over the
-    3 mm below. Each search ends at a different socket position (`socket_offsets`). The variance of the demonstrations
-    is then the variance of the socket positions, so that actions can follow a displaced socket down to the target. With
-    a `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its socket's turn from the
-    start.
+    distance `NARROWING` below. If the script does not go down so far, they become narrow after the search, within the
+    time `NARROWING_TIME`. Each search ends at a different socket position (`socket_offsets`). The variance of the
+    demonstrations is then the variance of the socket positions, so that actions can follow a displaced socket down to
+    the target. With a `search_turn` [rad] the sockets are also turned (`socket_turns`), and each motion has its
+    socket's turn from the start.
     """
     rng = np.random.default_rng(seed)
     script_times, script_poses = script
     heights = np.interp(times, script_times, script_poses[:, 2])
-    wide = np.clip((heights - press_from) / (3.0 * MM) + 1.0, 0.0, 1.0)[:, None]
+    wide = np.clip((heights - press_from) / NARROWING + 1.0, 0.0, 1.0)[:, None]
+    if heights.min() > press_from - NARROWING:
+        wide = np.clip(1.0 - (times - script_times[SEARCH_END]) / NARROWING_TIME, 0.0, 1.0)[:, None]
     scale = wide * _WIDE + (1.0 - wide) * _NARROW
     curves = random_curves(rng, times, _CORRELATION, NUM_DEMONSTRATIONS)
     wander = curves - _CENTERING * curves.mean(axis=0)

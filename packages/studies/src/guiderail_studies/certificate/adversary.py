@@ -74,7 +74,7 @@ class Adversary:
     @property
     def middle(self) -> np.ndarray:
         """Motion without actions (N, O)."""
-        return self._middle[self._past :]
+        return self._middle[self._loop.rest :]
 
     def attack(self, steps: int) -> AttackResult:
         """Execute sequences for at least `steps` further steps; return the result of all calls."""
@@ -125,14 +125,9 @@ class Adversary:
 
     def _measure(self, commands: np.ndarray, start: np.ndarray) -> dict[str, np.ndarray]:
         """Compute the quantities (N, O) of commands (N, O)."""
-        motion = np.concatenate([np.tile(start, (2 if self._past else 0, 1)), commands])
+        motion = np.concatenate([np.tile(start, (2, 1)), commands])
         first, second = (np.abs(np.diff(motion, order, axis=0)) / self._loop.period**order for order in (1, 2))
-        steps, outputs = commands.shape
-        return {
-            "pose": np.abs(commands - self._middle[self._past :]),
-            "speed": np.concatenate([np.zeros((steps, outputs)), first])[-steps:],
-            "acceleration": np.concatenate([np.zeros((steps, outputs)), second])[-steps:],
-        }
+        return {"pose": np.abs(commands - self.middle), "speed": first[1:], "acceleration": second}
 
     def _sample_start(self) -> np.ndarray:
         """Sample a corner of the box of starts; with a history, sample inside the box with probability 0.5."""
@@ -159,20 +154,23 @@ class Adversary:
             order, o, n, side = self._targets.pop()
         else:
             order, o = int(rng.integers(3)), int(rng.integers(self._generators.shape[1]))
-            n, side = int(rng.integers(steps - order)) + order, float(rng.choice([-1.0, 1.0]))
-        row = self._past + n
+            n, side = int(rng.integers(steps)), float(rng.choice([-1.0, 1.0]))
+        row = self._loop.rest + n
         direction = side * np.diff(self._generators[row - order : row + 1, o], order, axis=0)[0]
         signs = np.sign(direction[: steps * size].reshape(steps, size))
         fill, start = self._switching_actions()
-        if len(direction) > steps * size:
-            start = self._loop.start + np.sign(direction[steps * size :]) * self._loop.start_within
+        start = np.where(
+            direction[steps * size :],
+            self._loop.start + np.sign(direction[steps * size :]) * self._loop.start_within,
+            start,
+        )
         return np.where(signs == 0.0, fill, signs), start
 
     def _farthest_target(self, order: int, o: int, steps: np.ndarray) -> tuple[int, int, int, float]:
         """Return derivative order, output, step and sign of the largest value without constraints among `steps`."""
-        steps = steps[steps >= order] if (steps >= order).any() else np.array([order])
-        middle = np.diff(self._middle[:, o], order)[self._past + steps - order] * (order > 0)
-        size = np.abs(np.diff(self._generators[:, o], order, axis=0)).sum(axis=1)[self._past + steps - order]
+        rows = self._loop.rest + steps - order
+        middle = np.diff(self._middle[:, o], order)[rows] * (order > 0)
+        size = np.abs(np.diff(self._generators[:, o], order, axis=0)).sum(axis=1)[rows]
         best = int(np.argmax(np.abs(middle) + size))
         return order, o, int(steps[best]), -1.0 if middle[best] < 0.0 else 1.0
 

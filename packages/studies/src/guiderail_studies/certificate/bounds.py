@@ -30,6 +30,7 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.constraints import LinearConstraints
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
+from guiderail.models.primitives.qp import UnsolvableError
 from guiderail_studies.certificate.lagrange_bounds import Budget, BudgetedBounds, bound_within_budget
 from guiderail_studies.certificate.loop import Bounds, CertifiedLoop, reach, single_output_bounds
 
@@ -59,8 +60,8 @@ def certify(loop: CertifiedLoop, budget: Budget | None = None) -> CertifiedBound
     The regime *budgeted* is left out without a budget, without a history, or if no constraint can be active.
 
     Raises:
-        InputError: If a primitive without a history has more than `MAX_ACTIONS` actions, or its constraints leave less
-            room than twice `CORNER_MARGIN`.
+        InputError: If a primitive without a history has more than `MAX_ACTIONS` actions, its constraints leave less
+            room than twice `CORNER_MARGIN`, or a constrained program is not solved.
     """
     primitive = loop.primitive
     middle, generators = reach(loop)
@@ -112,8 +113,7 @@ def _bound_zonotope(middle: np.ndarray, generators: np.ndarray, loop: CertifiedL
     changes = []
     for order in (1, 2):
         change = np.abs(np.diff(middle, order, axis=0)) + np.abs(np.diff(generators, order, axis=0)).sum(axis=2)
-        padded = np.concatenate([np.zeros((order, middle.shape[1])), change])[-steps:]
-        changes.append(padded / loop.period**order)
+        changes.append(change[-steps:] / loop.period**order)
     return Bounds((middle - size)[-steps:], (middle + size)[-steps:], *changes)
 
 
@@ -125,8 +125,9 @@ def _find_active_steps(loop: CertifiedLoop, middle: np.ndarray, generators: np.n
     for n in range(primitive.num_steps):
         rows, lower, upper = primitive.free_constraints(n)
         history_map, action_map = rows[:, : past * primitive.num_outputs], rows[:, past * primitive.num_outputs :]
-        value = history_map @ middle[n : past + n].ravel()
-        spread = history_map @ generators[n : past + n].reshape(history_map.shape[1], generators.shape[2])
+        rows_past = slice(loop.rest + n - past, loop.rest + n)
+        value = history_map @ middle[rows_past].ravel()
+        spread = history_map @ generators[rows_past].reshape(history_map.shape[1], generators.shape[2])
         spread[:, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
         size = np.abs(spread).sum(axis=1)
         # A constraint with less slack than `BORDER` counts as active, so that the result does not depend on rounding.
@@ -142,7 +143,10 @@ def _bound_cells(loop: CertifiedLoop, can_be_active: np.ndarray) -> tuple[np.nda
     bounds, multipliers = np.full((2, primitive.num_steps, primitive.num_outputs), np.nan), []
     actions, cells = action_cells(loop.gains)
     for n in map(int, np.flatnonzero(can_be_active)):
-        predictions = [primitive.predict(n, action) for action in actions]
+        try:
+            predictions = [primitive.predict(n, action) for action in actions]
+        except UnsolvableError as error:
+            raise InputError(f"step {n} can't be certified, because {error}: widen the constraints") from error
         multipliers.append([prediction.multipliers for prediction in predictions])
         rows, lower, upper = loop.primitive.free_constraints(n)  # without `CORNER_MARGIN`, for `_min_norms`
         solutions = [prediction.correction for prediction in predictions]
@@ -224,7 +228,6 @@ def _bound_always(loop: CertifiedLoop, free: Bounds, corrected_bounds: np.ndarra
     steps = np.maximum(greatest[2:] - least[1:-1], greatest[1:-1] - least[2:]) / loop.period
     forward = greatest[2:] - 2.0 * least[1:-1] + greatest[:-2]
     bends = np.maximum(forward, 2.0 * greatest[1:-1] - least[2:] - least[:-2]) / loop.period**2
-    has_past = [np.arange(len(lower))[:, None] >= (0 if loop.primitive.history else order) for order in (1, 2)]
-    speed = np.where((recent[2:] | recent[1:-1]) & has_past[0], steps, free.speed)
-    acceleration = np.where((recent[2:] | recent[1:-1] | recent[:-2]) & has_past[1], bends, free.acceleration)
+    speed = np.where(recent[2:] | recent[1:-1], steps, free.speed)
+    acceleration = np.where(recent[2:] | recent[1:-1] | recent[:-2], bends, free.acceleration)
     return Bounds(lower, upper, speed, acceleration)

@@ -16,7 +16,7 @@ from guiderail_studies.certificate.bounds import CertifiedBounds
 from guiderail_studies.certificate.loop import Bounds, CertifiedLoop
 
 PRIMITIVE, CONSTRAINTS, WITNESS, CERTIFICATE = "primitive.npz", "constraints.npz", "witness.npz", "certificate.json"
-FORMAT = "guiderail certificate 4"
+FORMAT = "guiderail certificate 5"
 OUTWARD = 1e-5  # margin of all claims for the rounding of primitive and checker, relative to the largest value
 # The checker has digests of these sentences in `ASSUMED`.
 ASSUMPTIONS = (

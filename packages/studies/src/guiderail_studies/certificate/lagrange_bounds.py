@@ -52,8 +52,7 @@ def bound_within_budget(
     `free` are the bounds without active constraints, `middle` and `generators` the results of `reach`, and `first` is
     the first step at which a constraint can be active.
     """
-    primitive, past = loop.primitive, loop.primitive.history
-    num_steps, num_outputs = primitive.num_steps, primitive.num_outputs
+    num_steps, num_outputs = loop.primitive.num_steps, loop.primitive.num_outputs
     generators = np.concatenate([generators, residue_generators(loop, first)], axis=2)
     search = MultiplierSearch(loop, middle, generators, first, budget)
     shape = (3, 2, num_steps, num_outputs)
@@ -64,7 +63,7 @@ def bound_within_budget(
         for n in range(first, num_steps):
             search.select_step(n)
             for side, sign in enumerate((1.0, -1.0)):
-                at, row = (order, side, n), past + n - order
+                at, row = (order, side, n), loop.rest + n - order
                 directions = sign * generator_changes[row]
                 steps[at], outputs[at], multipliers[at] = search.find(directions)
                 value = search.bound(directions, steps[at], outputs[at], multipliers[at])
@@ -79,14 +78,14 @@ def bound_within_budget(
 
 
 def residue_generators(loop: CertifiedLoop, first: int) -> np.ndarray:
-    """Compute the responses (P + N, O, B) to a unit residue at each step from `first` in each unmoved output."""
-    primitive, past = loop.primitive, loop.primitive.history
+    """Compute the responses (R + N, O, B) to a unit residue at each step from `first` in each unmoved output."""
+    primitive, past, rest = loop.primitive, loop.primitive.history, loop.rest
     steps, unmoved = primitive.num_steps, np.flatnonzero(loop.gains == 0.0)
-    response = np.zeros((past + steps, primitive.num_outputs, (steps - first) * len(unmoved)))
-    for n in range(first, steps):
+    response = np.zeros((rest + steps, primitive.num_outputs, (steps - first) * len(unmoved)))
+    for n, row in enumerate(range(rest + first, rest + steps), start=first):
         history_map = primitive.linear_response(n)[0]
-        response[past + n] = history_map @ response[n : past + n].reshape(history_map.shape[1], response.shape[2])
-        response[past + n, unmoved, (n - first) * len(unmoved) + np.arange(len(unmoved))] = 1.0
+        response[row] = history_map @ response[row - past : row].reshape(history_map.shape[1], response.shape[2])
+        response[row, unmoved, (n - first) * len(unmoved) + np.arange(len(unmoved))] = 1.0
     return response
 
 
@@ -97,13 +96,13 @@ class MultiplierSearch:
     """
 
     def __init__(self, loop: CertifiedLoop, middle: np.ndarray, generators: np.ndarray, first: int, budget: Budget):
-        self._generators, self._first, self._past = generators, first, loop.primitive.history
+        self._generators, self._first, self._rest = generators, first, loop.rest
         self._steps, outputs = loop.primitive.num_steps, loop.primitive.num_outputs
         moved = loop.gains != 0.0
         self._actions = self._steps * int(moved.sum())
         self._free = self._actions + outputs  # number of generators without a budget: actions, then the start
         low, high = single_output_bounds(loop)
-        self._margins = np.stack([middle[self._past :] - low, high - middle[self._past :]])
+        self._margins = np.stack([middle[self._rest :] - low, high - middle[self._rest :]])
         self._bounded = np.flatnonzero(np.isfinite(low).any(axis=0) | np.isfinite(high).any(axis=0))
         self._budgets = budget.excess, budget.residue[:, ~moved]
 
@@ -112,7 +111,7 @@ class MultiplierSearch:
         first = max(n % STRIDE, n - MAX_DISTANCE // STRIDE * STRIDE)
         near = np.arange(first, min(n + MAX_DISTANCE, self._steps - 1) + 1, STRIDE)
         self._at, self._of = (x.ravel() for x in np.meshgrid(near, self._bounded))
-        self._rows = self._generators[self._past + self._at, self._of, : self._free]
+        self._rows = self._generators[self._rest + self._at, self._of, : self._free]
         self._sizes = np.maximum((self._rows**2).sum(axis=1), 1e-300)
 
     def find(self, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -143,7 +142,7 @@ class MultiplierSearch:
 
         The bounds are proven by the `multipliers` (O, R) of the constraints at `steps` (O, R) on `outputs` (O, R).
         """
-        rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._past + steps, outputs])
+        rest = directions - np.einsum("or,orc->oc", multipliers, self._generators[self._rest + steps, outputs])
         margins = self._margins[(multipliers > 0.0).astype(int), steps, outputs]
         margin = np.where(multipliers == 0.0, 0.0, margins)
         value = np.abs(rest[:, : self._free]).sum(axis=1) + (np.abs(multipliers) * margin).sum(axis=1)

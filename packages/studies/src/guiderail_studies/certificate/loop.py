@@ -18,6 +18,11 @@ class CertifiedLoop:
     start: np.ndarray  # output at which the robot begins (O,) [unit of the output]
     start_within: np.ndarray  # largest offset of the robot from `start` (O,) [unit of the output]
 
+    @property
+    def rest(self) -> int:
+        """Number of poses at rest before the first command, at least two, which its speed and acceleration need."""
+        return max(self.primitive.history, 2)
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -25,33 +30,33 @@ class Bounds:
 
     lower: np.ndarray  # smallest command (N, O) [unit of the output]
     upper: np.ndarray  # largest command (N, O) [unit of the output]
-    speed: np.ndarray  # largest speed (N, O) from the previous step to this step [unit of the output/s]
-    acceleration: np.ndarray  # largest acceleration (N, O) over this step and the two before it [unit of the output/s²]
+    # Largest speed (N, O), the change from the previous command over the period, and largest acceleration (N, O), the
+    # change of this speed over the period [unit of the output/s, /s²]. Before the first command is the start, at rest.
+    speed: np.ndarray
+    acceleration: np.ndarray
 
 
 def reach(loop: CertifiedLoop) -> tuple[np.ndarray, np.ndarray]:
     """Compute the zonotope of motions without active constraints.
 
     Returns:
-        Center (P + N, O) and generators (P + N, O, B) of the zonotope [unit of the output]. The center is the motion
-        without actions and begins with P copies of the start. Each entry of each step's action has one generator; with
-        a history, so has each output of the start.
+        Center (R + N, O) and generators (R + N, O, B) of the zonotope [unit of the output]. The center is the motion
+        without actions and begins with R copies of the start, `loop.rest`. Each entry of each step's action has one
+        generator, and so has each output of the start.
     """
-    primitive, past = loop.primitive, loop.primitive.history
+    primitive, past, rest = loop.primitive, loop.primitive.history, loop.rest
     steps, outputs = primitive.num_steps, primitive.num_outputs
     moved = np.flatnonzero(loop.gains)
-    batch = steps * len(moved) + (outputs if past else 0)
-    middle, generators = np.zeros((past + steps, outputs)), np.zeros((past + steps, outputs, batch))
-    if past:
-        middle[:past] = loop.start
-        generators[:past, :, batch - outputs :] = np.diag(loop.start_within)
-    for n in range(steps):
+    batch = steps * len(moved) + outputs
+    middle, generators = np.zeros((rest + steps, outputs)), np.zeros((rest + steps, outputs, batch))
+    middle[:rest], generators[:rest, :, batch - outputs :] = loop.start, np.diag(loop.start_within)
+    for n, row in enumerate(range(rest, rest + steps)):
         history_map, action_map, offset = primitive.linear_response(n)
-        middle[past + n] = offset
+        middle[row] = offset
         if past:
-            middle[past + n] += history_map @ middle[n : past + n].ravel()
-            generators[past + n] = history_map @ generators[n : past + n].reshape(past * outputs, batch)
-        generators[past + n, :, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
+            middle[row] += history_map @ middle[row - past : row].ravel()
+            generators[row] = history_map @ generators[row - past : row].reshape(past * outputs, batch)
+        generators[row, :, n * len(moved) : (n + 1) * len(moved)] += action_map[:, moved] * loop.gains[moved]
     return middle, generators
 
 

@@ -54,8 +54,6 @@ class Engine(AbstractContextManager[Any]):
 # An entry is called with `processes` and `address`, which are None by default.
 ENGINES: Registry[Callable[..., Engine]] = Registry(
     "engine",
-    package="guiderail_studies.engines",
-    decorator="register_engine",
     plugin="engine",
     check=check_callable,
 )

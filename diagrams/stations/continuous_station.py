@@ -1,0 +1,66 @@
+"""Station whose measured pose has no jumps of its angles."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydrake.systems.framework import Context, DiagramBuilder
+
+from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.wiring import add_system
+from guiderail.models.control.motion_constraints import StateConstraints
+from guiderail.systems.continuous_pose import ContinuousPose
+
+
+class ContinuousStation(Station):
+    """A station with the ports of an inner station, whose `pose` continues beyond ±π (`ContinuousPose`)."""
+
+    def __init__(self, station: Station, near: np.ndarray):
+        """Construct the station; the given `station` becomes its subsystem.
+
+        `near` is the pose (6,) of which the first measured pose is the nearest equivalent, such as the first mean of a
+        reference.
+
+        Raises:
+            InputError: If `near` is not a finite pose.
+        """
+        super().__init__()
+        self._inner, self.control_period = station, station.control_period
+        self.plant, self.scene_graph = station.plant, station.scene_graph
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("station", station)
+        measured = ContinuousPose(near, station.control_period)
+        add_system(builder, "continuous_pose", measured, pose=station.get_pose_output_port())
+        for port in map(station.get_input_port, range(station.num_input_ports())):
+            builder.ExportInput(port, port.get_name())
+        for port in map(station.get_output_port, range(station.num_output_ports())):
+            is_pose = port.get_name() == "pose"
+            builder.ExportOutput(measured.get_continuous_pose_output_port() if is_pose else port, port.get_name())
+        builder.BuildInto(self)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of the inner station that this class does not define, such as `arm`."""
+        if name == "_inner":
+            raise AttributeError(name)
+        return getattr(self._inner, name)
+
+    @property
+    def nominal_period(self) -> float:
+        """Time between commands of the inner station [s]."""
+        return self._inner.nominal_period
+
+    def set_pose(self, context: Context, pose: np.ndarray) -> None:
+        """Put the robot at rest with its tool center at `pose`, (6,); `context` is the root context."""
+        self._inner.set_pose(context, pose)
+
+    def set_contact(self, context: Context, friction: float, modulus: float) -> None:
+        """Multiply the friction and modulus of all contacts by factors until the next reset."""
+        self._inner.set_contact(context, friction, modulus)
+
+    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+        """Return the constraints of the inner station's joints."""
+        return self._inner.joint_range(margin, min_singular_value)
+
+    def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
+        """Sample the inner station's disturbances at a reset, and return them by name."""
+        return self._inner.disturb(context, rng)

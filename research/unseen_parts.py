@@ -1,0 +1,206 @@
+"""One policy for parts that it was not trained on: `python -m research.unseen_parts --meshes MESHES --out unseen`.
+
+The parts are split by a rule before anything is trained (`split_parts`), and the split is written to `split.json`.
+Then the parts are prepared, a policy is trained over the training parts with each seed, and all policies are evaluated
+on the held-out parts: uniform random actions, the scripted search, policies of single training parts, specialists of
+the held-out parts, the general policy of each seed, and the mean of their actions. Every finished step is stored, and
+the same command resumes. `rows/` has the episodes of each policy on each part, `table.md` the successes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Policy
+from guiderail.tools.ensemble import write_ensemble
+from guiderail.tools.environments import make_environment, task_named
+from guiderail.tools.evaluation.baselines import make_baseline
+from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.files import write_atomically
+from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.tables import read_table, table_text, write_table
+from guiderail_parts.batch import create_tasks
+from guiderail_parts.pairs import Pair, find_pairs
+from research.command import Parser, print_result, run_program
+
+TRAINING, HELD_OUT = 60, 30  # numbers of parts
+HELD_OUT_FRACTION = 0.34  # fraction of all pairs from which the held-out parts are taken
+ENVIRONMENT = {"guidance": "kgrl", "difficulty": "hard", "observation": "shared"}
+SETTINGS = {"symmetry": "near", "constant_episodes": 12}
+EASY_RANDOM, EASY_SEARCH = 0.2, 0.9  # success rates above which a part cannot show learning
+
+
+def split_parts(names: Iterable[str]) -> tuple[list[str], list[str]]:
+    """Return candidates for training and held-out parts, in the order in which they are used.
+
+    All names are ordered by the SHA-256 digest of the name. The first `HELD_OUT_FRACTION` are held out. The split thus
+    depends on neither the shapes nor any result. Parts that cannot be prepared are skipped.
+    """
+    ordered = sorted(names, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+    number = round(HELD_OUT_FRACTION * len(ordered))
+    return ordered[number:], ordered[:number]
+
+
+def prepare(pairs: Mapping[str, Pair], names: Sequence[str], number: int, out: Path, processes: int) -> list[Path]:
+    """Return the first `number` task folders that can be created, in the order of `names`."""
+    folders: list[Path] = []
+    for start in range(0, len(names), processes):
+        if len(folders) >= number:
+            break
+        chunk = [pairs[name] for name in names[start : start + processes]]
+        results = create_tasks(chunk, out, processes=processes, log=_report)
+        folders += [out / name for name, result in results.items() if "error" not in result]
+    return folders[:number]
+
+
+def prepared(folder: Path, names: Sequence[str], number: int) -> list[Path]:
+    """Return the first `number` task folders that exist, in the order of `names`."""
+    return [folder / name for name in names if (folder / name / "task.yaml").is_file()][:number]
+
+
+def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Path:
+    """Train a policy over parts, or continue the run; return its folder."""
+    if (run / "policy.safetensors").exists():
+        return run
+    _report(f"training {run.name} on {len(parts)} parts")
+    names = [task_named(str(part)) for part in parts]
+    if (run / "config.yaml").exists():
+        start_or_resume(None, run, environment={}, episodes=episodes, resume=True, pictures=False)
+    else:
+        imports = [folder for _, folders in names for folder in folders]
+        start_or_resume(
+            [name for name, _ in names], run, environment=ENVIRONMENT, settings=SETTINGS, episodes=episodes, seed=seed,
+            imports=imports, step_log=False, pictures=False,
+        )  # fmt: skip
+    return run
+
+
+def evaluate_part(part: Path, policies: Mapping[str, Path | str], episodes: int, out: Path) -> None:
+    """Evaluate policies on the same held-out episodes of a part; stored episodes are not simulated again.
+
+    A policy is the folder of a run, or the name of a baseline policy.
+    """
+    files = {name: out / "rows" / name / f"{part.name}.csv" for name in policies}
+    missing = [name for name, file in files.items() if not file.exists() or len(read_table(file)) < episodes]
+    if not missing:
+        return
+    task, _ = task_named(str(part))
+    with closing(make_environment(task, ENVIRONMENT)) as env:
+        env.reset(seed=0)
+        for name in missing:
+            source = policies[name]
+            act = Policy.load(source) if isinstance(source, Path) else make_baseline(task, source)(env)
+            rows = evaluate_policy(env, act, episodes=episodes)
+            files[name].parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(files[name], table_text(rows).encode())
+            _report(f"{part.name} {name}: {int(rows['success'].sum())} of {len(rows)}")
+
+
+def tabulate(out: Path) -> tuple[pd.DataFrame, dict[str, Any]]:
+    """Return the successes of each policy on each held-out part, and a summary, from the stored episodes."""
+    rates: dict[str, dict[str, float]] = {}
+    worst: dict[str, dict[str, float]] = {}
+    for file in sorted((out / "rows").glob("*/*.csv")):
+        rows = read_table(file)
+        rates.setdefault(file.parent.name, {})[file.stem] = float(rows["success"].mean())
+        limits = worst.setdefault(file.parent.name, {"peak_force": 0.0, "collisions": 0, "violation": -1.0})
+        limits["peak_force"] = max(limits["peak_force"], float(rows["peak_force"].max()))
+        limits["collisions"] += int((rows["termination"] == "collision").sum())
+        limits["violation"] = max(limits["violation"], float(rows["max_commanded_violation"].max()))
+    table = pd.DataFrame(rates)
+    easy = (table.get("uniform_random", 0.0) > EASY_RANDOM) | (table.get("scripted", 0.0) > EASY_SEARCH)
+    table["shows_learning"] = ~easy
+    summary: dict[str, Any] = {}
+    for name in rates:
+        column = table[name].dropna()
+        summary[name] = {
+            "parts": len(column), "mean": round(float(column.mean()), 4), "worst": float(column.min()),
+            "parts_from_90_percent": int((column >= 0.9).sum()),
+            "mean_where_learning_shows": round(float(column[table["shows_learning"]].mean()), 4), **worst[name],
+        }  # fmt: skip
+    return table, summary
+
+
+def _report(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def main(arguments: list[str]) -> None:
+    """Run the program."""
+    parser = Parser(
+        "unseen_parts",
+        "Train one policy over many parts, and evaluate it on parts that were held out by a rule. Each finished step "
+        "is stored, and the same command resumes.",
+        "--meshes meshes --out unseen --processes 2",
+    )
+    parser.add_argument("--meshes", type=Path, required=True, help="folder with a subfolder for each pair of meshes")
+    parser.add_out("unseen_parts")
+    parser.add_argument("--unit", default="m", help="unit of the meshes (default: m)")
+    parser.add_argument("--prepared", type=Path, help="folder with prepared task folders, which are used as they are")
+    parser.add_argument("--training", type=int, default=TRAINING, help=f"training parts (default: {TRAINING})")
+    parser.add_argument("--held-out", type=int, default=HELD_OUT, help=f"held-out parts (default: {HELD_OUT})")
+    parser.add_argument("--seeds", type=int, default=3, help="seeds of the general policy (default: 3)")
+    parser.add_argument("--episodes", type=int, default=600, help="training episodes (default: 600)")
+    parser.add_argument("--single", type=int, default=3, help="training parts with a policy of their own (default: 3)")
+    parser.add_argument("--single-episodes", type=int, default=80, help="their training episodes (default: 80)")
+    parser.add_argument(
+        "--specialists", type=int, default=150, help="training episodes of each held-out part's specialist; 0: none"
+    )
+    parser.add_argument("--evaluated", type=int, default=100, help="held-out episodes of each part (default: 100)")
+    parser.add_argument("--processes", type=int, default=1, help="pairs that are prepared at a time (default: 1)")
+    parser.add_json()
+    args = parser.parse_args(arguments)
+    out = args.out.resolve()
+    out.mkdir(parents=True, exist_ok=True)
+    pairs = {pair.name: pair for pair in find_pairs(args.meshes, args.unit)}
+    training_names, held_out_names = split_parts(pairs)
+    split = {"training_candidates": training_names, "held_out_candidates": held_out_names}
+    file = out / "split.json"
+    if file.exists() and json.loads(file.read_text(encoding="utf-8")) != split:
+        raise InputError(f"{file} has the split of other meshes: name another folder with --out")
+    write_atomically(file, json.dumps(split, indent=1).encode())
+    if args.prepared is None:
+        held_out, training = (
+            prepare(pairs, names, number, out / "tasks", args.processes)
+            for names, number in ((held_out_names, args.held_out), (training_names, args.training))
+        )
+    else:
+        held_out, training = (
+            prepared(args.prepared.resolve(), names, number)
+            for names, number in ((held_out_names, args.held_out), (training_names, args.training))
+        )
+    used = {"training": [part.name for part in training], "held_out": [part.name for part in held_out]}
+    write_atomically(out / "parts.json", json.dumps(used, indent=1).encode())
+    runs = [train_once(training, out / "runs" / f"general-{seed}", seed, args.episodes) for seed in range(args.seeds)]
+    policies: dict[str, Path | str] = {name: name for name in ("zero", "uniform_random", "scripted")}
+    policies |= {run.name: run for run in runs}
+    if len(runs) > 1:
+        mean = out / "runs" / "general-mean"
+        if not (mean / "policy.json").exists():
+            write_ensemble(runs, mean)
+        policies["general-mean"] = mean
+    for part in training[: args.single]:
+        run = out / "runs" / f"single-{part.name}"
+        policies[run.name] = train_once([part], run, 0, args.single_episodes)
+    for part in held_out:
+        evaluate_part(part, policies, args.evaluated, out)
+    for part in held_out if args.specialists else ():
+        run = train_once([part], out / "runs" / f"specialist-{part.name}", 0, args.specialists)
+        evaluate_part(part, {"specialist": run}, args.evaluated, out)
+    table, summary = tabulate(out)
+    write_table(out / "table", table.reset_index(names="part"))
+    write_atomically(out / "summary.json", json.dumps(summary, indent=1).encode())
+    print_result({"training_parts": len(training), "held_out_parts": len(held_out), **summary}, as_json=args.json)
+
+
+if __name__ == "__main__":
+    run_program(main)

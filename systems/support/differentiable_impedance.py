@@ -1,0 +1,92 @@
+"""The law of `impedance_torques` for `AutoDiffXd`, where it is differentiable."""
+
+from typing import Any
+
+import numpy as np
+from pydrake.autodiffutils import AutoDiffXd
+from pydrake.math import inv
+from scipy.linalg import solve_continuous_lyapunov
+
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.cartesian_impedance import (
+    JointTorques,
+    damping_matrix,
+    has_regular_inertia,
+    regularized,
+    spring_wrench,
+)
+
+
+def values_of(numbers: np.ndarray) -> np.ndarray:
+    """Return the values of an array of floats and `AutoDiffXd`, as floats."""
+    flat = [number.value() if isinstance(number, AutoDiffXd) else number for number in np.ravel(numbers)]
+    return np.array(flat, dtype=float).reshape(np.shape(numbers))
+
+
+def differentiable_damping(K: np.ndarray, Lambda_inverse: np.ndarray, damping_ratio: Any) -> np.ndarray:
+    """Compute the damping matrix D (6, 6) of `damping_matrix` with its derivatives.
+
+    G = D / (2 ζ) is the solution of G Λ⁻¹ G = K, so that its derivative is that of a Lyapunov equation:
+    dG Λ⁻¹ G + G Λ⁻¹ dG = dK − G dΛ⁻¹ G.
+    """
+    K_values, inverse_values = values_of(K), values_of(Lambda_inverse)
+    G = damping_matrix(K_values, inverse_values, 0.5)
+    dK, d_inverse = _derivatives(K), _derivatives(Lambda_inverse)
+    size = max(dK.shape[-1], d_inverse.shape[-1])
+    derivatives = np.zeros((6, 6, size))
+    for i in range(size):
+        change = (dK[..., i] if dK.shape[-1] else 0.0) - (G @ d_inverse[..., i] @ G if d_inverse.shape[-1] else 0.0)
+        derivatives[..., i] = solve_continuous_lyapunov(G @ inverse_values, change)
+    entries = [[AutoDiffXd(G[i, j], derivatives[i, j]) for j in range(6)] for i in range(6)]
+    return 2.0 * damping_ratio * np.array(entries)
+
+
+def _derivatives(numbers: np.ndarray) -> np.ndarray:
+    """Return the derivatives of an array (n, m) as (n, m, d); d is 0 if all numbers are constant."""
+    found = [number.derivatives() if isinstance(number, AutoDiffXd) else np.zeros(0) for number in np.ravel(numbers)]
+    size = max(map(len, found))
+    padded = [derivative if len(derivative) else np.zeros(size) for derivative in found]
+    return np.array(padded).reshape(*np.shape(numbers), size)
+
+
+def differentiable_torques(
+    *,
+    K: np.ndarray,
+    damping_ratio: Any,
+    wrench_limits: np.ndarray,
+    R_axes: np.ndarray | None,
+    p_error: np.ndarray,
+    eta: Any,
+    epsilon: np.ndarray,
+    J: np.ndarray,
+    M: np.ndarray,
+    v: np.ndarray,
+    posture_torque: np.ndarray,
+    gravity_torque: np.ndarray,
+    torque_limits: np.ndarray,
+) -> JointTorques:
+    """Compute the joint torques of `impedance_torques` without bound; the arguments are those of that function.
+
+    Raises:
+        InputError: If the arm is near a singular posture.
+    """
+    if R_axes is not None:
+        R = np.zeros((6, 6), dtype=object)
+        R[:3, :3] = R[3:, 3:] = R_axes
+        K = R @ K @ R.T
+    M_inverse_JT = inv(M) @ J.T
+    Lambda_inverse = regularized(J @ M_inverse_JT)
+    if not has_regular_inertia(values_of(Lambda_inverse)):
+        raise InputError("an impedance has derivatives in regular postures only: move the arm away from this posture")
+    damping = differentiable_damping(K, Lambda_inverse, damping_ratio) @ (J @ v)
+    unlimited_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
+    along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
+    wrench = np.minimum(np.maximum(along_axes, -wrench_limits), wrench_limits)
+    is_limited = bool((np.abs(values_of(along_axes)) >= values_of(wrench_limits)).any())
+    if R_axes is not None:
+        wrench = R @ wrench
+    leak = inv(Lambda_inverse) @ (M_inverse_JT.T @ posture_torque)
+    unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
+    torque = np.minimum(np.maximum(unlimited_torque, -torque_limits), torque_limits)
+    is_clipped = bool((np.abs(values_of(unlimited_torque)) > torque_limits).any())
+    return JointTorques(torque, wrench, is_limited or is_clipped)

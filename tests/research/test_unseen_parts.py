@@ -1,0 +1,51 @@
+"""Study of held-out parts: rule of the split, and table of stored episodes."""
+
+import pandas as pd
+import pytest
+
+pytest.importorskip("guiderail_parts")
+
+from guiderail.models.common.errors import InputError
+from research.unseen_parts import main, prepared, split_parts, tabulate
+
+
+def test_split_depends_on_the_names_alone():
+    names = [f"{number:05d}" for number in range(100)]
+    training, held_out = split_parts(names)
+    assert (len(training), len(held_out)) == (66, 34)
+    assert sorted(training + held_out) == names
+    assert split_parts(reversed(names)) == (training, held_out)
+    assert held_out[:3] == ["00015", "00044", "00051"]
+
+
+def test_parts_that_were_not_prepared_are_skipped(tmp_path):
+    for name in ("a", "c"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "task.yaml").touch()
+    assert [part.name for part in prepared(tmp_path, ["c", "b", "a"], 5)] == ["c", "a"]
+    assert [part.name for part in prepared(tmp_path, ["c", "b", "a"], 1)] == ["c"]
+
+
+def test_easy_parts_are_reported_apart(tmp_path):
+    rates = {"uniform_random": (0.0, 0.5), "scripted": (0.5, 0.5), "general-0": (1.0, 0.5)}
+    for policy, values in rates.items():
+        (tmp_path / "rows" / policy).mkdir(parents=True)
+        for part, rate in zip("ab", values, strict=True):
+            rows = pd.DataFrame({"success": [1, 0] if rate == 0.5 else [int(rate)] * 2, "peak_force": [3.0, 4.0]})
+            rows = rows.assign(termination=["success", "collision"], max_commanded_violation=-0.1)
+            rows.to_csv(tmp_path / "rows" / policy / f"part{part}.csv", index=False)
+    table, summary = tabulate(tmp_path)
+    assert list(table["shows_learning"]) == [True, False]
+    assert summary["general-0"]["mean"] == 0.75
+    assert summary["general-0"]["mean_where_learning_shows"] == 1.0
+    assert (summary["general-0"]["collisions"], summary["general-0"]["peak_force"]) == (2, 4.0)
+
+
+def test_split_of_other_meshes_is_refused(tmp_path):
+    (tmp_path / "meshes" / "a").mkdir(parents=True)
+    for name in ("plug.obj", "socket.obj"):
+        (tmp_path / "meshes" / "a" / name).touch()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "split.json").write_text("{}")
+    with pytest.raises(InputError, match="split of other meshes"):
+        main(["--meshes", str(tmp_path / "meshes"), "--out", str(tmp_path / "out")])

@@ -1,0 +1,78 @@
+"""Ensembles: mean action of several networks, their disagreement, and the command that writes them."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import guiderail
+from guiderail.models.common.errors import InputError
+from guiderail.models.policy import Ensemble, Policy
+from guiderail.tools.cli.main import main
+from guiderail.tools.ensemble import write_ensemble
+from guiderail.tools.evaluation.step_log import read_step_log
+
+
+def policy(seed, size=3, **description):
+    rng = np.random.default_rng(seed)
+    shapes = (5, size), (2, 5)
+    layers = [
+        (rng.normal(size=shape).astype(np.float32), rng.normal(size=shape[0]).astype(np.float32)) for shape in shapes
+    ]
+    about = {"observation_shape": [size], "action_low": [-1.0, -1.0], "action_high": [1.0, 1.0], **description}
+    return Policy(layers, about)
+
+
+def test_ensemble_acts_with_the_mean_and_is_stored(tmp_path):
+    members = [policy(0), policy(1, activation="tanh"), policy(2)]
+    Ensemble(members).save(tmp_path)
+    loaded = Policy.load(tmp_path)
+    assert isinstance(loaded, Ensemble)
+    observation = np.array([0.1, -0.2, 0.3], np.float32)
+    actions = np.stack([member(observation) for member in members])
+    np.testing.assert_array_equal(loaded(observation), actions.mean(axis=0))
+    assert loaded.disagreement(observation) == pytest.approx(np.std(actions, axis=0).mean())
+    assert Ensemble([members[0]] * 2).disagreement(observation) == 0.0
+    with pytest.raises(InputError, match="several networks"):
+        _ = loaded.layers
+
+
+def test_damaged_ensembles_are_refused(tmp_path):
+    Ensemble([policy(0), policy(1)]).save(tmp_path)
+    file = tmp_path / "policy.json"
+    values = json.loads(file.read_text())
+    for changed in ([], values["members"][:1], [*values["members"], values["members"][0]], 3):
+        file.write_text(json.dumps(values | {"members": changed}))
+        with pytest.raises(InputError, match="is damaged"):
+            Policy.load(tmp_path)
+
+
+def test_different_policies_are_no_ensemble():
+    with pytest.raises(ValueError, match="the same observation_shape"):
+        Ensemble([policy(0), policy(1, size=4)])
+    with pytest.raises(ValueError, match="the same action_low"):
+        Ensemble([policy(0), policy(1, action_low=[-2.0, -1.0])])
+
+
+def test_ensemble_of_runs_is_evaluated_like_a_run(bead_run, tmp_path, capsys):
+    other, out = tmp_path / "other", tmp_path / "mean"
+    shutil.copytree(bead_run, other)
+    changed = Policy.load(other)
+    Policy([(weight + np.float32(0.1), bias) for weight, bias in changed.layers], changed.description).save(other)
+    with pytest.raises(SystemExit) as end:
+        main(["ensemble", str(bead_run), str(other), "--out", str(out), "--json"])
+    assert end.value.code == 0
+    assert json.loads(capsys.readouterr().out) == {"policy": str(out), "networks": 2}
+    evaluation = guiderail.evaluate(out, episodes=2, baselines=[], processes=1, steps=tmp_path / "steps")
+    assert evaluation["trained_episodes"] is None
+    steps = read_step_log(tmp_path / "steps")
+    assert len(steps) == evaluation.rows["policy"]["steps"].sum()
+    assert (steps["disagreement"] > 0.0).all()
+    assert "disagreement" not in read_step_log(bead_run / "steps")
+    with pytest.raises(InputError, match="already exists"):
+        guiderail.evaluate(out, episodes=2, baselines=[], steps=tmp_path / "steps")
+    with pytest.raises(InputError, match="name at least two"):
+        write_ensemble([bead_run], tmp_path / "one")
+    with pytest.raises(InputError, match="already exists"):
+        write_ensemble([bead_run, other], out)
