@@ -8,6 +8,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
 from guiderail.systems.history_buffer import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from oracles.prerequisites import changed_outputs
 
 PERIOD = 0.02
 
@@ -188,6 +189,14 @@ def test_first_fallback_satisfies_the_constraints():
     context = system.CreateDefaultContext()
     system.get_null_space_action_input_port().FixValue(context, [0.0, 0.0])
     assert system.get_command_output_port().Eval(context)[0] <= -0.5 + 1e-9
+
+
+def test_fallback_depends_on_the_last_command():
+    p = primitive(history=0)
+    p.predict = unsolvable
+    stale, effects = changed_outputs(LcNsKmpSystem(p, None, PERIOD), inputs=("null_space_action",))
+    assert not stale
+    assert ("state 1", "command") in effects
 
 
 def test_initialization_restores_step_and_initial_command():

@@ -53,6 +53,15 @@ def test_action_follows_the_sliders_once_per_period(browser):
     np.testing.assert_array_equal(action.Eval(simulator.get_context()), [-0.5, 0.75])
 
 
+def test_action_is_the_present_input_at_each_initialization(browser):
+    system = MeshcatDevice(browser, AXES, KEYS, 0.125)
+    simulator = Simulator(system)
+    for value in (0.5, -0.25):
+        browser.sliders["input 1"] = value
+        simulator.Initialize()
+        np.testing.assert_array_equal(system.get_action_output_port().Eval(simulator.get_context()), [value, 0.0])
+
+
 def test_gamepad_axis_overrides_the_slider_when_deflected(browser):
     system = MeshcatDevice(browser, AXES, KEYS, 0.1)
     browser.sliders["input 1"] = 0.5
