@@ -311,7 +311,7 @@ def check_pose(pose: ArrayLike, size: int) -> np.ndarray:
 def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple[MultibodyPlant, SceneGraph]:
     """Add a plant with the settings that all stations share; `config` has further fields of `MultibodyPlantConfig`."""
     shared = {"discrete_contact_approximation": "lagged", "use_sampled_output_ports": False}  # see `TaskDiagram`
-    return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared, **config), builder)
+    return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared | config), builder)
 
 
 def add_workcell_plant(
@@ -319,7 +319,8 @@ def add_workcell_plant(
 ) -> tuple[MultibodyPlant, SceneGraph, Robot]:
     """Add a finalized plant with the workcell's fixture, and with the robot and workpiece that `add_robot` adds.
 
-    Contact is hydroelastic, with point contact as the fallback.
+    Contact is hydroelastic, with point contact as the fallback; its approximation is the workcell's
+    `contact_approximation`.
 
     Raises:
         InputError: If the time step is not positive.
@@ -327,7 +328,8 @@ def add_workcell_plant(
     if not time_step > 0.0:
         raise InputError(f"the plant's time step must be positive, not {time_step} s")
     contact = {"contact_model": "hydroelastic_with_fallback", "contact_surface_representation": "polygon"}
-    plant, scene_graph = add_plant(builder, time_step, **contact)
+    approximation = getattr(workcell, "contact_approximation", "lagged")
+    plant, scene_graph = add_plant(builder, time_step, **contact, discrete_contact_approximation=approximation)
     workcell.add_fixture(plant)
     robot = add_robot(plant)
     plant.Finalize()

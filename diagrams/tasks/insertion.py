@@ -18,6 +18,7 @@ from guiderail.diagrams.envs.observation import ObservationTerm, affine
 from guiderail.diagrams.envs.options import Pair, ResetOptions, satisfies
 from guiderail.diagrams.envs.scene import Camera, look_at
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
+from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
 from guiderail.diagrams.tasks.task import EpisodeConstant, Task, terminal_reward
@@ -159,6 +160,10 @@ class InsertionTask(Task):
 
         The default is None: the task then cannot be learned on hardware.
         """
+        return None
+
+    def rim_contact(self) -> RimContact | None:
+        """Return the place on the rim at which `probe_contact` measures the contact; None if there is none."""
         return None
 
     def hold_tests(self, pose: np.ndarray) -> Sequence[HoldTest]:

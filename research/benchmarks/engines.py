@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear_motion
+from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.options import HARD
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.contact_probe import SPEEDS, probe_contact
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
+from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.systems.recorder import Recording
 from guiderail.tools.visualization.style import legend, new_figure, save_figure
 from research.benchmarks import with_progress
@@ -31,22 +32,11 @@ OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
 MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
 PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses with 4 N
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
-NARROW = BncDimensions(mouth_chamfer=HARD["mouth_chamfer"])
-CAPTURED = 9.5 * MM  # height below which a plug has dropped into the jack [m]
-FARTHEST = 0.4 * MM  # offset at which no plug drops in [m]
-HALVINGS = 6  # bisection steps of the capture offset
-AROUND = 3.0 * MM  # radius of the circle on the rim along which the plug is dragged [m]
-SPEEDS = (0.003, 0.02, 0.04)  # speeds along the circle [m/s]
-CAPTURES = {  # station, and True if Drake's polygons have the areas of the circles that they approximate
-    "Drake": ("gantry", False),
-    "Drake, equal areas": ("gantry", True),
-    "MuJoCo": ("mujoco", False),
-}
-CONTACTS = {  # station, time step [s] and margin [m]
-    "Drake, 10 ms": ("gantry", PLANT_PERIOD, MARGIN),
-    "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4, MARGIN),
-    "Drake, 2.5 ms, no margin": ("gantry", PLANT_PERIOD / 4, 0.0),
-    "MuJoCo": ("mujoco", PLANT_PERIOD, MARGIN),
+NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+CONTACTS = {  # station and time step [s]
+    "Drake, 10 ms": ("gantry", PLANT_PERIOD),
+    "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4),
+    "MuJoCo": ("mujoco", PLANT_PERIOD),
 }
 
 
@@ -63,14 +53,19 @@ def measure() -> dict[str, Any]:
     }
     levers["two points, rigid"] = [rigid_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
     levers["even pressure"] = [even_lever(BncDimensions(), offset * MM) / MM for offset in OFFSETS]
-    captures = {"as drawn": (NARROW.bore_clearance + NARROW.mouth_chamfer) / MM}
-    captures |= {engine: _capture(*values) / MM for engine, values in with_progress(CAPTURES.items(), "capture")}
-    drags = {
-        contact: [drag(*values, speed) for speed in SPEEDS]
-        for contact, values in with_progress(CONTACTS.items(), "drag")
-    }
+    captures = {"as drawn": geometric_capture() / MM}
+    drags = {}
+    for contact, (station, time_step) in with_progress(CONTACTS.items(), "contact"):
+        probe = probe_contact(NARROW, station, time_step=time_step)
+        captures[contact], drags[contact] = probe.capture / MM, list(probe.drags)
     measured = {"levers_mm": levers, "captures_mm": captures, "drags": drags}
     return {"profiles": profiles, "offsets_mm": list(OFFSETS), **measured}
+
+
+def geometric_capture() -> float:
+    """Return the offset from which a plug drops in as drawn [m]."""
+    dimensions = NARROW.workcell().dimensions
+    return float(dimensions.bore_clearance + dimensions.mouth_chamfer)
 
 
 def rigid_lever(d: BncDimensions, offset: float) -> float:
@@ -110,31 +105,6 @@ def _lever(name: str, offset: float, modulus: float) -> float:
     """Return the distance between the plug's axis and the center of pressure, at rest on the rim [m]."""
     recording = _pressed(name, BncWorkcell(), offset, modulus)
     return float(np.linalg.norm(center_of_pressure(recording["wrench"][-10:].mean(axis=0), MIN_CONTACT_FORCE)))
-
-
-def _capture(name: str, equal_area: bool = False) -> float:
-    """Return the largest offset at which a plug that is pressed on the jack drops into it [m]."""
-    near, far = 0.0, FARTHEST
-    for _ in range(HALVINGS):
-        middle = 0.5 * (near + far)
-        workcell = BncWorkcell(NARROW, equal_area=equal_area)
-        is_captured = _pressed(name, workcell, middle)["pose"][-1, 2] < CAPTURED
-        near, far = (middle, far) if is_captured else (near, middle)
-    return near
-
-
-def drag(station: str, time_step: float, margin: float, speed: float) -> float:
-    """Return the ratio of drag to normal force of a plug that slides over a sharp rim: the effective friction."""
-    workcell = BncWorkcell(NARROW, margin=margin)
-    down = poses(np.array([11.0 * MM, PRESSED]), np.pi / 2)
-    times = np.concatenate([[0.0], np.linspace(0.6, 1.4, 81)])
-    motion = np.concatenate([down[:1], np.tile(down[1], (81, 1))])
-    angles = speed / AROUND * np.maximum(times - 0.6, 0.0)
-    motion[:, :2] += AROUND * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    built = STATIONS.get(station).build(workcell, time_step=time_step)
-    wrench = drive_along(built, times, motion)[1]["wrench"][45:]
-    wrench = wrench[wrench[:, 2] > MIN_CONTACT_FORCE]
-    return float(np.median(np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]))
 
 
 def _pressed(name: str, workcell: BncWorkcell, offset: float, modulus: float = 1.0) -> Recording:

@@ -10,7 +10,9 @@ from pydrake.systems.framework import DiagramBuilder
 
 from guiderail import systems
 from guiderail.models.common.errors import InputError
+from guiderail.models.control.cartesian_impedance import impedance_torques
 from guiderail.models.control.wrench import WrenchBound
+from guiderail.systems.support.differentiable_impedance import differentiable_torques
 from oracles.prerequisites import changed_outputs
 from oracles.systems import check_stale_outputs
 
@@ -105,6 +107,17 @@ def test_saturated_entry_has_no_gradient():
     np.testing.assert_allclose(ExtractValue(found).ravel(), evaluate(controller, numbers, outputs), atol=1e-9)
     assert found[-1].value() == 1.0
     np.testing.assert_array_equal(ExtractGradient(found)[0], np.zeros(18))
+
+
+@pytest.mark.parametrize(("share", "is_saturated"), [(1.0, False), (1.0 + 1e-12, True)])
+def test_torque_at_its_limit_is_not_saturated(share, is_saturated):
+    """As for floats: a torque that is not changed by its limit is not saturated."""
+    zero, limits = np.zeros(6), np.full(6, 2.0)
+    arguments = {"p_error": zero[:3], "eta": 1.0, "epsilon": zero[:3], "J": np.eye(6), "M": np.eye(6), "v": zero}
+    arguments |= {"K": np.eye(6), "damping_ratio": 1.0, "wrench_limits": LIMITS, "R_axes": None}
+    arguments |= {"posture_torque": zero, "gravity_torque": share * limits, "torque_limits": limits}
+    assert impedance_torques(**arguments).is_saturated == is_saturated
+    assert differentiable_torques(**arguments).is_saturated == is_saturated
 
 
 def test_closed_loop_has_derivatives_of_its_motion():

@@ -1,8 +1,9 @@
 """Export of skills: the ONNX file computes the policy's actions, and a loop without an environment its commands."""
 
-import json
+import re
 from dataclasses import replace
-from itertools import pairwise
+from itertools import count, pairwise
+from pathlib import Path
 
 import numpy as np
 import onnxruntime
@@ -11,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.laws import Stepper, load_law
+from guiderail.models.laws import load_law
 from guiderail.models.policy import Policy
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import make_environment
@@ -46,26 +47,42 @@ def test_onnx_computes_the_actions_of_the_policy(sizes, activation, squash, seed
 
 
 @pytest.mark.parametrize("name", ["connector", "passage"])
-def test_exported_skill_acts_as_in_its_environment(name, tmp_path):
-    export_skill(f"pretrained:{name}", tmp_path / "skill")
-    skill = json.loads((tmp_path / "skill/skill.json").read_text())
-    config = RunFolder(find_run(f"pretrained:{name}")).config()
-    env = make_environment(config.task, config.environment)
-    session = onnxruntime.InferenceSession(tmp_path / "skill/policy.onnx", providers=["CPUExecutionProvider"])
-    policy = Policy.load(find_run(f"pretrained:{name}"))
+def test_loop_of_the_docs_acts_as_the_environment(name, tmp_path, monkeypatch):
+    """The loop without an environment in docs/use.md commands what the environment of the run commands."""
+    page = (Path(__file__).parents[2] / "docs/use.md").read_text("utf-8").partition("\n## A skill without")[2]
+    (code,) = re.findall(r"```python\n(.*?)```", page.partition("\n## ")[0], re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    export_skill(f"pretrained:{name}", Path("connector"))
+    loop: dict = {}
+    exec(compile(code, "use.md", "exec"), loop)
+    skill, config = loop["skill"], RunFolder(find_run(f"pretrained:{name}")).config()
+    env, policy = make_environment(config.task, config.environment), Policy.load(find_run(f"pretrained:{name}"))
     observation, _ = env.reset(seed=1_000_000)
     assert len(skill["observation"]) == len(observation)
     simulator = env.unwrapped.simulator
     station = simulator.get_system().GetSubsystemByName("station")
     pose = station.GetOutputPort("pose").Eval(station.GetMyContextFromRoot(simulator.get_context()))
-    stepper = Stepper(load_law(tmp_path / "skill"), pose)
-    for _ in range(3):
-        (row,) = session.run(None, {"observation": observation[None].astype(np.float32)})
-        np.testing.assert_allclose(row[0], policy(observation), rtol=1e-4, atol=1e-5)
-        commands = [stepper.step(row[0]).pose for _ in range(skill["action_repeat"])]
-        observation, _, terminated, truncated, _ = env.step(row[0])
-        assert (terminated, truncated) == (False, False)
-        np.testing.assert_allclose(env.unwrapped.trace.commanded[-len(commands) :], commands, atol=1e-6)
+    commands: list[np.ndarray] = []
+    reads = count()
+
+    def read_signals():
+        nonlocal observation
+        if next(reads) == 0:
+            return {"pose": pose}
+        if commands:
+            observation, _, terminated, truncated, _ = env.step(policy(observation))
+            assert (terminated, truncated) == (False, False)
+            recent = env.unwrapped.trace.commanded[-skill["action_repeat"] :]
+            np.testing.assert_allclose(recent, commands[-skill["action_repeat"] :], atol=1e-6)
+        if len(commands) == 3 * skill["action_repeat"]:
+            raise KeyboardInterrupt
+        signals: dict = {}
+        for entry, value in zip(skill["observation"], observation, strict=True):
+            signals.setdefault(entry["signal"], {})[entry["index"]] = value * entry["scale"] + entry["center"]
+        return signals
+
+    with pytest.raises(KeyboardInterrupt):
+        loop["run"](read_signals, commands.append)
     env.close()
 
 

@@ -21,10 +21,7 @@ def train(
     out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
     variants: Annotated[
         Path | None,
-        option(
-            "YAML file of variants, options of the environment by name, such as 'fine: {time_step: 0.0025}': each "
-            "episode is in another variant."
-        ),
+        option("YAML file with options of the environment by a variant's name: each episode is in another variant."),
     ] = None,
     guidance: cli.Guidance = None,
     algorithm: cli.Algorithm = None,

@@ -26,6 +26,7 @@ FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"
 PLUG_SDF = FOLDER / "bnc_plug.sdf"
 BORE_SIDES = 24  # sides of the polygon that approximates the bore
+LIP_WIDTH, LIP_RISE = 0.1 * MM, 0.005 * MM  # size of the lip at the mouth's inner corner [m]
 
 
 @dataclass(frozen=True)
@@ -185,20 +186,28 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
 
 
-def bore_mesh(dimensions: BncDimensions, equal_area: bool = False) -> TriangleMesh:
-    """Return the mesh that collides with the barrel: the mouth's face, its chamfer and the bore.
-
-    The bore is a polygon around the true circle, or with `equal_area` a polygon of the same area.
-    """
+def chamfer_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the chamfer of the mouth with a lip at its edge, a shallow cone in place of the sharp corner."""
     d = dimensions
-    corner = equal_area_radius(1.0, BORE_SIDES) if equal_area else 1.0 / float(np.cos(np.pi / BORE_SIDES))
-    profile = [
-        (d.ring_radius, 0.0),
-        ((d.bore_radius + d.mouth_chamfer) * corner, 0.0),
-        (d.bore_radius * corner, d.mouth_chamfer),
-        (d.bore_radius * corner, d.ring_length),
-    ]
-    return lathe(profile, BORE_SIDES)
+    lip = [(d.bore_radius + d.mouth_chamfer + LIP_WIDTH, 0.0), (d.bore_radius + d.mouth_chamfer - LIP_RISE, LIP_RISE)]
+    return _lathe([*lip, (d.bore_radius, d.mouth_chamfer)])
+
+
+def bore_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the flat face of the mouth and the wall of the bore, without the chamfer between them."""
+    d = dimensions
+    face = _lathe([(d.ring_radius, 0.0), (d.bore_radius + d.mouth_chamfer + LIP_WIDTH, 0.0)])
+    wall = _lathe([(d.bore_radius, d.mouth_chamfer), (d.bore_radius, d.ring_length)])
+    return TriangleMesh(
+        np.concatenate([face.vertices, wall.vertices]),
+        np.concatenate([face.triangles, wall.triangles + len(face.vertices)]),
+    )
+
+
+def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
+    """Return a surface of revolution whose polygons have the areas of the circles that they approximate."""
+    corner = equal_area_radius(1.0, BORE_SIDES)
+    return lathe([(radius * corner, height) for radius, height in profile], BORE_SIDES)
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:

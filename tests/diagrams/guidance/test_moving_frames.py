@@ -8,7 +8,8 @@ from pydrake.systems.analysis import Simulator
 from guiderail.diagrams.guidance.sct import SctGuidance
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.models.templates import load_template
+from guiderail.models.templates import load_template, parse_template
+from guiderail.systems import SctStateMachine
 
 PERIOD = 0.02
 START = np.array([0.1, -0.06, 0.06, 0.0, 0.0, -1.2])
@@ -67,6 +68,32 @@ def test_commands_stay_inside_the_constraints_of_a_frame_that_moves(simulator):
     for x in np.linspace(0.0, 0.005, 20):
         fix(simulator, RigidTransform([0.1 + x, 0.0, 0.0]))
         assert commands(simulator, 1)[0, -1] <= 1e-6
+
+
+def test_port_has_the_poses_of_several_frames_in_their_order():
+    text = """
+name: two
+inputs: 3
+frames: [near, far]
+max_speed_m_per_s: 0.5
+max_speed_rad_per_s: 1.0
+states:
+  only:
+    input_mapping: [{kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.5, frame: near}]
+    active_constraints: [{kind: keep_above, frame: near, height_m: 0.0}]
+    transition_distance: {kind: height, frame: far}
+    starts_at_m: 1.0
+    ends_at_m: 0.0
+"""
+    template = parse_template(text)
+    machine = SctStateMachine(template, dict.fromkeys(template.frames, RigidTransform()), PERIOD)
+    context = machine.CreateDefaultContext()
+    machine.get_pose_input_port().FixValue(context, np.array([0.0, 0.0, 0.5, 0.0, 0.0, 0.0]))
+    poses = [transform_to_pose(RigidTransform([0.0, 0.0, z])) for z in (0.1, 0.2)]
+    machine.get_frame_poses_input_port().FixValue(context, np.concatenate(poses))
+    frames = machine.frames.eval(context)
+    assert [frames[name].translation()[2] for name in ("near", "far")] == [0.1, 0.2]
+    assert machine.get_transition_distance_output_port().Eval(context)[0] == pytest.approx(0.3)
 
 
 def test_pose_that_is_not_finite_is_refused(simulator):

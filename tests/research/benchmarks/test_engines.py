@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from guiderail.diagrams.tasks.contact_probe import probe_contact
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from research.benchmarks import engines
@@ -28,27 +29,11 @@ def test_lever_is_similar_in_mujoco():
     assert rigid_lever(D, 2.0 * MM) < mujoco < drake == pytest.approx(mujoco, rel=0.4)
 
 
-def test_capture_offset_is_close_to_the_geometry():
-    """With the time step of the plant, the capture offset in Drake is up to 1.5 times the offset of the geometry."""
+def test_capture_and_drag_in_mujoco_are_those_of_the_geometry():
     pytest.importorskip("mujoco")
-    geometric = engines.NARROW.bore_clearance + engines.NARROW.mouth_chamfer
-    drake, mujoco = (engines._capture(station) for station in ("gantry", "mujoco"))
-    assert mujoco == pytest.approx(geometric, abs=0.02 * MM)
-    assert geometric < drake < 1.5 * geometric
-    assert engines._capture("gantry", equal_area=True) == pytest.approx(geometric, abs=0.05 * MM)
-
-
-def test_drag_is_friction_when_steps_are_short():
-    """With the default time step and margin, the drag is up to 4.2 times the friction."""
-    names = ("Drake, 2.5 ms, no margin", "Drake, 10 ms")
-    fine, default = (engines.drag(*engines.CONTACTS[name], 0.02) for name in names)
-    assert fine == pytest.approx(engines.FRICTION, rel=0.25)
-    assert fine < default < 4.2 * engines.FRICTION
-
-
-def test_drag_is_friction_in_mujoco():
-    pytest.importorskip("mujoco")
-    assert engines.drag(*engines.CONTACTS["MuJoCo"], 0.02) == pytest.approx(engines.FRICTION, rel=0.05)
+    probe = probe_contact(engines.NARROW, "mujoco")
+    assert probe.capture == pytest.approx(engines.geometric_capture(), abs=0.03 * MM)
+    assert probe.drags == pytest.approx([engines.FRICTION] * 2, rel=0.05)
 
 
 def test_draw_writes_a_picture(tmp_path):

@@ -204,13 +204,31 @@ def test_velocity_and_force_columns_are_not_positions(prefix, file):
 
 
 def test_unused_columns_are_listed_as_left_out(file):
-    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,a,b,c", *range(6)))
-    assert result.assumptions == ["there is no orientation", "a, b and c are left out"]
+    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,a,b", *range(5)))
+    assert result.assumptions == ["there is no orientation", "a and b are left out"]
     many = ",".join(f"f{n}" for n in range(20))
     result = read_csv_files(write(file, f"t [s],x_m,y_m,z_m,roll_rad,pitch_rad,yaw_rad,{many}", *range(26)))
     assert result.assumptions[-1] == "f0, f1, f2, f3, f4, f5, f6, f7 and 12 more are left out"
     result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,force", *range(4)))
     assert result.assumptions[-1] == "force is left out"
+
+
+@pytest.mark.parametrize("names", ["a,b,c", "h0,h1,h2", "foo_a,foo_b,foo_c,foo_d", "i,j,k,w", "alpha,beta,gamma"])
+def test_unknown_columns_that_could_be_an_orientation_are_refused(names, file):
+    values = range(3 + len(names.split(",")))
+    with pytest.raises(InputError, match=r"has no orientation in a known|not the whole of an orientation"):
+        read_csv_files(write(file, f"t [s],x_m,y_m,z_m,{names}", *values))
+
+
+def test_unit_quaternion_between_unknown_columns_is_refused(file):
+    quaternion = Rotation.from_euler("ZYX", [0.4, -0.3, 0.2]).as_quat()
+    with pytest.raises(InputError, match="u, v, s and c could be one"):
+        read_csv_files(write(file, "t [s],x_m,y_m,z_m,p,u,v,s,c", 1, 2, 3, 7, *quaternion))
+
+
+def test_columns_of_other_quantities_are_left_out(file):
+    result = read_csv_files(write(file, "t [s],x_m,y_m,z_m,fx,fy,fz,gripper_width", *range(7)))
+    assert result.assumptions == ["there is no orientation", "fx, fy, fz and gripper_width are left out"]
 
 
 TRUE = Rotation.from_euler("ZYX", [0.4, -0.3, 0.2])

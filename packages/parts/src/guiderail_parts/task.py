@@ -537,7 +537,7 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
         "station": "gantry",
         "action_repeat": 10,
         "action_dims": file.action_dims,
-        "history_variance": HISTORY_VARIANCE,
+        "history.variance": HISTORY_VARIANCE,
         "force_limit": file.force_limit,
         "time_step": file.time_step,
         **file.recommended.environment,

@@ -13,6 +13,7 @@ import unicodedata
 from array import array
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +71,15 @@ _ORIENTATION = re.compile(
     r"|rotation_vector|rv|axis_angle|angles?|phi|theta|psi|attitude"
     r"|o_t_ee|q[._/ ]?[xyzw]|r_?[xyz]|o[xyzw]|r[0-3][0-3])[._/ ]?(?:[xyzw]|[0-9]+)?(?:_rpy)?(?:_deg|_rad)?"
 )
+# Names of columns that describe another quantity than an orientation.
+_OTHER = re.compile(
+    r".*(?:force|torque|wrench|moment|twist|vel|speed|acc|jerk|gripper|finger|width|aperture|joint|effort|current|volt"
+    r"|power|temp|press|stamp|time|sec|index|seq|frame|count|step|label|name|status|mode|phase|reward|action|done|episode"
+    r"|demo|cov|error|dist|button|trigger|contact|load|mass|robot|tool|valid|success).*"
+    r"|[ftmv][._/ ]?[xyz].*|[a-z]+[0-9]{2,}|q[0-9].*",
+    re.IGNORECASE,
+)
+_ORIENTATION_SIZES = (3, 4, 9)  # numbers of columns of an orientation
 _ROTATION_VECTOR = ("r_?x", "r_?y", "r_?z")
 _KUKA = ("A", "B", "C")  # angles of a KUKA about z, y and x [degrees]
 _TCP_POSE = re.compile(r"(actual|target)_TCP_pose_[0-5]")  # columns of a Universal Robots recording (RTDE)
@@ -224,7 +234,7 @@ def _read(
     positions = positions * [UNITS[str(known)] for known in units]
     frames = _frames_of(columns)
     if rotations is None:
-        _refuse_orientation(file, columns, position)
+        _refuse_orientation(file, columns, (*clock, *position))
         if target is not None:
             raise InputError(f"{file} has no quaternion nor roll, pitch and yaw, and --target needs an orientation")
         assumptions.append("there is no orientation")
@@ -282,9 +292,9 @@ def _frames_of(columns: Sequence[_Column]) -> Frames:
     return frame, child
 
 
-def _refuse_orientation(file: Path, columns: Sequence[_Column], position: Sequence[_Column]) -> None:
-    """Raise an InputError if columns describe an orientation, which must not be dropped."""
-    left = [column for column in columns if not any(column is other for other in position)]
+def _refuse_orientation(file: Path, columns: Sequence[_Column], used: Sequence[_Column]) -> None:
+    """Raise an InputError if columns that are not used describe an orientation, which must not be dropped."""
+    left = [column for column in columns if not any(column is other for other in used)]
     plain = [column for column in left if not re.search(r"covariance|velocity|vel[._/ ]", column.plain)]
     found = [c.name for c in plain if _ORIENTATION.fullmatch(c.plain) or c.name in (*_KUKA, *"WPRw")]
     if found:
@@ -294,6 +304,20 @@ def _refuse_orientation(file: Path, columns: Sequence[_Column], position: Sequen
             "known convention: name four columns qx, qy, qz and qw, or three roll, pitch and yaw, or delete "
             f"{'it' if is_one else 'them'} to import positions alone"
         )
+    unknown = [column for column in left if column.name and not column.frame and not _OTHER.fullmatch(column.plain)]
+    unit = next((four for four in combinations(unknown[:_MAX_LISTED], 4) if _is_quaternion(four)), ())
+    if unit or len(unknown) in _ORIENTATION_SIZES:
+        names = _listed([column.name for column in unit or unknown])
+        raise InputError(
+            f"{file} has no orientation in a known convention, and {names} could be one: name four columns qx, qy, qz "
+            "and qw, or three roll, pitch and yaw, or delete these to import positions alone"
+        )
+
+
+def _is_quaternion(columns: Sequence[_Column]) -> bool:
+    """Return True if the values of every line are a unit quaternion in some order."""
+    squares = np.sum([column.values**2 for column in columns], axis=0)
+    return bool(np.all(np.abs(squares - 1.0) < 2e-3))
 
 
 def _table(file: Path) -> list[_Column]:
