@@ -117,7 +117,8 @@ class ActiveConstraintProjector(LeafSystem):
 
     def _calc_command(self, context: Context, value: AbstractValue) -> None:
         """Compute the command and the fallback flag, (7,)."""
-        last, measured = np.split(declare.initialized(self, context, self._last), 2)
+        stored = declare.initialized(self, context, self._last)
+        last, measured = stored[:6], stored[6:]
         number, command, is_fallback = self._state(context), last, True
         if number is not None:
             requested, frames = self._requested_pose_port.Eval(context), self.frames.eval(context)

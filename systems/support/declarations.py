@@ -209,9 +209,10 @@ def part_output(
 
     `part` maps the value of `source` to an array (size,). Without `size`, it returns a number, and the port is (1,).
     """
+    is_state = isinstance(source, DiscreteStateIndex)
 
     def calc(context: Context, vector: BasicVector) -> None:
-        whole = source.Eval(context) if isinstance(source, CacheEntry) else context.get_discrete_state().value(source)
+        whole = context.get_discrete_state().value(source) if is_state else source.Eval(context)
         if size is None:
             vector.SetAtIndex(0, part(whole))
         else:
