@@ -295,9 +295,14 @@ def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str |
     Raises:
         InputError: If the task or an argument is unknown, or options are incompatible.
     """
-    arguments = check_environment(task, arguments)
-    if render_mode is not None or environment_id(task) != task:  # others may not have the argument
-        arguments = {**arguments, "render_mode": render_mode}
+    if task in TASKS.names():
+        from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
+
+        arguments = {"task": EnvConfig.resolve(task, arguments), "render_mode": render_mode}
+    else:
+        arguments = check_environment(task, arguments)
+        if render_mode is not None or environment_id(task) != task:  # others may not have the argument
+            arguments = {**arguments, "render_mode": render_mode}
     return gymnasium.make(environment_id(task), disable_env_checker=True, **arguments)
 
 

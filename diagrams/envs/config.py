@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.options import (
     check_choice,
     flat_options,
     option_fields,
-    validate_options,
+    validate_tree,
 )
 from guiderail.diagrams.envs.settings import EnvSettings
 from guiderail.diagrams.guidance.registry import (
@@ -139,13 +139,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     _check_declared_options(task, known)
     defaults, preset, options = (flat_options(models.values(), given) for given in settings)
     _check_given_options(task, options, known)
-    merged = {**defaults, **preset, **options, **chosen}
-    parts: dict[str, Any] = {
-        part: validate_options(
-            model, {option: merged[option] for option in option_fields(model) if option in merged}, name
-        )
-        for part, model in models.items()
-    }
+    parts: dict[str, Any] = dict(validate_tree(models, {**defaults, **preset, **options, **chosen}, name))
     common = parts.pop("common")
     config = EnvConfig(name, **{option: getattr(common, option) for option in CommonOptions.model_fields}, parts=parts)
     config.make_task()  # its constructor refuses incompatible options

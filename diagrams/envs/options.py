@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import fields
+from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 import numpy as np
@@ -16,6 +17,7 @@ from pydantic import (
     Field,
     ValidationError,
     ValidationInfo,
+    create_model,
     field_validator,
 )
 from pydantic.fields import FieldInfo
@@ -295,6 +297,36 @@ def validate_options(model: type[Model], values: Mapping[str, Any], context: str
         return model(**{fields[name]: value for name, value in values.items()})
     except ValidationError as error:
         raise InputError(_format_error(model, error.errors()[0], values, context)) from None
+
+
+@lru_cache(maxsize=128)
+def _tree_of(models: tuple[tuple[str, type[Options]], ...]) -> type[Options]:
+    fields: dict[str, Any] = {part: (model, ...) for part, model in models}
+    return create_model("Tree", __base__=Options, **fields)
+
+
+def validate_tree(models: Mapping[str, type[Options]], values: Mapping[str, Any], context: str) -> dict[str, Options]:
+    """Validate and convert the options of all parts at once; `context` is the subject of an error message.
+
+    Args:
+        models: Model of each part. A part takes the values whose names it declares.
+        values: Options by name, in which no entry of a structured option is in a mapping; see `flat_options`.
+        context: Subject of an error message.
+
+    Raises:
+        InputError: If a value has the wrong type or is out of range.
+    """
+    tree = {
+        part: {field: values[name] for name, field in option_fields(model).items() if name in values}
+        for part, model in models.items()
+    }
+    try:
+        validated = _tree_of(tuple(models.items())).model_validate(tree)
+    except ValidationError as error:
+        first = error.errors()[0]
+        part, *location = first["loc"]
+        raise InputError(_format_error(models[str(part)], {**first, "loc": tuple(location)}, values, context)) from None
+    return {part: getattr(validated, part) for part in models}
 
 
 def check_choice(name: str, value: Any, choices: list[str], context: str) -> str:
