@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +46,7 @@ class ContactProbe:
     drags: tuple[float, ...]  # ratio of drag to normal force at each of `SPEEDS`
     lever: float  # distance of the center of pressure from the workpiece's axis, at rest [m]
     capture: float  # largest offset from which a pressed workpiece drops in [m]
+    cost: float = float("nan")  # CPU time per simulated time of a resting workpiece, without the station's construction
 
     @property
     def drag_error(self) -> float:
@@ -81,12 +83,11 @@ def probe_contact(task: Any, station: str = "gantry", **options: Any) -> Contact
     contact = task.rim_contact() if hasattr(task, "rim_contact") else None
     if contact is None:
         raise InputError(f"{task.name} has no rim on which its contact can be measured")
-    return ContactProbe(
-        contact.friction,
-        tuple(drag(task.workcell(), contact, speed, station, **options) for speed in SPEEDS),
-        lever_arm(task.workcell(), contact, contact.radius, station, **options),
-        capture_offset(task.workcell(), contact, station, **options),
-    )
+    workcell = task.workcell()
+    drags = tuple(drag(workcell, contact, speed, station, **options) for speed in SPEEDS)
+    recording, cost = _press(workcell, contact, [(contact.radius, 0.0)], station, options)
+    capture = capture_offset(workcell, contact, station, **options)
+    return ContactProbe(contact.friction, drags, _lever(recording), capture, cost)
 
 
 def drag(workcell: Any, contact: RimContact, speed: float, station: str = "gantry", **options: Any) -> float:
@@ -96,7 +97,7 @@ def drag(workcell: Any, contact: RimContact, speed: float, station: str = "gantr
     """
     angles = speed / contact.radius * np.linspace(0.0, END - DOWN, 81)
     offsets = contact.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    recording = _press(workcell, contact, offsets, station, options)
+    recording, _ = _press(workcell, contact, offsets, station, options)
     wrench = recording["wrench"][round(FROM / CONTROL_PERIOD) :]
     wrench = wrench[wrench[:, 2] > MIN_CONTACT_FORCE]
     ratios = np.linalg.norm(wrench[:, :2], axis=1) / wrench[:, 2]
@@ -105,7 +106,10 @@ def drag(workcell: Any, contact: RimContact, speed: float, station: str = "gantr
 
 def lever_arm(workcell: Any, contact: RimContact, offset: float, station: str = "gantry", **options: Any) -> float:
     """Return the distance of the center of pressure from the axis of a workpiece at rest on the rim [m]."""
-    recording = _press(workcell, contact, [(offset, 0.0)], station, options)
+    return _lever(_press(workcell, contact, [(offset, 0.0)], station, options)[0])
+
+
+def _lever(recording: Recording) -> float:
     return float(np.linalg.norm(center_of_pressure(recording["wrench"][-10:].mean(axis=0), MIN_CONTACT_FORCE)))
 
 
@@ -114,15 +118,19 @@ def capture_offset(workcell: Any, contact: RimContact, station: str = "gantry", 
     near, far = 0.0, contact.radius
     while far - near > RESOLUTION:
         middle = 0.5 * (near + far)
-        heights = _press(workcell, contact, [(middle, 0.0)], station, options)["pose"][:, 2]
+        heights = _press(workcell, contact, [(middle, 0.0)], station, options)[0]["pose"][:, 2]
         near, far = (middle, far) if heights[-1] < contact.height - DROPPED else (near, middle)
     return near
 
 
 def _press(
     workcell: Any, contact: RimContact, offsets: Sequence[tuple[float, float]] | np.ndarray, station: str, options: Any
-) -> Recording:
-    """Record a workpiece that is pressed on the rim at the first of the `offsets` and moves along them (N, 2) [m]."""
+) -> tuple[Recording, float]:
+    """Record a workpiece that is pressed on the rim at the first of the `offsets` and moves along them (N, 2) [m].
+
+    Returns:
+        The recording, and the CPU time per simulated time.
+    """
     times = np.linspace(DOWN, END, len(offsets)) if len(offsets) > 1 else np.array([DOWN])
     path = np.zeros((len(times), POSE_SIZE))
     path[:, :2] = offsets
@@ -132,4 +140,6 @@ def _press(
     source = linear_motion(np.append(0.0, times), np.concatenate([start[None], path]))
     driven = DrivenStation(built, source, round(END / CONTROL_PERIOD))
     driven.start(start)
-    return driven.run()
+    begin = time.process_time()
+    recording = driven.run()
+    return recording, (time.process_time() - begin) / END

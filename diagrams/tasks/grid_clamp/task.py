@@ -17,6 +17,7 @@ from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, fr
 from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
 from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell
+from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, GridClampOptions
 from guiderail.diagrams.tasks.insertion import InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
@@ -272,6 +273,10 @@ class GridClamp(InsertionTask):
         """Return a straight descent into the hole."""
         heights = (max(self.options.start_height), -TEMPLATE.parameters["push_m"])
         return ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2)
+
+    def rim_contact(self) -> RimContact:
+        """Return the place at which the pegs stand on the faces around their holes."""
+        return RimContact(self._workcell.dimensions.peg_length, 2.5 * MM, self.options.friction)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D (6, 6) and y0 (6,) of an estimate of the height; a pull checks the lateral offset instead."""

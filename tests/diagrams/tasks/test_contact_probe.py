@@ -35,6 +35,15 @@ def test_lever_arm_and_capture_of_the_connector_do_not_depend_on_the_step(probes
     assert default.capture == pytest.approx(size.bore_clearance + size.mouth_chamfer, abs=0.05 * MM)
 
 
+def test_drag_of_the_clamp_is_its_friction_at_20_mm_per_s():
+    """At 40 mm/s it is 1.0 at the default time step, and the friction at a quarter of it."""
+    clamp = EnvConfig.resolve("GridClamp", {"difficulty": "hard"}).make_task()
+    contact = clamp.rim_contact()
+    assert drag(clamp.workcell(), contact, 0.02) == pytest.approx(contact.friction, rel=0.15)
+    fine = drag(clamp.workcell(), contact, 0.04, time_step=PLANT_PERIOD / 4)
+    assert fine == pytest.approx(contact.friction, rel=0.15)
+
+
 def test_probe_finds_a_chamfer_inside_the_margin(monkeypatch):
     """Extrapolated contact on the chamfer stops a plug that would slide past it."""
     monkeypatch.setattr(sdf, "BARREL", dataclasses.replace(sdf.BARREL, margin=0.1 * MM))

@@ -330,6 +330,9 @@ def _measure(
 
     The first contact is None if no misaligned plug was blocked.
     """
+    from guiderail.diagrams.stations.station import PLANT_PERIOD
+    from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag
+    from guiderail_parts.task import rim_contact, write_workcell
     from guiderail_parts.task_file import SearchNumbers
     from guiderail_parts.trial import insert, measure_first_contact, measure_lever_sign
 
@@ -353,6 +356,15 @@ def _measure(
     penetration, clearance = 1e3 * max(trial.penetration for trial in trials), prepared["clearance_mm"]
     if clearance is not None and penetration > 0.5 * clearance:
         log(f"penetration of {penetration:.3f} mm is more than half the clearance ({0.5 * clearance:.3f} mm)")
+    contact_on_rim = rim_contact(file)
+    ratio = drag(write_workcell(folder, file), contact_on_rim, SPEEDS[0], time_step=file.time_step)
+    if not abs(ratio / contact_on_rim.friction - 1.0) <= MAX_DRAG_ERROR:  # also if the plug does not touch
+        step = 1e3 * (file.time_step or PLANT_PERIOD)
+        log(
+            f"the contact has not converged at a time step of {step:g} ms: on the rim, drag / normal force is "
+            f"{ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s, and the friction {contact_on_rim.friction:g}; check a policy at "
+            "shorter steps (guiderail converge)"
+        )
     measured = {
         **prepared,
         "deviation_mm": round(deviation, 4),
@@ -368,6 +380,7 @@ def _measure(
         "penetration_pushed_on_the_rim_mm": round(penetration, 4),
         "snap_mm": round(1e3 * aligned.snap, 4),
         "real_time_factor": round(min(trial.real_time_factor for trial in trials), 2),
+        "drag": round(ratio, 3) if np.isfinite(ratio) else None,
         "inserted_s": inserted_s,
     }
     sign = measure_lever_sign([(xy, trial.recording) for xy, trial in zip(MISALIGNMENTS, misaligned, strict=True)])

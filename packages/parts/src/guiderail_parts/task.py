@@ -23,6 +23,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import (
     HOLD_DISTANCE,
     MAX_HOLD_MOTION,
@@ -333,6 +334,10 @@ class PartInsertion(DemonstratedInsertion):
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
         return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]), phases=None)
 
+    def rim_contact(self) -> RimContact:
+        """Return the place on the socket's rim."""
+        return rim_contact(self.file)
+
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D and y0 of an estimate D x + y0 of height and turn; pushes check the lateral offset instead."""
         D = np.zeros((POSE_SIZE, POSE_SIZE))
@@ -482,6 +487,15 @@ def _shared_sides(across: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the matrices of the last entries of "shared" for a rotation or reflection across the axis (2, 2)."""
     moved = block_diag(across, np.eye(1))
     return (np.eye(1), *[moved] * (1 + len(DELAYS)))
+
+
+RIM_OFFSET = 1.5 * MM  # displacement at which a plug is pressed on the rim [m]
+
+
+def rim_contact(file: PartTaskFile) -> RimContact:
+    """Return the place on the rim of a task file's socket, with the turn that the plug has during a search."""
+    turn = float(file.motion.plan_search()[1][0, 3])  # Rz of the first pose
+    return RimContact(file.motion.first_contact, RIM_OFFSET, file.plug.pieces[0].friction, turn)
 
 
 def write_workcell(folder: Path, file: PartTaskFile) -> PartWorkcell:

@@ -1,4 +1,4 @@
-"""`guiderail study`, `guiderail robustness`, `guiderail certify` and `guiderail report`."""
+"""`guiderail study`, `guiderail robustness`, `guiderail converge`, `guiderail certify` and `guiderail report`."""
 
 from importlib import import_module
 from pathlib import Path
@@ -111,6 +111,52 @@ def robustness(
             typer.echo(f"{policy}, {name}: success rate below 90 % at {below}")
     typer.echo(result["table"])
     typer.echo(result["picture"])
+
+
+@cli.command("converge runs/connector --steps 10,5,2.5,1.25 --engines drake,mujoco")
+def converge(
+    run: Annotated[str, argument("Folder of a run. With --out also pretrained:NAME ({pretrained}).", "RUN")],
+    steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
+    engines: Annotated[str, option("Engines: drake and mujoco, comma-separated.")] = "drake",
+    episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
+    seed: cli.Seed = SEED,
+    env: cli.Env = None,
+    out: Annotated[Path | None, option("Folder to write.  [default: converge in the run]")] = None,
+    processes: cli.Processes = None,
+    trust_policy: cli.TrustPolicy = False,
+    trust_imports: cli.TrustImports = False,
+    as_json: cli.Json = False,
+) -> None:
+    """Check that a policy's success does not depend on the plant's time step or on the physics engine.
+
+    The same held-out episodes run at every step. The table has success rates with intervals, the number of episodes
+    that agree with the shortest step, peak forces, and the contact on the rim: drag over normal force at 20 and 40
+    mm/s, lever arm, capture, and CPU time per simulated time. Evaluated episodes are stored, so the same command
+    resumes an interrupted evaluation.
+    """
+    from guiderail_studies.converge import converge as evaluate_convergence
+    from guiderail_studies.converge import parse_steps
+
+    result = evaluate_convergence(
+        run,
+        steps=parse_steps(steps),
+        engines=engines,
+        episodes=episodes,
+        seed=seed,
+        environment=cli.parse_environment(env),
+        out=out,
+        processes=processes,
+        trust_policy=trust_policy,
+    )
+    if as_json:
+        typer.echo(to_json(result | {"table": str(result["table"])}))
+        return
+    typer.echo(result["table"].with_suffix(".md").read_text(encoding="utf-8"))
+    if result["coarsest"] is not None:
+        typer.echo(f"coarsest step that agrees with the finest: {result['coarsest']:g} ms")
+    if result["warning"]:
+        typer.echo(f"warning: {result['warning']}")
+    typer.echo(result["table"])
 
 
 @cli.command("certify runs/passage --attack 1000000")
