@@ -53,6 +53,18 @@ def _is_abandoned(name: str) -> bool:
     return False
 
 
+def refuse_links(folder: Path) -> None:
+    """Raise an InputError if a folder inside of a run's folder is a link to a place outside of it.
+
+    Such a link would let a run that came from elsewhere read and overwrite files of other folders.
+    """
+    inside = folder.resolve()
+    for parent, subfolders, _ in os.walk(folder):
+        for path in (Path(parent, name) for name in subfolders):
+            if path.is_symlink() and not path.resolve().is_relative_to(inside):
+                raise InputError(f"{path} is a link to a folder outside of {folder}: replace the link by a folder")
+
+
 def _check_output(kind: str, endings: tuple[str, ...], path: Path) -> None:
     """Raise an InputError if the ending of a path is none of `endings`, or the file cannot be written."""
     if path.suffix.lower() not in endings:

@@ -12,7 +12,17 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives import io
 from guiderail.models.primitives.full_turns import without_jumps
 
+MAX_STEPS = 20_000  # largest number of control steps of a motion: 20 s at 1 kHz, 400 s at 50 Hz
 MAX_MAGNITUDE = 1e100  # largest absolute value; covariances, which are products of two outputs, must not overflow
+
+
+def num_periods(duration: float, period: float) -> int:
+    """Return the duration of a motion in periods, rounded; raise an InputError unless it is less than `MAX_STEPS`."""
+    if not duration / period < MAX_STEPS:
+        raise InputError(
+            f"a motion of {duration:.3g} s has {MAX_STEPS} or more periods of {period:.3g} s: give a longer period"
+        )
+    return round(duration / period)
 
 
 class Demonstrations:
@@ -127,14 +137,14 @@ class Demonstrations:
         Demonstrations that already have one uniform clock of N steps are returned unchanged.
 
         Args:
-            num_steps: Number of steps N, at least 2; the largest number of samples of a recording by default.
+            num_steps: Number of steps N, from 2 to `MAX_STEPS`; by default the largest number of samples.
 
         Raises:
-            InputError: If `num_steps` is less than 2 or not a whole number.
+            InputError: If `num_steps` is out of range or not a whole number.
         """
-        num_steps = max(len(t) for t in self.times) if num_steps is None else as_whole(num_steps, "num_steps")
-        if num_steps < 2:
-            raise InputError(f"a clock needs at least two steps, not {num_steps}")
+        if num_steps is not None and not 2 <= as_whole(num_steps, "num_steps") <= MAX_STEPS:
+            raise InputError(f"a clock has from 2 to {MAX_STEPS} steps, not {num_steps}")
+        num_steps = max(len(t) for t in self.times) if num_steps is None else int(num_steps)
         first = self.times[0]
         if len(first) == num_steps and all(np.array_equal(t, first) for t in self.times):
             steps = np.diff(first)

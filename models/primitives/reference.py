@@ -12,7 +12,7 @@ import numpy as np
 
 from guiderail.models.common.arrays import as_number, as_numbers, find_asymmetric
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.primitives.demonstrations import Demonstrations
+from guiderail.models.primitives.demonstrations import Demonstrations, num_periods
 from guiderail.models.primitives.kernels import Kernel, check_kernel
 from guiderail.models.primitives.mixture import fit_mixture, regress, thinned
 from guiderail.models.primitives.promp import ProMp
@@ -216,13 +216,13 @@ class ReferenceTrajectory:
         the last time. The number of steps is this duration divided by the period, rounded.
 
         Raises:
-            InputError: If an argument is not positive, or fewer than two steps remain.
+            InputError: If an argument is not positive, or fewer than two or more than `MAX_STEPS` steps remain.
         """
         if not (0.0 < period < np.inf and 0.0 < time_scale < np.inf):
             raise InputError(f"a period and a time scale must be positive, not {period} s and {time_scale}")
         step = (self.times[-1] - self.times[0]) / (self.num_steps - 1)
         duration = self.num_steps * step * time_scale
-        number = round(duration / period)
+        number = num_periods(duration, period)
         if number < 2:
             raise InputError(f"a motion of {duration:g} s has fewer than two steps of {period:g} s")
         clock = period * np.arange(number)

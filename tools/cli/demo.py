@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 
 from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
 from guiderail.models.policy import Policy
+from guiderail.tools.console import PrintableConsole
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
@@ -41,7 +41,7 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     check_seed(seed)
     _clear(out)
     started = time.perf_counter()
-    console = Console(soft_wrap=True, highlight=False)
+    console = PrintableConsole(soft_wrap=True, highlight=False)
     console.print(
         "A robot has nine demonstrations of the way through a narrow passage. Then an obstacle and a forbidden zone\n"
         "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."

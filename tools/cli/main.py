@@ -16,6 +16,7 @@ from guiderail.models.common.errors import InputError, RunsFailedError, brief, e
 from guiderail.models.common.plugins import SIBLINGS, MissingSiblingError, find_plugins
 from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app, print_message
+from guiderail.tools.terminal import protect_terminal
 
 COMMANDS = {
     "train": ("train", "demo"),
@@ -80,6 +81,7 @@ def main(arguments: list[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal may lack the characters of a table or a bar
+    protect_terminal()
     _show_messages()
     try:
         code = load_commands(*arguments[:1])(args=arguments, prog_name="guiderail", standalone_mode=False)

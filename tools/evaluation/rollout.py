@@ -177,10 +177,12 @@ class EpisodeProgress:
             asks: True if the program asks questions while the bar is shown. The bar is then redrawn only after
                 episodes, so that it covers no question.
         """
-        from rich.console import Console  # slow to import
+        # slow to import
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-        self._console = console or Console(stderr=True)
+        from guiderail.tools.console import PrintableConsole
+
+        self._console = console or PrintableConsole(stderr=True)
         self._episodes, self._name = episodes, name
         self._done, self._count, self._window = 0, 0, window
         self._recent: deque[tuple[float, float]] = deque(maxlen=window)

@@ -17,7 +17,7 @@ from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import Demonstrations, LinearConstraints
-from guiderail.models.primitives.demonstrations import DemonstratedBounds
+from guiderail.models.primitives.demonstrations import MAX_STEPS, DemonstratedBounds, num_periods
 from guiderail.models.primitives.full_turns import Orientation, continued_angles, continued_vectors
 from guiderail.models.primitives.poses import pose_rotation
 
@@ -142,6 +142,8 @@ class Segment:
         for what, value, least in (("num_steps", self.num_steps, MIN_STEPS), ("dwell", self.dwell, 0)):
             if value is not None and not is_whole(value, least):
                 raise InputError(f"{what} of a segment is a whole number of at least {least}, not {brief(value)}")
+        if self.num_steps is not None and self.num_steps > MAX_STEPS:
+            raise InputError(f"num_steps of a segment is at most {MAX_STEPS}, not {self.num_steps}")
         if not isinstance(self.demonstrations, Demonstrations | str | PathLike):
             raise InputError(
                 f"demonstrations of a segment are Demonstrations or their file, not {brief(self.demonstrations)}"
@@ -165,19 +167,20 @@ class Segment:
 
         Raises:
             InputError: If there is neither `num_steps` nor a positive, finite period [s], or the demonstrations are
-                shorter than four periods.
+                shorter than four periods or longer than `MAX_STEPS`.
         """
         if self.num_steps is not None:
             return int(self.num_steps)
         if not isinstance(period, Real) or not 0.0 < period < np.inf:
             raise InputError("give the period of the environment [s], or num_steps of every segment")
         duration = float(np.mean([t[-1] - t[0] for t in self.recorded.times]))
-        if round(duration / period) < MIN_PERIODS:
+        periods = num_periods(duration, float(period))
+        if periods < MIN_PERIODS:
             raise InputError(
                 f"demonstrations of {duration:.3g} s are shorter than {MIN_PERIODS} periods of {period:.3g} s: give as "
                 "period the duration of a step of the environment [s], or num_steps of the segment"
             )
-        return max(round(duration / period) + 1, MIN_STEPS)
+        return max(periods + 1, MIN_STEPS)
 
     def discrete_values(self, num_steps: int) -> list[Any] | None:
         """Return the most frequent discrete output of the demonstrations for each control step, or None.

@@ -22,7 +22,14 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.tools.environments import check_environment, task_content
 from guiderail.tools.evaluation.metrics import check_rows
-from guiderail.tools.files import LOCK, refuse_existing_run, remove_partial_files, write_atomically, write_error
+from guiderail.tools.files import (
+    LOCK,
+    refuse_existing_run,
+    refuse_links,
+    remove_partial_files,
+    write_atomically,
+    write_error,
+)
 from guiderail.tools.imports import import_stored
 from guiderail.tools.learning.config import MAX_EPISODES, config_values, make_config
 from guiderail.tools.learning.learner import LearnerConfig
@@ -132,8 +139,10 @@ class RunFolder:
         """Lock the run against other processes; the lock of a killed process has no effect.
 
         Raises:
-            InputError: If another process writes into the run, or the folder cannot be written.
+            InputError: If another process writes into the run, the folder cannot be written, or a folder in it is a
+                link to a place outside.
         """
+        refuse_links(self.path)
         lock = filelock.FileLock(self.path / LOCK, timeout=0)
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -201,10 +210,11 @@ class RunFolder:
         """Read the configuration of the run, and import the modules that register its task and learner.
 
         Raises:
-            InputError: If the folder is not a run, its configuration is invalid, or the configuration names code that
-                is not trusted (`trust_imports`).
+            InputError: If the folder is not a run, a folder in it is a link to a place outside, its configuration is
+                invalid, or the configuration names code that is not trusted (`trust_imports`).
         """
         file = self.path / "config.yaml"
+        refuse_links(self.path)
         try:
             is_run = file.is_file()
         except OSError as error:

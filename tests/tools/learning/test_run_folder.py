@@ -83,3 +83,26 @@ def test_table_of_episodes_refuses_text_for_numbers(old, new, tmp_path):
     (tmp_path / "episodes.csv").write_text(TABLE.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(InputError, match=r"episodes\.csv"):
         RunFolder(tmp_path).episodes()
+
+
+@pytest.mark.parametrize("name", ["baselines", "checkpoint", "steps", "logs", "baselines/zero"])
+def test_folder_with_a_link_to_another_place_is_refused(name, bead_config, tmp_path):
+    folder, outside = RunFolder(tmp_path / "run"), tmp_path / "outside"
+    folder.create(bead_config)
+    outside.mkdir()
+    link = folder.path / name
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(outside)
+    with pytest.raises(InputError, match="is a link to a folder outside"):
+        folder.config()
+    with pytest.raises(InputError, match="is a link to a folder outside"), folder.locked():
+        pass
+    assert not any(outside.iterdir())
+
+
+def test_folder_with_a_link_inside_of_it_is_read(bead_config, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    folder.create(bead_config)
+    (folder.path / "old").mkdir()
+    (folder.path / "steps").symlink_to(folder.path / "old")
+    assert folder.config() == bead_config

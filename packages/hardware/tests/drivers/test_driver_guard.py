@@ -222,6 +222,15 @@ def test_arm_is_damped_when_hold_raises():
     assert arm.speed < 0.05
 
 
+def test_arm_is_damped_when_hold_returns_false():
+    arm = MovingArm(HoldingDriver())
+    arm.driver.hold = lambda: False
+    change_statuses(arm.driver, lambda status: MALFORMED_STATUS)
+    arm.advance(DAMPING_STEPS)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.OFF)
+    assert arm.speed < 0.05
+
+
 def test_arm_is_not_damped_when_hold_succeeds():
     arm, holds = MovingArm(HoldingDriver()), []
     arm.driver.hold = partial(holds.append, True)

@@ -100,6 +100,40 @@ def test_statuses_of_a_second_robot_at_rest_conflict():
     assert sequence.num_conflicts >= 2
 
 
+@pytest.mark.parametrize("offset", [-1e4, -1.0, -MAX_DELAY - 2 * PERIOD, MAX_DELAY + 2 * PERIOD, 1.0, 1e4])
+@pytest.mark.parametrize("run", [1, 2, 7, 50])
+def test_alternating_clocks_of_two_robots_conflict(offset, run):
+    """Statuses of a second robot at rest arrive in groups of `run`, with a clock far from the first robot's."""
+    sequence = StatusSequence(PERIOD)
+    for step in range(4 * run):
+        is_second = step // run % 2
+        sequence.add(status(100.0 + step * PERIOD + is_second * offset, 0.0))
+    assert sequence.num_conflicts >= 1
+
+
+@pytest.mark.parametrize("offset", [-0.9, -0.6, -0.3, -2.2, 0.3])
+def test_moving_and_resting_robot_conflict_when_their_clocks_are_close(offset):
+    """Time stamps of the second robot may precede those of the first."""
+    sequence, speed = StatusSequence(PERIOD), 1.0
+    for step in range(8):
+        time = 1.0 + step * PERIOD
+        sequence.add(status(time, speed * time, velocity=speed))
+        sequence.add(status(time + offset * PERIOD, 0.0))
+    assert sequence.num_conflicts >= 1
+
+
+@pytest.mark.parametrize("jump", [-1e4, -1.0, 1.0, 1e4])
+def test_restarted_clock_of_one_robot_does_not_conflict(jump):
+    times = 1.0 + PERIOD * np.arange(60)
+    times[30:] += jump
+    assert status_conflicts(*(status(t, 0.0) for t in times)) == 0
+
+
+def test_lost_and_reordered_statuses_of_a_moving_robot_do_not_conflict():
+    order = [0, 1, 2, 3, 5, 4, 6, 8, 7, 9, 10, 30, 31, 32, 60, 61, 63, 62, 64]
+    assert status_conflicts(*(status(1.0 + n * PERIOD, 1.5 * n * PERIOD, velocity=1.5) for n in order)) == 0
+
+
 # Sequences of commands.
 
 

@@ -244,6 +244,27 @@ def test_velocity_is_unknown_after_the_prediction_time(share, is_known):
     assert rig.estimate.state.velocity.any() == is_known
 
 
+@pytest.mark.parametrize("jump", [0.05, 0.5, 2.0, 1e5])
+@pytest.mark.parametrize("torque", [None, np.zeros(2)])
+def test_velocity_is_known_after_a_jump_of_the_local_clock(jump, torque):
+    rig = Rig().settle()
+    assert rig.check(torque=torque, gap=PERIOD + jump) == Fault.DEADLINE_MISSED
+    for _ in range(30):
+        np.testing.assert_allclose(rig.estimate.state.velocity, rig.v, atol=1e-6)
+        assert rig.estimate.age <= LIMITS.max_age
+        assert rig.check(torque=torque) == Fault.DEADLINE_MISSED
+    assert rig.estimate.is_new
+
+
+@pytest.mark.parametrize("jump", [-2.0, -0.5, -0.05])
+def test_velocity_is_known_after_the_local_clock_is_set_back(jump):
+    rig = Rig().settle()
+    rig.check(gap=PERIOD + jump)
+    for _ in range(15):
+        assert np.abs(rig.estimate.state.velocity - rig.v).max() < 0.05
+        rig.check()
+
+
 @pytest.mark.parametrize("drift", [-9e-4, 9e-4])
 def test_clock_drift_is_no_fault(drift):
     rig = Rig().settle()

@@ -12,6 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from guiderail.tools.console import PrintableConsole
 from guiderail_studies.engines.engine import Outcome
 from guiderail_studies.job import count_attempts
 
@@ -35,7 +36,7 @@ class StudyProgress:
             call: Identifier of the attempts of this call in the logs, which other processes may write too.
             console: Console; standard error by default, so that results can be piped.
         """
-        self._console = console or Console(stderr=True)
+        self._console = console or PrintableConsole(stderr=True)
         self._call = call
         self._open = {key: (job, job.folder.path / "episodes.csv") for key, job in jobs.items()}
         self._total, self._num_ended, self._num_failed = total, 0, 0

@@ -94,8 +94,10 @@ class Driver(ABC):
     def write(self, torque: np.ndarray, time: float) -> None:
         """Send joint torques (n,) [Nm]; `time` is the time of the command [s]."""
 
-    def hold(self) -> None:
+    def hold(self) -> bool | None:
         """Brake the arm or hold its position, until torques are written again.
+
+        If the robot refuses, return False: the arm is then damped by torques instead.
 
         Raises:
             InputError: If the driver cannot hold the arm; see `can_hold`.

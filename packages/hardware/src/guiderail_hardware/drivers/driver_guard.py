@@ -40,6 +40,7 @@ class DriverGuard:
         self._has_failed_to_receive = self._has_failed_command = False
         self._is_failing = False  # the last command failed
         self._has_recovered = False  # a command succeeded after a failed one
+        self._answer: object = None  # result of the last command
 
     @property
     def error(self) -> str:
@@ -111,10 +112,10 @@ class DriverGuard:
         self._command("stop")
 
     def hold(self) -> bool:
-        """Hold the arm; return False if the driver raises an exception, so that torques are sent instead."""
+        """Hold the arm; return False if the driver returns False or raises an exception, so that torques are sent."""
         has_failed = self._has_failed_command, self._is_failing
         if self._command("hold"):
-            return True
+            return self._answer is not False
         self._has_failed_command, self._is_failing = has_failed  # only failed torques count
         return False
 
@@ -157,7 +158,7 @@ class DriverGuard:
 
     def _command(self, method: str, *arguments: object) -> bool:
         try:
-            getattr(self._driver, method)(*arguments)
+            self._answer = getattr(self._driver, method)(*arguments)
         except ERRORS as error:
             self.command_error, self._has_failed_command = _describe(method, error), True
             self.num_failed_commands += 1

@@ -15,6 +15,7 @@ from guiderail_hardware.models.joint_status import (
     JointStatus,
     LastStatus,
     StatusLimits,
+    check_content,
     check_status,
     parse_status,
 )
@@ -103,6 +104,11 @@ class EstimatorState:
         """Return the state as one vector, (12 + 20 n,)."""
         return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
 
+    def shifted(self, seconds: float) -> "EstimatorState":
+        """Return the state with all local times later, after a jump of the local clock [s]."""
+        names = ("check_time", "receipt_time", "fault_time", "doubt_time", "last_offset", "accepted_offset")
+        return replace(self, **{name: getattr(self, name) + seconds for name in names})
+
     @property
     def last(self) -> LastStatus:
         """Last readable status, valid or not."""
@@ -150,7 +156,8 @@ class StateEstimator:
 
     The clocks are synchronized with the first status. Afterwards the clock offset follows early statuses quickly and
     late statuses slowly. After a fault or a timeout the clocks are synchronized again. Delays of this program are not
-    attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`.
+    attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`, and so is a jump of the local
+    clock that the robot's clock does not show. After a jump the velocity remains known.
 
     Args:
         limits: Plausibility limits of a status.
@@ -190,11 +197,14 @@ class StateEstimator:
             The fault, the age of the accepted status and the estimate; `advance` completes the state.
         """
         status = parse_status(status)
+        jump = self._clock_jump(before, status, now)
+        if jump:
+            before = before.shifted(jump)
         state = self._predict(before, now, M, drag)
         is_doubted = np.isfinite(before.doubt_time)
         is_trusted = not is_doubted or (status is not None and self._agrees(status, state, now))
         last = before.accepted if is_doubted and is_trusted else before.last
-        fault = self._find_fault(before, last, status, now)
+        fault = self._find_fault(before, last, status, now) or (Fault.DEADLINE_MISSED if jump else Fault.NONE)
         if status is None or fault in DROPPED_FAULTS:
             return self._finish(state, before, fault, now)
         values = status.values()
@@ -266,6 +276,19 @@ class StateEstimator:
         bias is learned.
         """
         return replace(state, torque=self._zeros, tolerance=self._period * self._torque_tolerance)
+
+    def _clock_jump(self, before: EstimatorState, status: JointStatus | None, now: float) -> float:
+        """Return the time [s] by which the local clock has jumped ahead of the robot's since the last check, or 0.
+
+        A status that is newer than the last one shows how much time has passed. A difference of up to `max_age` is a
+        delay of messages and no jump.
+        """
+        if status is None or check_content(status, len(self._zeros)) or not np.isfinite(before.last_time):
+            return 0.0
+        passed = status.time - before.last_time
+        jump = now - before.receipt_time - passed
+        is_jump = 0.0 < passed <= self._limits.max_age and now - before.check_time > self._limits.max_check_interval
+        return float(jump) if is_jump and jump > self._limits.max_age else 0.0
 
     def _predict(self, before: EstimatorState, now: float, M: np.ndarray, drag: np.ndarray) -> EstimatorState:
         """Return the state with the effect of the torques since the last check."""

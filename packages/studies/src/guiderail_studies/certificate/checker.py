@@ -171,10 +171,10 @@ class Primitive:
         C, N = k[P:, P:] - V.T @ V, n - P
         F, left = self.factor(C)
         self.W, self.F = extended(solve(chol[::-1, ::-1].T, V[::-1])[::-1].T), extended(F)
-        # Bound on ‖C − F Fᵀ‖ / ħ, also for the F of the primitive: it drops pivots up to 10 N ε and rounds to doubles.
-        dropped = left + N * (rounding + 10 * N * EXTENDED + 4 * EPS * float(max(C.diagonal())))
-        self.dropped, scale = float(dropped / self.hbar), 1 / np.sqrt(variances)
-        require(self.dropped * np.einsum("noo->n", self.precisions).max() <= 0.5, "λ + β is too small")
+        self.dropped, scale = float((left + N * rounding) / self.hbar), 1 / np.sqrt(variances)  # ≥ ‖C − F Fᵀ‖ / ħ
+        # The same for the executed primitive, which drops pivots of 10 N ε and rounds F to double precision.
+        executed = self.dropped + N * (10 * N * EXTENDED + 4 * EPS * float(max(C.diagonal()))) / self.hbar
+        require(executed * np.einsum("noo->n", self.precisions).max() <= 1e-5, "λ + β is too small")
         conditions = np.linalg.cond(self.covariances * scale[:, :, None] * scale[:, None])
         require((conditions <= 1e12).all(), "a covariance is too badly conditioned")
         self.covariance_error = 4 * self.outputs * (3 * self.outputs + 1) * EXTENDED * conditions
