@@ -603,8 +603,10 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     shutil.copytree(folder, other)
     text = (other / "task.yaml").read_text()
     (other / "task.yaml").write_text(text.replace("name: parts/peg", "name: parts/other", 1))
-    options = "--set", "net_arch=8", "--set", "gradient_steps=1", "--no-pictures", "--out", tmp_path / "run"
-    call("train", folder, other, "--episodes", 2, *options, "--json")
+    options = "--set", "net_arch=8", "--set", "gradient_steps=1", "--set", "demonstration_episodes=1"
+    options = *options, "--no-pictures", "--out", tmp_path / "run"
+    call("train", folder, other, "--episodes", 2, "--evaluate", 1, *options, "--json")
+    assert json.loads(capsys.readouterr().out.splitlines()[-1])["held_out_episodes"] == 2
     run = RunFolder(tmp_path / "run")
     assert sorted(run.episodes()["environment"]) == ["parts/other", "parts/peg"]
     assert len({member.task_content for member in run.config().members}) == 2
