@@ -39,7 +39,8 @@ FRICTION = 0.2  # friction coefficient of metal on metal
 # step, and the next step ejects it. A discrete plant extrapolates the pressure along the normals of the plug's
 # surfaces, so a margin is harmless only if the plug cannot slide past a surface within it: a chamfer inside the margin
 # stops a plug that slides over the rim, with a force that depends on the time step. So the chamfer touches a barrel of
-# its own, `barrel_edge`, without a margin. The margin of `barrel`, which face and bore touch, is at most the chamfer's height.
+# its own, `barrel_edge`, without a margin. The margin of `barrel`, which face and bore touch, is at most the chamfer's
+# height.
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
 # than with metal parts (docs/experiments.md, "Center of pressure on the rim").
