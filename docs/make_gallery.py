@@ -229,7 +229,7 @@ def make_readme_picture(folder: Path) -> dict[str, str]:
     (folder / "readme.jpg").write_bytes(picture.read_bytes())
     picture.unlink()
     panel = Panel(
-        "iiwa after 60 episodes, a connector off by a hidden offset",
+        "an iiwa after 60 episodes",
         "BncConnector",
         ON_ARM | {"reward": "aligned"},
         _learned_on_arm,

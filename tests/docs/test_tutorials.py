@@ -37,6 +37,19 @@ def test_tutorial_is_short_and_in_the_contents(page):
     assert f"tutorials/{page.stem}\n" in (DOCS / "index.md").read_text(encoding="utf-8")
 
 
+def test_snippets_of_the_readme_run(forks, tmp_path):
+    text = (ROOT / "README.md").read_text("utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    assert len(blocks) == 2
+    assert all(len(block.split("\n\n")[-1].splitlines()) <= 10 for block in blocks)
+    (tmp_path / "snippets.py").write_text("\n".join(blocks))
+    finished = forks.run(tmp_path / "snippets.py", folder=tmp_path, OMP_NUM_THREADS="1")
+    assert finished.returncode == 0, finished.stderr
+    assert round(float(finished.stdout), 6) == 1.3
+    assert {path.name for path in tmp_path.glob("*.stl")} == {"plug.stl", "socket.stl"}
+    assert len(text.split()) <= 900
+
+
 def test_concept_pages_are_notebooks():
     assert {page.stem for page in NOTEBOOKS} >= {"start", "templates", "primitives", "kgrl", "exploration", "safety"}
 
