@@ -195,4 +195,3 @@ def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     probe = probe_contact(made, "gantry" if condition.engine == "drake" else "mujoco", **step)
     values = (*probe.drags, 1e3 * probe.lever, 1e3 * probe.capture, probe.cost)
     return dict(zip(names, (float(value) for value in values), strict=True))
-
