@@ -36,10 +36,11 @@ BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 
 
 FRICTION = 0.2  # friction coefficient of metal on metal
 # Distance at which contact with the jack begins [m]. Without a margin the plug moves into the jack for a whole time
-# step, and the next step ejects it. A discrete plant extrapolates the pressure along the normals of the plug's surfaces,
-# so a margin is harmless only if the plug cannot slide past a surface within it: a chamfer inside the margin stops a
-# plug that slides over the rim, with a force that depends on the time step. So the chamfer touches a barrel of its own,
-# `barrel_edge`, without a margin. The margin of `barrel`, which face and bore touch, is at most the chamfer's height.
+# step, and the next step ejects it. A discrete plant extrapolates the pressure along the normals of the plug's
+# surfaces, so a margin is harmless only if the plug cannot slide past a surface within it: a chamfer inside the margin
+# stops a plug that slides over the rim, with a force that depends on the time step. So the chamfer touches a barrel of
+# its own, `barrel_edge`, without a margin. The margin of `barrel`, which face and bore touch, is at most the chamfer's
+# height.
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
 # than with metal parts (docs/experiments.md, "Center of pressure on the rim").

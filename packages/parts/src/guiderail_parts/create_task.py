@@ -326,10 +326,10 @@ def _measure(
     log: Callable[[str], None],
 ) -> tuple[dict[str, Any], SearchNumbers]:
     """Return the measurements of the chosen contact, and the numbers that the scripted search uses."""
-    from guiderail_parts.task_file import SearchNumbers
     from guiderail.diagrams.stations.station import PLANT_PERIOD
     from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, SPEEDS, drag
     from guiderail_parts.task import rim_contact, write_workcell
+    from guiderail_parts.task_file import SearchNumbers
     from guiderail_parts.trial import insert, measure_lever_sign
 
     inserted_s, contact, aligned = _seconds_since(start), choice.contact, choice.aligned
@@ -357,9 +357,9 @@ def _measure(
     if not abs(ratio / contact_on_rim.friction - 1.0) <= MAX_DRAG_ERROR:  # also if the plug does not touch
         step = 1e3 * (file.time_step or PLANT_PERIOD)
         log(
-            f"on the rim, drag / normal force is {ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s and {step:g} ms a step, and the "
-            f"friction {contact_on_rim.friction:g}: the contact has not converged, or edges of the socket's mouth hold back "
-            "a sliding plug; check policies at shorter steps and in another engine (guiderail converge)"
+            f"on the rim, drag / normal force is {ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s and {step:g} ms a step, and "
+            f"the friction {contact_on_rim.friction:g}: the contact has not converged, or edges of the socket's mouth "
+            "hold back a sliding plug; check policies at shorter steps and in another engine (guiderail converge)"
         )
     measured = {
         **prepared,
