@@ -8,8 +8,8 @@ minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked
 Contact. The ring has three open rigid surfaces: the mouth's face with the bore, and the mouth's chamfer, which collide
 only with the barrel, and a pair of slots that collide only with the lugs. These surfaces have a third of the triangles
 of a closed ring, and their contact is computed five times faster. The chamfer's edge at the face is a lip, a shallow
-cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket,
-which pushes the lugs into their detents.
+cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant primitives. A soft
+pad on the barrel models the gasket, which pushes the lugs into their detents.
 
 `python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
 """
