@@ -60,10 +60,10 @@ class MovableWorkcell(ABC):
     # Pairs without contact: names of surfaces of the fixture, then of the workpiece. (`drake:collision_filter_group` in
     # an SDF file filters whole bodies only.)
     filtered_pairs: ClassVar[Sequence[tuple[Iterable[str], Iterable[str]]]] = ()
-    # Drake's approximation of the contact. "lagged" bounds the friction by the last step's normal force. It is zero at
-    # the new contact points of a tilted workpiece that slides along a rim: the drag is too small. "similar" bounds it
-    # by the present force, but lifts a sliding contact by friction × speed × time step: by 40 µm at 20 mm/s and
-    # 10 ms. `guiderail.diagrams.tasks.contact_probe` measures the drag.
+    # Drake's approximation of the contact. "lagged" bounds the friction by the last step's normal force. That is zero
+    # at the new contact points of a tilted workpiece that slides along a rim, so that the drag is too small. "similar"
+    # bounds it by the present force, but lifts a sliding contact by friction × speed × time step: by 40 µm at
+    # 20 mm/s and 10 ms. `guiderail.diagrams.tasks.contact_probe` measures the drag.
     contact_approximation: ClassVar[str] = "lagged"
 
     @property

@@ -5,10 +5,11 @@ end, and x through the lugs. The origin of the plug frame P is the center of the
 to the cable, and x through the entries of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by
 minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
-Contact. The ring has two open rigid surfaces: a bore that collides only with the barrel, and a pair of slots that
-collide only with the lugs. These surfaces have a third of the triangles of a closed ring, and their contact is computed
-five times faster. The jack's barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket,
-which pushes the lugs into their detents.
+Contact. The ring has three open rigid surfaces: the mouth's face with the bore, and the mouth's chamfer, which collide
+only with the barrel, and a pair of slots that collide only with the lugs. These surfaces have a third of the triangles
+of a closed ring, and their contact is computed five times faster. The chamfer's edge at the face is a lip, a shallow
+cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant primitives. A soft
+pad on the barrel models the gasket, which pushes the lugs into their detents.
 
 `python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
 """

@@ -361,9 +361,9 @@ def _measure(
     if not abs(ratio / contact_on_rim.friction - 1.0) <= MAX_DRAG_ERROR:  # also if the plug does not touch
         step = 1e3 * (file.time_step or PLANT_PERIOD)
         log(
-            f"the contact has not converged at a time step of {step:g} ms: on the rim, drag / normal force is "
-            f"{ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s, and the friction {contact_on_rim.friction:g}; check a policy at "
-            "shorter steps (guiderail converge)"
+            f"on the rim, drag / normal force is {ratio:.2f} at {1e3 * SPEEDS[0]:g} mm/s and {step:g} ms a step, and "
+            f"the friction {contact_on_rim.friction:g}: the contact has not converged, or edges of the socket's mouth "
+            "hold back a sliding plug; check policies at shorter steps and in another engine (guiderail converge)"
         )
     measured = {
         **prepared,
