@@ -574,11 +574,8 @@ def test_slow_drift_of_a_position_is_detected(rate, is_fault, joint):
     drifted, limit = 0.0, module.MAX_DRIFT * LIMITS.position_tolerance
     for _ in range(round(4.0 / PERIOD)):
         drifted += rate * PERIOD
-
-        def drift(status, shift=drifted * np.eye(2)[joint]):
-            return replace(status, positions=status.positions + shift)
-
-        if fault := rig.check(drift):
+        shift = drifted * np.eye(2)[joint]
+        if fault := rig.check(lambda status, shift=shift: replace(status, positions=status.positions + shift)):
             break
     assert (fault == Fault.INCONSISTENT) == is_fault
     assert not is_fault or abs(drifted) < 2.5 * limit
