@@ -566,6 +566,29 @@ def test_position_is_checked_at_its_tolerance(size, is_fault, joint, sign):
     np.testing.assert_allclose(rig.estimate.state.residual, step, atol=1e-9)
 
 
+@pytest.mark.parametrize("joint", [0, 1])
+@pytest.mark.parametrize(("rate", "is_fault"), [(0.009, True), (-0.009, True), (0.004, True), (0.002, False)])
+def test_slow_drift_of_a_position_is_detected(rate, is_fault, joint):
+    """The positions drift for four seconds, and the velocities are true."""
+    rig = Rig().settle()
+    drifted, limit = 0.0, module.MAX_DRIFT * LIMITS.position_tolerance
+    for _ in range(round(4.0 / PERIOD)):
+        drifted += rate * PERIOD
+        shift = drifted * np.eye(2)[joint]
+        if fault := rig.check(lambda status, shift=shift: replace(status, positions=status.positions + shift)):
+            break
+    assert (fault == Fault.INCONSISTENT) == is_fault
+    assert not is_fault or abs(drifted) < 2.5 * limit
+
+
+def test_noise_is_no_drift():
+    rng, rig = np.random.default_rng(0), Rig().settle()
+    for _ in range(round(20.0 / PERIOD)):
+        noise = rng.normal(size=(2, 2)) * [[2e-5], [3e-3]]
+        rig.check(lambda s, e=noise: replace(s, positions=s.positions + e[0], velocities=s.velocities + e[1]))
+        assert rig.estimate.fault == Fault.NONE
+
+
 def test_residual_decays():
     rig = Rig().settle()
     rig.check(shifted(positions=[5e-4, 0.0]))
@@ -573,11 +596,13 @@ def test_residual_decays():
     assert rig.estimate.state.residual[0] == pytest.approx(5e-4 * np.exp(-PERIOD / 0.1), rel=1e-4)
 
 
-@pytest.mark.parametrize(("bias", "is_fault"), [(0.0095, False), (0.0125, True)])
-def test_velocity_bias_is_detected_above_its_tolerance(bias, is_fault):
-    """A bias of 0.01 rad/s adds up to 1e-3 rad, the position tolerance, over the window of 0.1 s."""
+@pytest.mark.parametrize(("bias", "limit", "is_fault"), [
+    (0.0095, 0.3, False), (0.0125, 0.4, True), (0.0095, 2.0, True), (0.0022, 10.0, False), (0.0028, 10.0, True),
+])  # fmt: skip
+def test_velocity_bias_is_detected_above_its_tolerance(bias, limit, is_fault):
+    """Biases of 0.01 and 0.0025 rad/s add up to 1 and 5 mrad, the tolerances, over the windows of 0.1 and 2 s."""
     rig = Rig().settle()
-    result = rig.detected(shifted(velocities=[0.0, bias]), 400)
+    result = rig.detected(shifted(velocities=[0.0, bias]), round(limit / PERIOD))
     assert (result is not None) == is_fault
 
 
@@ -980,7 +1005,7 @@ def test_state_is_restored_from_its_vector():
     np.testing.assert_array_equal(restored.vector(), rig.state.vector())
     np.testing.assert_array_equal(restored.bias, rig.state.bias)
     assert (restored.doubt_time, restored.last_time) == (rig.state.doubt_time, rig.state.last_time)
-    assert EstimatorState.initial(3).vector().shape == (12 + 20 * 3,)
+    assert EstimatorState.initial(3).vector().shape == (12 + 21 * 3,)
 
 
 def test_torque_that_is_not_finite_counts_as_zero():
@@ -1023,7 +1048,7 @@ def test_commanded_impulse_is_not_learned_when_the_command_ends():
 
 def test_initial_state_is_zero_without_statuses():
     state = EstimatorState.initial(2)
-    expected = np.zeros(12 + 20 * 2)
+    expected = np.zeros(12 + 21 * 2)
     expected[2] = Fault.NO_STATUS
     expected[[4, 8, 10]] = np.nan
     np.testing.assert_array_equal(state.vector(), expected)
@@ -1064,7 +1089,7 @@ def recorded(seed):
         rig.external = EXTERNAL * rng.uniform(0.8, 1.2, 2)
         rig.check(lambda _, rig=rig: random_status(rng, rig), torque, gap)
         size = 12 + 20 * 2
-        values = np.nan_to_num(rig.state.vector(), nan=-1.0) * np.cos(np.arange(size))
+        values = np.nan_to_num(rig.state.vector()[:size], nan=-1.0) * np.cos(np.arange(size))
         finite_age = min(rig.estimate.age, 10.0)
         sums.append(values.sum() + rig.estimate.fault + 2.0 * rig.estimate.is_new + 3.0 * finite_age)
     return np.reshape(sums, (10, 30)).sum(axis=1)

@@ -35,6 +35,8 @@ EARLY_FRACTION = 0.2
 EARLY_WINDOW = 0.5  # decay time of the sum of offset corrections for early statuses [s]
 MAX_EARLY = 1.0 / 3.0  # sum of these corrections above which the robot's clock is too fast, relative to `max_lead`
 POSITION_WINDOW = 0.1  # decay time of the difference between positions and integrated velocities [s]
+# The same over seconds, for a position that drifts slowly, and the largest difference in position tolerances
+DRIFT_WINDOW, MAX_DRIFT = 2.0, 5.0
 REACTION_WINDOW = 0.02  # time in which the external torque must explain a change of velocity [s]
 MOMENTUM_WINDOW = 0.1  # decay time of the difference between momentum and integrated torques [s]
 MIN_MOTION, MIN_SPEED = 1e-4, 0.02  # motion [rad] and speed [rad/s] above which a joint's values must change
@@ -87,21 +89,22 @@ class EstimatorState:
     # Largest difference of `predicted` and `measured` that errors of the torques explain, (n,) [Nms].
     tolerance: np.ndarray
     bias: np.ndarray  # learned constant error of the torques, (n,) [Nm]
+    drift: np.ndarray  # like `residual`, with the decay time `DRIFT_WINDOW`, (n,) [rad]
 
     @classmethod
     def initial(cls, num_joints: int) -> "EstimatorState":
         """Return the state before the first check."""
         scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
-        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((14, num_joints)))
+        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((15, num_joints)))
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
         """Return the state from the result of `vector`."""
         values, vectors = np.split(vector[12:], [6 * num_joints])
-        return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(14, -1))
+        return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(15, -1))
 
     def vector(self) -> np.ndarray:
-        """Return the state as one vector, (12 + 20 n,)."""
+        """Return the state as one vector, (12 + 21 n,)."""
         return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
 
     def shifted(self, seconds: float) -> "EstimatorState":
@@ -140,7 +143,8 @@ class StateEstimator:
       positions or velocities of the joint. While one joint moves, no other joint repeats all of position, velocity and
       external torque.
     - *Position against velocity*: |Δq − h (v₋ + v) / 2| ≤ h |v − v₋| for two statuses with the velocities v₋ and v and
-      the time h between them. The sum of deviations, with a decay, is within the position tolerance.
+      the time h between them. The sum of deviations, with a decay, is within the position tolerance, and with a slower
+      decay within `MAX_DRIFT` of these tolerances.
     - *Velocity against torque*: with p = Σ h (τ + τ_external − C v) and m = Σ M Δv, both with a decay, and the time h
       between two checks,
       |M⁻¹ (p − m)| ≤ Δv_noise + |M⁻¹| Σ h (tolerance and relative errors of the torques) + min(1.5 Σ |Δv|, Δv_max).
@@ -346,10 +350,11 @@ class StateEstimator:
         moved = (np.abs(change[self._positions]) - 2.0 * RESOLUTION) / elapsed
         equal_velocities = is_equal[self._velocities] & (np.maximum(speed, moved) > MIN_SPEED)
         equal_values = is_equal.reshape(3, -1).all(axis=0) & (speed.max() > MIN_SPEED)
-        decay = np.exp(-elapsed / POSITION_WINDOW)
+        deviation = self._deviation(values, change, elapsed)
         return replace(
             state,
-            residual=decay * state.residual + self._deviation(values, change, elapsed),
+            residual=np.exp(-elapsed / POSITION_WINDOW) * state.residual + deviation,
+            drift=np.exp(-elapsed / DRIFT_WINDOW) * state.drift + deviation,
             equal_positions=np.where(equal_positions, state.equal_positions + 1.0, 0.0),
             equal_velocities=np.where(equal_velocities, state.equal_velocities + 1.0, 0.0),
             equal_values=np.where(equal_values, state.equal_values + 1.0, 0.0),
@@ -358,7 +363,7 @@ class StateEstimator:
     def _restart(self, state: EstimatorState) -> EstimatorState:
         """Return the state with the comparisons of consecutive statuses reset."""
         zero = self._zeros
-        return replace(state, residual=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
+        return replace(state, residual=zero, drift=zero, equal_positions=zero, equal_velocities=zero, equal_values=zero)
 
     def _update_momentum(
         self, state: EstimatorState, M: np.ndarray, change: np.ndarray, elapsed: float
@@ -404,7 +409,8 @@ class StateEstimator:
         )
         if any((count >= limit).any() for count, limit in counts):
             return Fault.FROZEN
-        if (np.abs(state.residual) > self._limits.position_tolerance).any():
+        tolerance = self._limits.position_tolerance
+        if (np.abs(state.residual) > tolerance).any() or (np.abs(state.drift) > MAX_DRIFT * tolerance).any():
             return Fault.INCONSISTENT
         inverse, limits = np.linalg.inv(M), self._limits
         deviation = np.abs(inverse @ (state.predicted - state.measured))
