@@ -42,32 +42,41 @@ class RateLimiter {
   std::array<double, 6> last_{};
 };
 
-// Holds the last valid command when commands stop. A command is valid while it is finite, its age is at most the timeout,
-// and it is at most one period in the future.
+// Holds the last valid command when commands stop. A command is valid while it is finite, its age at the last check is at
+// most the timeout, and it is at most one period in the future.
 class Watchdog {
  public:
   Watchdog(double period, double timeout, int size) : min_age_(-(period + 1e-6)), timeout_(timeout), last_(size) {}
 
-  void start(const double* pose) { std::copy_n(pose, last_.size(), last_.begin()); }
-
-  // Computes the pose to follow at a time [s] for a command (O,) with its time stamp [s].
-  const double* step(double time, const double* command, double stamp, const double* pose, bool is_controlled = true) {
-    const int n = static_cast<int>(last_.size());
-    is_valid_ = time - stamp <= timeout_ && time - stamp >= min_age_;
-    for (int i = 0; i < n; ++i) is_valid_ = is_valid_ && std::abs(command[i]) <= 1e6;
-    if (!is_controlled) {
-      if (is_finite(pose, n)) std::copy_n(pose, n, last_.begin());
-      return is_valid_ ? command : last_.data();
-    }
-    if (is_valid_) std::copy_n(command, n, last_.begin());
-    return last_.data();
+  void start(double time, const double* pose) {
+    std::copy_n(pose, last_.size(), last_.begin());
+    check_time_ = time;
   }
 
-  bool has_timed_out() const { return !is_valid_; }
+  // Checks a command (O,) with its time stamp [s] at a time [s], once per period; returns the pose to follow.
+  const double* step(double time, const double* command, double stamp, const double* pose, bool is_controlled = true) {
+    const int n = static_cast<int>(last_.size());
+    if (!is_controlled) {
+      if (is_finite(pose, n)) std::copy_n(pose, n, last_.begin());
+    } else if (is_valid(time, command, stamp)) {
+      std::copy_n(command, n, last_.begin());  // followed until now, even if it becomes stale now
+    }
+    check_time_ = time;
+    has_timed_out_ = !is_valid(time, command, stamp);
+    return has_timed_out_ ? last_.data() : command;
+  }
+
+  bool has_timed_out() const { return has_timed_out_; }
 
  private:
-  double min_age_, timeout_;
-  bool is_valid_ = false;
+  bool is_valid(double time, const double* command, double stamp) const {
+    for (std::size_t i = 0; i < last_.size(); ++i)
+      if (!(std::abs(command[i]) <= 1e6)) return false;
+    return check_time_ - stamp <= timeout_ && time - stamp >= min_age_;
+  }
+
+  double min_age_, timeout_, check_time_ = 0;
+  bool has_timed_out_ = true;
   std::vector<double> last_;
 };
 

@@ -163,7 +163,7 @@ class PhaseWrenchLimit {
         for (int i = 0; i < n; ++i) target[j] = std::min(target[j], limits_[8 * i + j]);
     }
     if (!is_started_) bound_ = target;
-    for (int j = 0; j < 8; ++j) output_[j] = max_wrench ? std::min(bound_[j], max_wrench[j]) : bound_[j];
+    for (int j = 0; j < 8; ++j) output_[j] = !max_wrench || bound_[j] <= max_wrench[j] ? bound_[j] : max_wrench[j];
     is_started_ = true;
     approach(target);
     return output_.data();

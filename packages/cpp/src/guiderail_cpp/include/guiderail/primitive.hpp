@@ -148,6 +148,9 @@ class Primitive {
     return {output_.data(), std::max(constraints_.violation(output_.data(), step_), kUnconstrained), !is_solved};
   }
 
+  // Undoes the first step of an episode.
+  void rewind() { is_started_ = false; }
+
   // True if a constraint of the last step's window was active.
   bool is_constrained() const { return is_constrained_; }
   int iterations() const { return is_constrained_ ? solver_.iterations() : 0; }

@@ -180,13 +180,7 @@ class Template {
     std::array<double, kMaxInputs> u{};
     for (int i = 0; i < inputs_; ++i) u[i] = std::min(std::max(inputs[i], -1.0), 1.0);
     Transform total;
-    bool is_first = true;
-    for (const Mapping& mapping : states_[state].mappings) {
-      const Transform part = displacement(mapping, u, X, period);
-      total = displace(total, part);
-      is_first = false;
-    }
-    (void)is_first;
+    for (const Mapping& mapping : states_[state].mappings) total = displace(total, displacement(mapping, u, X, period));
     return displace(X, total);
   }
 
@@ -554,6 +548,9 @@ class TemplateGuidance {
   int actions() const { return mapping_.inputs(); }
   int state() const { return state_; }
   double transition_distance() const { return template_.distance_to_go(state_, pose_to_transform(output_.data())); }
+
+  // Undoes the first step of an episode.
+  void rewind() { is_started_ = false; }
 
   // Moves the frame of an object, by its number in skill.json, to a pose (6,).
   void set_frame(int index, const double* pose) {
