@@ -9,8 +9,8 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.registry import build_guidance
-from guiderail.models.common.transforms import RigidTransform, transform_to_pose
 from guiderail.models.policy import Policy
+from guiderail.tools.environments import make_environment
 from guiderail.tools.export import TrainedSkill
 from guiderail_cpp.arrays import Arrays
 
@@ -33,7 +33,7 @@ def record_skill(
         episodes: Number of episodes.
         seed: Seed of the random numbers.
     """
-    rng, rows = np.random.default_rng(seed), []
+    rng, rows, start = np.random.default_rng(seed), [], _start(skill)
     period, size = skill.prior.period, skill.prior.pose_size
     entries = skill.description["observation"]
     for _ in range(episodes):
@@ -42,14 +42,13 @@ def record_skill(
         context = simulator.get_mutable_context()
         ports = {name: guidance.GetInputPort(name) for name in ("action", "pose", "wrench")}
         values = {name: np.zeros(port.size()) for name, port in ports.items()}
-        values["pose"] = _start(skill, size) + START_SPREAD * rng.normal(size=size)
+        values["pose"] = start + START_SPREAD * rng.normal(size=size)
         for name, port in ports.items():
             port.FixValue(context, values[name])
         simulator.Initialize()
         command = guidance.GetOutputPort("desired_pose").Eval(context)
-        start = values["pose"]
         for step in range(skill.task.num_steps):
-            pose = start if step == 0 else command + TRACKING_SPREAD * rng.normal(size=size)
+            pose = values["pose"] if step == 0 else command + TRACKING_SPREAD * rng.normal(size=size)
             raw = _random_signals(entries, signals, rng)
             if step % skill.config.action_repeat == 0:
                 own = {"time": [step * period], "pose": pose, "desired_pose": command}
@@ -70,16 +69,18 @@ def record_skill(
     return {f"replay/{name}": np.array(column, dtype=float) for name, column in zip(names, zip(*rows), strict=True)}
 
 
-def _start(skill: TrainedSkill, size: int) -> np.ndarray:
-    """Return a pose at which episodes begin, near the demonstrations or the objects of the template."""
+def _start(skill: TrainedSkill) -> np.ndarray:
+    """Return a pose at which episodes begin."""
     if skill.prior.primitive is not None:
         return skill.prior.primitive.reference.means[0]
-    placed = skill.prior.template
-    assert placed is not None
-    frames, template = placed.frames, placed.template
-    p_WF = next((X_WF.translation() for X_WF in frames.values()), np.zeros(3))
-    X_WE = RigidTransform(p_WF + [0.0, 0.0, 0.05])
-    return transform_to_pose(template.project(template.initial_state, X_WE, frames))
+    # The poses of a task's robot and objects depend on the task: its environment knows them.
+    env = make_environment(skill.config.task, skill.config.environment)
+    try:
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape or 1))
+        return np.array(env.unwrapped.trace.measured[0])  # type: ignore[attr-defined]
+    finally:
+        env.close()
 
 
 def _random_signals(entries: list, signals: Mapping[str, int], rng: np.random.Generator) -> dict[str, np.ndarray]:
