@@ -19,6 +19,7 @@ from guiderail.diagrams.stations.impedance_control import (
     WRENCH_RATE,
     make_phase_wrench_limit,
 )
+from guiderail.diagrams.tasks.insertion import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
@@ -83,6 +84,7 @@ def skill_arrays(skill: TrainedSkill) -> tuple[Arrays, dict[str, str], dict[str,
     arrays = {
         "period": np.array([prior.period]),
         "duration": np.array([prior.period * skill.task.num_steps]),
+        "observation/min_force": np.array([MIN_CONTACT_FORCE]),
         "action_repeat": np.array([float(skill.config.action_repeat)]),
     }
     arrays |= _guidance_arrays(guidance, prior) | _force_arrays(skill) | policy_arrays(skill.policy)

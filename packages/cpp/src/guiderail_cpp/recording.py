@@ -9,6 +9,9 @@ import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.registry import build_guidance
+from guiderail.diagrams.tasks.insertion import MIN_CONTACT_FORCE
+from guiderail.models.common.transforms import WRENCH_SIZE
+from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.export import TrainedSkill
@@ -52,6 +55,8 @@ def record_skill(
             raw = _random_signals(entries, signals, rng)
             if step % skill.config.action_repeat == 0:
                 own = {"time": [step * period], "pose": pose, "desired_pose": command}
+                if signals.get("wrench") == WRENCH_SIZE:
+                    own["center_of_pressure"] = center_of_pressure(raw["wrench"], MIN_CONTACT_FORCE)
                 own["phase"] = [-1.0 + 2.0 * step / skill.task.num_steps]
                 for name in ("state", "transition_distance"):
                     if guidance.HasOutputPort(name):

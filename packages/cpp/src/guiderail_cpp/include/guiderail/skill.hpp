@@ -34,6 +34,9 @@ class Skill {
     desired_.resize(static_cast<std::size_t>(outputs()));
     time_ = observation_.signal("time"), phase_ = observation_.signal("phase");
     pose_ = observation_.signal("pose"), desired_pose_ = observation_.signal("desired_pose");
+    wrench_ = observation_.size("wrench") == 6 ? observation_.signal("wrench") : nullptr;
+    pressure_ = observation_.signal("center_of_pressure"), min_force_ = data.number("observation/min_force");
+    if (pressure_ && observation_.size("center_of_pressure") != 2) throw std::runtime_error("a center of pressure is two numbers");
     state_ = observation_.signal("state"), distance_ = observation_.signal("transition_distance");
     const int actions = primitive_ ? primitive_->actions() : template_->actions();
     if (actions != policy_.outputs()) throw std::runtime_error("the policy's action does not fit the guidance");
@@ -44,13 +47,15 @@ class Skill {
   int outputs() const { return primitive_ ? primitive_->outputs() : template_->outputs(); }
   int actions() const { return policy_.outputs(); }
   const double* action() const { return held_.data(); }  // action of the present control step
+  const double* desired() const { return desired_.data(); }  // last command (O,)
   int state() const { return template_ ? template_->state() : 0; }
   bool is_over() const { return steps_ * period_ >= duration_; }
   const std::optional<Governor>& governor() const { return governor_; }
   const std::vector<std::string>& signals() const { return observation_.names(); }
 
   // Place of a signal that the policy observes, to be written before each step; nullptr if it does not observe it. The
-  // signals time, phase, pose, desired_pose, state and transition_distance are written by the skill itself.
+  // signals time, phase, pose, desired_pose, state and transition_distance, and center_of_pressure if the whole wrench is
+  // observed, are written by the skill itself.
   double* signal(const std::string& name) { return observation_.signal(name); }
   int signal_size(const std::string& name) const { return observation_.size(name); }
 
@@ -83,6 +88,11 @@ class Skill {
       if (phase_) *phase_ = -1.0 + 2.0 * std::min(time / duration_, 1.0);
       if (pose_) std::copy_n(pose, observation_.size("pose"), pose_);
       if (desired_pose_) std::copy_n(desired_.begin(), observation_.size("desired_pose"), desired_pose_);
+      if (pressure_ && wrench_) {
+        const bool is_reliable = wrench_[2] >= min_force_;
+        pressure_[0] = is_reliable ? -wrench_[4] / wrench_[2] : 0.0;
+        pressure_[1] = is_reliable ? wrench_[3] / wrench_[2] : 0.0;
+      }
       if (state_ && template_) *state_ = template_->state();
       if (distance_ && template_) *distance_ = template_->transition_distance();
       const double* action = policy_(observation_.values());
@@ -115,7 +125,8 @@ class Skill {
   std::optional<Governor> governor_;
   std::optional<PhaseWrenchLimit> phase_limit_;
   std::vector<double> held_, desired_;
-  double *time_, *phase_, *pose_, *desired_pose_, *state_, *distance_;
+  double *time_, *phase_, *pose_, *desired_pose_, *state_, *distance_, *wrench_, *pressure_;
+  double min_force_;
   long steps_ = 0;
 };
 
