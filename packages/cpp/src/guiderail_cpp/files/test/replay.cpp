@@ -74,10 +74,13 @@ class Replay {
     for (std::size_t t = 0; t < steps; ++t) times[t] = step(t);
     const long counted = allocations_;
     std::sort(times.begin(), times.end());
-    std::printf("%zu steps, largest difference %.3g, %ld allocations, p50 %.2f us, p99.9 %.2f us, max %.2f us\n", steps, worst_, counted,
+    std::printf("%zu steps, %.0f %% with an active constraint, largest difference %.3g, %ld allocations, p50 %.2f us, p99.9 %.2f us, max %.2f us\n", steps,
+                100.0 * static_cast<double>(constrained_) / static_cast<double>(steps), worst_, counted,
                 times[steps / 2], times[steps - 1 - steps / 1000], times.back());
     return worst_ <= tolerance_ && counted == 0 ? 0 : 1;
   }
+
+  void count(bool is_constrained) { constrained_ += is_constrained; }
 
   template <class Law>
   double timed(Law law) {
@@ -92,7 +95,7 @@ class Replay {
  private:
   const Data& record_;
   double tolerance_, worst_ = 0;
-  long allocations_ = 0;
+  long allocations_ = 0, constrained_ = 0;
 };
 
 int replay_skill(const Data& data, const Data& record, Replay& replay) {
@@ -112,6 +115,7 @@ int replay_skill(const Data& data, const Data& record, Replay& replay) {
     replay.compare("action", t, skill.action());
     replay.compare("command", t, command.pose);
     replay.compare(record.get("replay/fallback")[t], command.fallback);
+    replay.count(skill.is_constrained());
     return time;
   });
 }
@@ -122,13 +126,15 @@ int replay_guidance(const Data& data, const Data& record, Replay& replay) {
   const Tensor &reset = record.get("replay/reset"), &fallback = record.get("replay/fallback"), &violation = record.get("replay/violation");
   return replay.run([&](std::size_t t) {
     Command command{};
+    const double *action = replay.row("action", t), *pose = replay.row("pose", t);
     const double time = replay.timed([&] {
-      if (reset[t] != 0.0) guidance.start(replay.row("pose", t));
-      command = guidance.step(replay.row("action", t), replay.row("pose", t));
+      if (reset[t] != 0.0) guidance.start(pose);
+      command = guidance.step(action, pose);
     });
     replay.compare("command", t, command.pose);
     replay.compare(fallback[t], command.fallback);
     replay.compare(violation[t], command.violation);
+    replay.count(guidance.is_constrained());
     if (record.has("replay/state")) {
       if constexpr (std::is_same_v<Guidance, TemplateGuidance>) replay.compare(record.get("replay/state")[t], guidance.state());
     }
@@ -140,8 +146,9 @@ int replay_governor(const Data& data, Replay& replay) {
   const Governor governor(data);
   return replay.run([&](std::size_t t) {
     double reference[6];
-    const double time = replay.timed(
-        [&] { governor.apply(replay.row("desired", t), replay.row("pose", t), replay.row("velocity", t), replay.row("max_wrench", t), reference); });
+    const double *desired = replay.row("desired", t), *pose = replay.row("pose", t), *velocity = replay.row("velocity", t);
+    const double* max_wrench = replay.row("max_wrench", t);
+    const double time = replay.timed([&] { governor.apply(desired, pose, velocity, max_wrench, reference); });
     replay.compare("reference", t, reference);
     return time;
   });
@@ -153,8 +160,8 @@ int replay_wrench(const Data& data, Replay& replay) {
     Vec6 spring, damping, wrench;
     std::copy_n(replay.row("spring", t), 6, spring.begin());
     std::copy_n(replay.row("damper", t), 6, damping.begin());
-    const double time = replay.timed(
-        [&] { wrench = bounded_wrench(spring, damping, replay.row("velocity", t), *replay.row("mass", t), governor.bound()); });
+    const double *velocity = replay.row("velocity", t), *mass = replay.row("mass", t);
+    const double time = replay.timed([&] { wrench = bounded_wrench(spring, damping, velocity, *mass, governor.bound()); });
     replay.compare("wrench", t, wrench.data());
     return time;
   });
@@ -164,10 +171,10 @@ int replay_phase_limit(const Data& data, const Data& record, Replay& replay) {
   PhaseWrenchLimit limit(data);
   const Tensor& reset = record.get("replay/reset");
   return replay.run([&](std::size_t t) {
-    const double* bound = nullptr;
+    const double *bound = nullptr, *state = replay.row("state", t), *max_wrench = replay.row("max_wrench", t);
     const double time = replay.timed([&] {
       if (reset[t] != 0.0) limit.start();
-      bound = limit.step(static_cast<int>(*replay.row("state", t)), replay.row("max_wrench", t));
+      bound = limit.step(static_cast<int>(*state), max_wrench);
     });
     replay.compare("bound", t, bound);
     return time;
@@ -178,12 +185,13 @@ int replay_rate_limiter(const Data& data, const Data& record, Replay& replay) {
   RateLimiter limiter(data.number("period"), data.number("speed"), data.number("angular_speed"));
   const Tensor& reset = record.get("replay/reset");
   return replay.run([&](std::size_t t) {
-    const double* pose = nullptr;
+    const double *desired = replay.row("desired", t), *pose = replay.row("pose", t), *limited = nullptr;
+    const bool is_controlled = *replay.row("controlled", t) > 0.0;
     const double time = replay.timed([&] {
-      if (reset[t] != 0.0) limiter.start(replay.row("pose", t));
-      pose = limiter.step(replay.row("desired", t), replay.row("pose", t), *replay.row("controlled", t) > 0.0);
+      if (reset[t] != 0.0) limiter.start(pose);
+      limited = limiter.step(desired, pose, is_controlled);
     });
-    replay.compare("limited", t, pose);
+    replay.compare("limited", t, limited);
     return time;
   });
 }
@@ -192,13 +200,14 @@ int replay_watchdog(const Data& data, const Data& record, Replay& replay) {
   Watchdog watchdog(data.number("period"), data.number("timeout"), 6);
   const Tensor& reset = record.get("replay/reset");
   return replay.run([&](std::size_t t) {
-    const double* pose = nullptr;
-    const double now = *replay.row("time", t);
+    const double *desired = replay.row("desired", t), *pose = replay.row("pose", t), *followed = nullptr;
+    const double now = *replay.row("time", t), stamp = *replay.row("stamp", t);
+    const bool is_controlled = *replay.row("controlled", t) > 0.0;
     const double time = replay.timed([&] {
-      if (reset[t] != 0.0) watchdog.start(now, replay.row("pose", t));
-      pose = watchdog.step(now, replay.row("desired", t), *replay.row("stamp", t), replay.row("pose", t), *replay.row("controlled", t) > 0.0);
+      if (reset[t] != 0.0) watchdog.start(now, pose);
+      followed = watchdog.step(now, desired, stamp, pose, is_controlled);
     });
-    replay.compare("followed", t, pose);
+    replay.compare("followed", t, followed);
     replay.compare(*replay.row("timed_out", t), watchdog.has_timed_out());
     return time;
   });
@@ -207,8 +216,8 @@ int replay_watchdog(const Data& data, const Data& record, Replay& replay) {
 int replay_policy(const Data& data, Replay& replay) {
   Policy policy(data);
   return replay.run([&](std::size_t t) {
-    const double* action = nullptr;
-    const double time = replay.timed([&] { action = policy(replay.row("observation", t)); });
+    const double *action = nullptr, *observation = replay.row("observation", t);
+    const double time = replay.timed([&] { action = policy(observation); });
     replay.compare("action", t, action);
     return time;
   });

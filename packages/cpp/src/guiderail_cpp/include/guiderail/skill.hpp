@@ -48,6 +48,7 @@ class Skill {
   int actions() const { return policy_.outputs(); }
   const double* action() const { return held_.data(); }  // action of the present control step
   const double* desired() const { return desired_.data(); }  // last command (O,)
+  bool is_constrained() const { return primitive_ ? primitive_->is_constrained() : template_->is_constrained(); }
   int state() const { return template_ ? template_->state() : 0; }
   bool is_over() const { return steps_ * period_ >= duration_; }
   const std::optional<Governor>& governor() const { return governor_; }

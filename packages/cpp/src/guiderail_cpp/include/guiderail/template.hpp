@@ -552,6 +552,9 @@ class TemplateGuidance {
   // Undoes the first step of an episode.
   void rewind() { is_started_ = false; }
 
+  // True if an active constraint or a limit of speed changed the last request.
+  bool is_constrained() const { return is_constrained_; }
+
   // Moves the frame of an object, by its number in skill.json, to a pose (6,).
   void set_frame(int index, const double* pose) {
     template_.set_frame(index, pose);
@@ -590,6 +593,8 @@ class TemplateGuidance {
       std::array<double, 6> desired{};
       if (is_finite(requested.data(), 6)) {
         constrain(requested, desired);
+        is_constrained_ = false;
+        for (int i = 0; i < 6; ++i) is_constrained_ = is_constrained_ || !(std::abs(desired[i] - requested[i]) <= 1e-9);
         const Vec3 measured{measured_[0], measured_[1], measured_[2]};
         const double error = distance({last_[0], last_[1], last_[2]}, measured);
         const bool reduces_error = distance({desired[0], desired[1], desired[2]}, measured) < error;
@@ -618,7 +623,7 @@ class TemplateGuidance {
   bool has_own_mapping_;
   double period_, max_tracking_error_;
   int state_ = 0;
-  bool is_started_ = false;
+  bool is_started_ = false, is_constrained_ = false;
   std::array<double, 6> last_{}, measured_{}, output_{};
 };
 
