@@ -33,6 +33,7 @@ class Skill {
     held_.resize(static_cast<std::size_t>(policy_.outputs()));
     desired_.resize(static_cast<std::size_t>(outputs()));
     time_ = observation_.signal("time"), phase_ = observation_.signal("phase");
+    pose_size_ = observation_.size("pose"), desired_size_ = observation_.size("desired_pose");
     pose_ = observation_.signal("pose"), desired_pose_ = observation_.signal("desired_pose");
     wrench_ = observation_.size("wrench") == 6 ? observation_.signal("wrench") : nullptr;
     pressure_ = observation_.signal("center_of_pressure"), min_force_ = data.number("observation/min_force");
@@ -87,8 +88,8 @@ class Skill {
       const double time = steps_ * period_;
       if (time_) *time_ = std::min(time, duration_);
       if (phase_) *phase_ = -1.0 + 2.0 * std::min(time / duration_, 1.0);
-      if (pose_) std::copy_n(pose, observation_.size("pose"), pose_);
-      if (desired_pose_) std::copy_n(desired_.begin(), observation_.size("desired_pose"), desired_pose_);
+      if (pose_) std::copy_n(pose, pose_size_, pose_);
+      if (desired_pose_) std::copy_n(desired_.begin(), desired_size_, desired_pose_);
       if (pressure_ && wrench_) {
         const bool is_reliable = wrench_[2] >= min_force_;
         pressure_[0] = is_reliable ? -wrench_[4] / wrench_[2] : 0.0;
@@ -128,6 +129,7 @@ class Skill {
   std::vector<double> held_, desired_;
   double *time_, *phase_, *pose_, *desired_pose_, *state_, *distance_, *wrench_, *pressure_;
   double min_force_;
+  int pose_size_, desired_size_;
   long steps_ = 0;
 };
 
