@@ -111,3 +111,11 @@ def test_export_refuses_options_that_its_loop_lacks(option, value, tmp_path, mon
     monkeypatch.setattr(RunFolder, "config", lambda self: config)
     with pytest.raises(InputError, match=f"{option}={value} cannot be exported"):
         export_skill("pretrained:passage", tmp_path / "out")
+
+
+def test_target_of_missing_sibling_names_the_line_that_installs_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.cli.export.find_plugins", lambda kind: iter(()))
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "pretrained:connector", "--target", "cpp", "--out", str(tmp_path / "skill")])
+    line = 'guiderail export --target cpp needs guiderail-cpp, which is not installed: pip install "guiderail[cpp]"'
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"guiderail: {line}\n")

@@ -28,7 +28,7 @@ def export(
     action in their order and the settings of the guidance (skill.json), and the data of its movement primitive
     (primitive.npz). With cpp, it contains a C++ library that computes the commands, its data, and a test.
     """
-    exporters = {name: point for name, point in find_plugins("exporter")}
+    exporters = dict(find_plugins("exporter"))
     if target not in TARGETS and target not in exporters:
         raise InputError(f"there is no target {target!r}: {did_you_mean(target, [*TARGETS, *exporters])}")
     if target in exporters:

@@ -60,6 +60,7 @@ class Program:
 
 
 def main() -> int:
+    """Compare the episodes that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run")
     parser.add_argument("folder", type=Path)
@@ -84,7 +85,9 @@ def main() -> int:
         rows = {}
         for name, env in environments.items():
             program.is_starting = True
-            act = policy if name == "python" else (lambda _: np.zeros(len(policy.description["action_low"]), np.float32))
+            act = (
+                policy if name == "python" else (lambda _: np.zeros(len(policy.description["action_low"]), np.float32))
+            )
             paths = Paths(env)
             rows[name] = rollout(env, act, paths, seed=HELD_OUT_SEED + episode, held_out=True)
             success[name] += bool(rows[name]["success"])

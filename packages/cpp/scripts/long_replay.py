@@ -1,6 +1,6 @@
 """Compare each law in C++ with Python for 100,000 steps of random inputs, optimized and with sanitizers (20 minutes).
 
-    python packages/cpp/scripts/long_replay.py [--steps 100000] [LAW …]
+python packages/cpp/scripts/long_replay.py [--steps 100000] [LAW …]
 """
 
 import argparse
@@ -16,6 +16,7 @@ from test_laws import FLAGS
 
 
 def main() -> int:
+    """Compare the laws that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("laws", nargs="*", default=list(LAWS))
     parser.add_argument("--steps", type=int, default=100_000)

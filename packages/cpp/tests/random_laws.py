@@ -5,13 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
-from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.export import governor_arrays, policy_arrays
-from guiderail_cpp.recording import double_action
-from guiderail_cpp.templates import template_arrays
-from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
 from pydrake.systems.analysis import Simulator
 from safetensors.numpy import save
 
@@ -30,6 +26,11 @@ from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
+from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
+from guiderail_cpp.export import governor_arrays, policy_arrays
+from guiderail_cpp.recording import double_action
+from guiderail_cpp.templates import template_arrays
+from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
 
 Files = tuple[bytes, bytes]
 """Content of the files of the data and of the recording."""
@@ -46,6 +47,7 @@ def record_guidance(guidance, period, steps, rng, start, action, near, episode=E
     columns: dict[str, list] = {name: [] for name in ("reset", "action", "pose", "command", "fallback", "violation")}
     columns |= {name: [] for name in outputs}
     ports = {name: guidance.GetInputPort(name) for name in ("action", "pose", "wrench")}
+    command = np.zeros(0)
     for step in range(steps):
         number = step % episode
         if number == 0:
@@ -145,7 +147,9 @@ def kgrl_equation(steps: int) -> Files:
     lower, upper = np.full(6, -np.inf), np.full(6, np.inf)
     lower[:2], upper[:2] = -2e-3, 2e-3
     lower[4] = upper[4] = 0.0
-    return _primitive(replace(config, constraints=LinearConstraints.box(lower, upper)), history=False, scale=3.0, steps=steps)
+    return _primitive(
+        replace(config, constraints=LinearConstraints.box(lower, upper)), history=False, scale=3.0, steps=steps
+    )
 
 
 def _template(template, frames, steps, start, *, velocity=False, period=0.01, limit=0.004, seed=0) -> Files:
@@ -195,7 +199,8 @@ states:
     input_mapping:
       - {kind: translation, inputs: [0, 1, 2], speed_m_per_s: 0.06, frame: tool}
       - {kind: scaled, frame: b, distance_m: [0.05, 0.1, 0.3], factor: [0.2, 0.7, 1.0],
-         of: {kind: uneven, above: 0.5, below: 0.9, of: {kind: rotation, inputs: [3, 4, 5], speed_rad_per_s: 0.5, frame: a}}}
+         of: {kind: uneven, above: 0.5, below: 0.9,
+              of: {kind: rotation, inputs: [3, 4, 5], speed_rad_per_s: 0.5, frame: a}}}
     active_constraints:
       - {kind: half_space, frame: a, normal: [0.2, 0.1, 1.0], offset_m: -0.05}
       - {kind: box, frame: a, lower_m: [-0.2, -0.2, -0.1], upper_m: [0.2, 0.2, 0.25]}
@@ -268,7 +273,7 @@ def policy(steps: int) -> Files:
     rng, sizes = np.random.default_rng(3), (17, 64, 63, 3)
     layers = [
         (rng.normal(size=(after, before)).astype(np.float32), rng.normal(size=after).astype(np.float32))
-        for before, after in zip(sizes[:-1], sizes[1:], strict=True)
+        for before, after in pairwise(sizes)
     ]
     description = {
         "observation_shape": [17], "activation": "normalized_relu", "squash": "tanh",

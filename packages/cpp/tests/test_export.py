@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from guiderail.tools.cli.main import main
+from guiderail.models.common.errors import InputError
 from guiderail_cpp.export import export_cpp
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
@@ -44,10 +44,11 @@ def test_controller_and_node_run_the_skill_with_a_double_of_ros2(tmp_path):
 def test_description_lists_signals_and_action(tmp_path):
     export_cpp("pretrained:clamp", tmp_path / "skill")
     skill = json.loads((tmp_path / "skill/skill.json").read_text())
-    assert skill["signals"] == {"pose": 3, "wrench": 3} and skill["frames"] == ["hole"]
+    assert skill["signals"] == {"pose": 3, "wrench": 3}
+    assert skill["frames"] == ["hole"]
     assert [entry["name"] for entry in skill["action"]] == ["input 0", "input 1", "input 2"]
 
 
-def test_command_refuses_a_folder_that_exists(tmp_path, capsys):
-    assert main(["export", "pretrained:connector", "--target", "cpp", "--out", str(tmp_path)]) == 2
-    assert "exists" in capsys.readouterr().err
+def test_export_refuses_a_folder_that_exists(tmp_path):
+    with pytest.raises(InputError, match="exists"):
+        export_cpp("pretrained:connector", tmp_path)

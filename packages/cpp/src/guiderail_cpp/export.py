@@ -19,7 +19,7 @@ from guiderail.diagrams.stations.impedance_control import (
     WRENCH_RATE,
     make_phase_wrench_limit,
 )
-from guiderail.diagrams.tasks.insertion import MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
@@ -114,7 +114,7 @@ def _guidance_arrays(guidance: str, prior: PriorKnowledge) -> Arrays:
 
 
 def _force_arrays(skill: TrainedSkill) -> Arrays:
-    """Return the arrays of the force bound, if the task has one: the governor's, and the limits of a template's states."""
+    """Return the arrays of the task's force bound, if any: the governor's, and the limits of a template's states."""
     impedance = call_checked(skill.task, "impedance")
     if impedance is None or impedance.bound is None:
         return {}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.guidance.registry import build_guidance
-from guiderail.diagrams.tasks.insertion import MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
 from guiderail.models.policy import Policy
@@ -17,14 +18,14 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.export import TrainedSkill
 from guiderail_cpp.arrays import Arrays
 
+Entries = Sequence[Mapping[str, Any]]
+"""Entries of an observation, as in `skill.json`."""
 EPISODES = 4  # number of recorded episodes
 SPREAD = 0.3  # probability that a random entry of the observation is far outside, where it is clipped
 START_SPREAD, TRACKING_SPREAD = 1e-3, 5e-4  # standard deviations of measured poses at a start and around a command
 
 
-def record_skill(
-    skill: TrainedSkill, signals: Mapping[str, int], episodes: int = EPISODES, seed: int = 0
-) -> Arrays:
+def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int = EPISODES, seed: int = 0) -> Arrays:
     """Record random episodes of a skill, without a plant.
 
     The guidance diagram of the environment computes the commands. The network is evaluated in double precision, as in
@@ -71,7 +72,8 @@ def record_skill(
             flat = np.concatenate([raw[name] for name in signals])
             rows.append((float(step == 0), flat, pose, action, command, fallback[0]))
     names = ("reset", "signals", "pose", "action", "command", "fallback")
-    return {f"replay/{name}": np.array(column, dtype=float) for name, column in zip(names, zip(*rows), strict=True)}
+    columns = zip(*rows, strict=True)
+    return {f"replay/{name}": np.array(column, dtype=float) for name, column in zip(names, columns, strict=True)}
 
 
 def _start(skill: TrainedSkill) -> np.ndarray:
@@ -88,7 +90,7 @@ def _start(skill: TrainedSkill) -> np.ndarray:
         env.close()
 
 
-def _random_signals(entries: list, signals: Mapping[str, int], rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _random_signals(entries: Entries, signals: Mapping[str, int], rng: np.random.Generator) -> dict[str, np.ndarray]:
     raw = {name: np.zeros(size) for name, size in signals.items()}
     for entry in entries:
         width = entry["scale"] * (10.0 * entry["clip"] if rng.uniform() < SPREAD else 1.0)
@@ -96,7 +98,7 @@ def _random_signals(entries: list, signals: Mapping[str, int], rng: np.random.Ge
     return raw
 
 
-def _observe(entries: list, signals: Mapping[str, np.ndarray]) -> np.ndarray:
+def _observe(entries: Entries, signals: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the observation (n,) for the signals, in single precision."""
     values = [
         np.clip(

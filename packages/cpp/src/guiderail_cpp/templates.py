@@ -10,9 +10,8 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.models.templates import SharedControlTemplate
+from guiderail.models.templates import SharedControlTemplate, mappings, shape_constraints, transitions
 from guiderail.models.templates import constraints as active
-from guiderail.models.templates import mappings, shape_constraints, transitions
 from guiderail.models.templates.geometry import WORLD, StatePart, matrix_deg
 
 # Kinds in the order of the enumerations in template.hpp.

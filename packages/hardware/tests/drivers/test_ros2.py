@@ -74,18 +74,21 @@ def test_driver_reads_joints_by_name_and_the_wrench_as_joint_torques(connect):
     driver = connect(reversed=True)
     driver.configure(IMPEDANCE)
     fault, number = watch(driver, 1.0)
-    assert fault == Fault.NONE and number > 5
+    assert fault == Fault.NONE
+    assert number > 5
     status = driver.read()
     np.testing.assert_allclose(status.positions, [0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.0], atol=0.06)
     # Force along z of the base: no torque about the vertical first axis, and the power of a lift at the second.
-    assert abs(status.external_torque[0]) < 1e-9 and abs(status.external_torque[1]) > 1.0
+    assert abs(status.external_torque[0]) < 1e-9
+    assert abs(status.external_torque[1]) > 1.0
 
 
 @needs_middleware
 def test_loss_latency_and_reordering_are_no_fault(connect):
     driver = connect(loss=0.1, latency=0.04, jitter=0.9)
     fault, number = watch(driver)
-    assert fault == Fault.NONE and number > 20
+    assert fault == Fault.NONE
+    assert number > 20
 
 
 @needs_middleware

@@ -11,7 +11,7 @@ import logging
 import random
 import time as clock
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlsplit
 
 import numpy as np
@@ -151,7 +151,15 @@ class Ros2Driver(PoseDriver):
     """
 
     name = robot = "panda"
-    torque_reflex_limits = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0)  # joint torque limits [Nm]
+    torque_reflex_limits: ClassVar[tuple[float, ...]] = (
+        87.0,
+        87.0,
+        87.0,
+        87.0,
+        12.0,
+        12.0,
+        12.0,
+    )  # joint torque limits [Nm]
     has_command_timeout = True  # the controller holds the arm at its last target
     motion_limits = MOTION_LIMITS
 
@@ -348,7 +356,9 @@ class Ros2UrDriver(Ros2Driver):
     torque_reflex_limits = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # largest external joint torques [Nm]
 
 
-def bounded_target(X_BaseTool: RigidTransform, X_BaseActual: RigidTransform, impedance: RobotImpedance) -> RigidTransform:
+def bounded_target(
+    X_BaseTool: RigidTransform, X_BaseActual: RigidTransform, impedance: RobotImpedance
+) -> RigidTransform:
     """Return the target nearest to X_BaseTool in the direction of the error whose spring force is inside the bound.
 
     The error e is scaled until each component of K e is at most `RobotImpedance.max_wrench`.
