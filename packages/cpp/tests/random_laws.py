@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -139,17 +138,6 @@ def skgrl_oblique(steps: int) -> Files:
         times[1] - times[0], history=3, history_variance=1e-7, horizon=15, kernel=Matern52(1.0),
     )  # fmt: skip
     return _primitive(config, history=True, scale=2.0, steps=steps)
-
-
-def kgrl_equation(steps: int) -> Files:
-    """An output that must not move: equal bounds."""
-    config = connector()
-    lower, upper = np.full(6, -np.inf), np.full(6, np.inf)
-    lower[:2], upper[:2] = -2e-3, 2e-3
-    lower[4] = upper[4] = 0.0
-    return _primitive(
-        replace(config, constraints=LinearConstraints.box(lower, upper)), history=False, scale=3.0, steps=steps
-    )
 
 
 def _template(template, frames, steps, start, *, velocity=False, period=0.01, limit=0.004, seed=0) -> Files:
@@ -411,7 +399,6 @@ def watchdog(steps: int) -> Files:
 
 LAWS: dict[str, Callable[[int], Files]] = {
     "kgrl": kgrl,
-    "kgrl, equation": kgrl_equation,
     "skgrl": skgrl,
     "skgrl, measured history": skgrl_measured,
     "skgrl, oblique constraints": skgrl_oblique,

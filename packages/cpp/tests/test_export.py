@@ -5,9 +5,12 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
+from guiderail_cpp.arrays import primitive_arrays
 from guiderail_cpp.export import export_cpp
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
@@ -47,6 +50,13 @@ def test_description_lists_signals_and_action(tmp_path):
     assert skill["signals"] == {"pose": 3, "wrench": 3}
     assert skill["frames"] == ["hole"]
     assert [entry["name"] for entry in skill["action"]] == ["input 0", "input 1", "input 2"]
+
+
+def test_export_refuses_equal_bounds():
+    reference = ReferenceTrajectory(np.arange(4.0), np.zeros((4, 2)), np.tile(1e-4 * np.eye(2), (4, 1, 1)))
+    constraints = LinearConstraints.box([0.0, -1.0], [0.0, 1.0])
+    with pytest.raises(InputError, match="equal lower and upper bounds"):
+        primitive_arrays(LcNsKmp(reference, constraints=constraints), np.eye(2), is_measured=False)
 
 
 def test_export_refuses_a_folder_that_exists(tmp_path):

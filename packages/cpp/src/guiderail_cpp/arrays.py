@@ -6,11 +6,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.window import StepFactor
 
 Arrays = dict[str, np.ndarray]
 """Arrays of doubles by name."""
+_EQUAL = 1e-9  # largest distance of two bounds that count as equal, relative to a correction of norm one
 
 
 def constraint_arrays(constraints: LinearConstraints) -> Arrays:
@@ -29,8 +31,14 @@ def primitive_arrays(primitive: LcNsKmp, gain: np.ndarray, *, is_measured: bool)
         primitive: Primitive with O outputs and P past outputs.
         gain: Null-space action (O, A) per unit of each entry of the policy's action.
         is_measured: True if the history has measured outputs, False if it has commands.
+
+    Raises:
+        InputError: If a lower bound is equal to its upper bound: the solver needs thousands of iterations for the
+            many dependent equations of a window.
     """
     factors = [_factor(primitive, step) for step in range(primitive.num_steps)]
+    if any((factor.upper - factor.lower < _EQUAL).any() for factor in factors):
+        raise InputError("constraints with equal lower and upper bounds cannot be exported: widen them a little")
     rows = [factor.constraint_rows for factor in factors]
     width = max(row.shape[1] for row in rows)
     arrays = {
