@@ -226,13 +226,17 @@ states:
 """
 
 
-def template_every_kind(steps: int) -> Files:
+def _every_kind(state: str, steps: int) -> Files:
+    """Random steps that begin in a state of the template."""
     frames = {
         "a": RigidTransform(rpy_rotation(0.1, -0.2, 0.4), [0.4, 0.1, 0.2]),
         "b": RigidTransform(rpy_rotation(-0.3, 0.1, -0.6), [0.52, 0.12, 0.22]),
     }
-    start = transform_to_pose(RigidTransform(frames["a"].rotation(), [0.35, 0.0, 0.3]))
-    return _template(parse_template(EVERY_KIND), frames, steps, start, limit=0.05)
+    template = parse_template(EVERY_KIND.replace("initial_state: far", f"initial_state: {state}"))
+    p_AE = [-0.1, -0.05, 0.1] if state == "far" else [0.03, 0.02, 0.03]
+    X_WE = frames["a"] @ RigidTransform(rpy_rotation(0.0, 0.1, 0.0), p_AE)
+    start = transform_to_pose(template.project(template.initial_state, X_WE, frames))
+    return _template(template, frames, steps, start, limit=0.05)
 
 
 def template_arc(steps: int) -> Files:
@@ -406,7 +410,9 @@ LAWS: dict[str, Callable[[int], Files]] = {
     "template pouring": lambda steps: _shipped("pouring", steps),
     "template pouring_aimed": lambda steps: _shipped("pouring_aimed", steps),
     "template pouring_shielded": lambda steps: _shipped("pouring_shielded", steps),
-    "template of every kind": template_every_kind,
+    "template of every kind, far": lambda steps: _every_kind("far", steps),
+    "template of every kind, near": lambda steps: _every_kind("near", steps),
+    "template of every kind, turn": lambda steps: _every_kind("turn", steps),
     "template with an arc": template_arc,
     "constraints on a velocity": lambda steps: _shipped("pouring", steps, velocity=True),
     "policy": policy,
