@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUTSIDE := .venv-outside
 ALONE := .venv-alone
 # Distributions of this repository, installed together: the core and its siblings require each other.
-SIBLINGS := hardware parts studies data lerobot mujoco
+SIBLINGS := hardware parts studies data lerobot mujoco cpp
 EDITABLE := $(SIBLINGS:%=-e packages/%)
 # Meshcat and LCM use this machine's network only. Without package_map, Drake's Parser(plant) refuses its remote package
 # drake_models, whose files it would download: `make TARGET DRAKE_ALLOW_NETWORK=meshcat:lcm:package_map` permits it.

@@ -6,8 +6,9 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,8 +25,13 @@ from guiderail.tools.files import check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 
+if TYPE_CHECKING:
+    from guiderail.diagrams.guidance.prior import PriorKnowledge
+    from guiderail.diagrams.tasks.task import Task
+    from guiderail.tools.learning.run_folder import RunConfig
+
 WRENCH_NAMES = ("Fx [N]", "Fy [N]", "Fz [N]", "Mx [Nm]", "My [Nm]", "Mz [Nm]")
-NAMES = {"time": ("time [s]",), "phase": ("phase",), "wrench": WRENCH_NAMES}
+NAMES = {"time": ("time [s]",), "phase": ("phase",), "state": ("state",), "wrench": WRENCH_NAMES}
 NAMES["center_of_pressure"] = ("center of pressure x [m]", "center of pressure y [m]")
 NAMES |= {signal: tuple(f"{signal} {name}" for name in POSE_NAMES) for signal in ("pose", "desired_pose")}
 """Names of a signal's entries with their units; entries of another signal are numbered."""
@@ -33,6 +39,71 @@ EXPORTED = {"kernel": DEFAULT_KERNEL, "history.source": "commanded", "history.ad
 """Options whose other values the loop of a skill without an environment does not implement."""
 GUIDED = ("kgrl", "skgrl")  # guidance whose data can be exported
 POLICY_FILE = "policy.onnx"
+
+
+@dataclass(frozen=True)
+class TrainedSkill:
+    """Policy of a run with the task and the prior knowledge that its guidance is built from.
+
+    Attributes:
+        config: Configuration of the run.
+        policy: Deterministic policy.
+        task: Task.
+        prior: Prior knowledge of the task.
+        description: Meaning of observation and action, and settings of the guidance, as written to `skill.json`.
+    """
+
+    config: RunConfig
+    policy: Policy
+    task: Task
+    prior: PriorKnowledge
+    description: dict[str, Any]
+
+
+def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, Any]) -> TrainedSkill:
+    """Load the policy of a run and describe its observation, action and guidance.
+
+    Args:
+        run: Folder of a run, or `pretrained:NAME`.
+        guidance: Kinds of guidance that can be exported.
+        exported: Options of which only one value can be exported, with this value.
+
+    Raises:
+        InputError: If there is no such run, its policy observes images, or its guidance cannot be exported.
+    """
+    folder = RunFolder(find_run(run))
+    config, policy = folder.config(), Policy.load(folder.path)
+    kind = config.environment.get("guidance")
+    if config.task not in TASKS.names() or kind not in guidance:
+        raise InputError(
+            f"the guidance of a run to export is {' or '.join(guidance)}: evaluate this policy with guiderail evaluate"
+        )
+    if len(policy.description["observation_shape"]) != 1 or "image_shape" in policy.description:
+        raise InputError("a policy that observes images cannot be exported: train one with observation=state")
+    resolved = EnvConfig.resolve(config.task, config.environment)
+    task, prior = resolved.make_task(), make_prior_knowledge(resolved)
+    description: dict[str, Any] = {"task": config.task, "environment": dict(config.environment)}
+    description["action_repeat"] = config.action_repeat
+    observed = math.prod(policy.description["observation_shape"])
+    description["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size, observed)
+    if len(description["observation"]) != observed:
+        raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")
+    for option, value in exported.items():
+        if (given := config.environment.get(option, value)) != value:
+            raise InputError(f"{option}={given} cannot be exported, only {option}={value}: train with this value")
+    names = [f"input {index}" for index in range(len(policy.description["action_low"]))]
+    if kind in GUIDED:
+        primitive = prior.primitive
+        assert primitive is not None
+        if primitive.motion is not None or primitive.progress is not None:
+            raise InputError("constraints of the motion and progress=state cannot be exported: train without them")
+        names = [f"null-space action of {POSE_NAMES[output]}" for output in primitive.explored_outputs]
+    low, high = (policy.description[f"action_{end}"] for end in ("low", "high"))
+    description["control_period_s"] = prior.period
+    description["action"] = [
+        {"name": name, "low": low[index], "high": high[index]} for index, name in enumerate(names)
+    ]  # fmt: skip
+    return TrainedSkill(config, policy, task, prior, description)
 
 
 def export_skill(run: Path | str, out: Path) -> list[Path]:
@@ -50,31 +121,13 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
         Paths of the files.
 
     Raises:
-        InputError: If there is no such run, its policy observes images, or the folder cannot be written.
+        InputError: As `load_skill`, or if the folder cannot be written.
     """
-    folder = RunFolder(find_run(run))
-    config, policy = folder.config(), Policy.load(folder.path)
-    if config.task not in TASKS.names() or config.environment.get("guidance") not in GUIDED:
-        raise InputError(
-            f"the guidance of a run to export is {' or '.join(GUIDED)}: evaluate this policy with guiderail evaluate"
-        )
     check_new(out, "folder")
-    files = {POLICY_FILE: policy_to_onnx(policy)}
-    skill: dict[str, Any] = {"task": config.task, "environment": dict(config.environment)}
-    skill |= {"action_repeat": config.action_repeat, "policy": POLICY_FILE}
-    resolved = EnvConfig.resolve(config.task, config.environment)
-    task, prior = resolved.make_task(), make_prior_knowledge(resolved)
-    primitive_config = prior.primitive
-    skill["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size)
-    if len(skill["observation"]) != math.prod(policy.description["observation_shape"]):
-        raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")
-    assert primitive_config is not None
-    if primitive_config.motion is not None or primitive_config.progress is not None:
-        raise InputError("constraints of the motion and progress=state cannot be exported: train without them")
-    for option, exported in EXPORTED.items():
-        if (value := config.environment.get(option, exported)) != exported:
-            raise InputError(f"{option}={value} cannot be exported, only {option}={exported}: train with this value")
-    law = make_law(prior, history=config.environment["guidance"] == "skgrl")
+    skill = load_skill(run, GUIDED, EXPORTED)
+    environment, config = skill.config.environment, skill.prior.primitive
+    assert config is not None
+    law = make_law(skill.prior, history=environment["guidance"] == "skgrl")
     primitive = law.primitive
     buffer = io.BytesIO()
     constraints = primitive.constraints
@@ -83,40 +136,49 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
         covariances=primitive.reference.covariances, G=constraints.G, c=constraints.c,
         gains=law.gain,
     )  # fmt: skip
-    files[PRIMITIVE_FILE] = buffer.getvalue()
-    skill["primitive"] = {
-        "file": PRIMITIVE_FILE, "lambda_": primitive_config.lambda_, "beta": primitive_config.beta,
-        "horizon": primitive_config.horizon, "history": primitive.history,
-        "history_variance": primitive_config.history_variance, "history_source": law.history_source,
-        "kernel": config.environment["kernel"], "length_scale": config.environment["length_scale"],
+    description = skill.description | {"policy": POLICY_FILE}
+    description["primitive"] = {
+        "file": PRIMITIVE_FILE, "lambda_": config.lambda_, "beta": config.beta,
+        "horizon": config.horizon, "history": primitive.history,
+        "history_variance": config.history_variance, "history_source": law.history_source,
+        "kernel": environment["kernel"], "length_scale": environment["length_scale"],
     }  # fmt: skip
-    skill["control_period_s"] = prior.period
-    low, high = (policy.description[f"action_{end}"] for end in ("low", "high"))
-    skill["action"] = [
-        {"name": f"null-space action of {POSE_NAMES[output]}", "output": output,
-         "low": low[i], "high": high[i]}
-        for i, output in enumerate(law.outputs)
-    ]  # fmt: skip
-    files[SKILL_FILE] = json.dumps(skill, indent=2, default=_plain).encode() + b"\n"
-    out.mkdir(parents=True)
-    for name, content in files.items():
-        write_atomically(out / name, content)
-    return [out / name for name in files]
+    for entry, output in zip(description["action"], law.outputs, strict=True):
+        entry["output"] = output
+    files = {POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue()}
+    return write_files(out, files | {SKILL_FILE: to_json(description)})
+
+
+def write_files(out: Path, files: Mapping[str, bytes]) -> list[Path]:
+    """Write files, by their path in the folder, into a new folder; return their paths."""
+    paths = [out / name for name in files]
+    for path, content in zip(paths, files.values(), strict=True):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, content)
+    return paths
+
+
+def to_json(description: Mapping[str, Any]) -> bytes:
+    """Return the content of `skill.json`."""
+    return json.dumps(description, indent=2, default=_plain).encode() + b"\n"
 
 
 def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _observation(terms: Any, clip: float, pose_size: int) -> list[dict[str, Any]]:
-    """Return the entries of the observation, each clip((value − center) / scale)."""
+def _observation(terms: Any, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
+    """Return the entries of the observation, each clip((value − center) / scale); there are `observed` of them."""
     if not isinstance(terms, Sequence):
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
+    sizes = [_size(term, pose_size) for term in terms]
+    if sizes.count(1) and observed > sum(sizes):  # one signal whose size neither its name nor its scale tells
+        unknown = [i for i, term in enumerate(terms) if term.signal not in NAMES and sizes[i] == 1]
+        if len(unknown) == 1:
+            sizes[unknown[0]] += observed - sum(sizes)
     entries = []
-    for term in terms:
-        names: Sequence[str] = NAMES.get(term.signal, ())
-        names = names[:pose_size] if "pose" in term.signal else names
-        size = max(np.size(term.center), np.size(term.scale), len(names) if term.entries is None else 1)
+    for term, size in zip(terms, sizes, strict=True):
+        names = NAMES.get(term.signal, ())
         indices = range(size) if term.entries is None else term.entries
         centers, scales = (np.broadcast_to(values, len(indices)) for values in (term.center, term.scale))
         for index, center, scale in zip(indices, centers, scales, strict=True):
@@ -124,6 +186,14 @@ def _observation(terms: Any, clip: float, pose_size: int) -> list[dict[str, Any]
             entry = {"name": name, "signal": term.signal, "index": index, "center": float(center)}
             entries.append({**entry, "scale": float(scale), "clip": clip})
     return entries
+
+
+def _size(term: Any, pose_size: int) -> int:
+    """Return the number of a term's entries, as far as its name, center and scale tell."""
+    if term.entries is not None:
+        return len(term.entries)
+    known = len(NAMES.get(term.signal, ())[: pose_size if "pose" in term.signal else None])
+    return max(np.size(term.center), np.size(term.scale), known)
 
 
 def policy_to_onnx(policy: Policy) -> bytes:

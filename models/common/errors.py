@@ -81,6 +81,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "bags": {"rosbags": "rosbags"},
     "fci": {"franky": "franky"},
     "rtde": {"rtde_control": "ur-rtde", "rtde_receive": "ur-rtde", "dashboard_client": "ur-rtde"},
+    "ros2": {"cyclonedds": "Cyclone DDS"},
     "tensorboard": {"tensorboard": "TensorBoard"},
     "ray": {"ray": "Ray"},
     "onnx": {"onnxruntime": "ONNX Runtime"},

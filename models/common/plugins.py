@@ -26,6 +26,7 @@ SIBLINGS = {
     "data": ("dataset",),
     "lerobot": (),
     "mujoco": (),
+    "cpp": (),
 }
 """Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""
 

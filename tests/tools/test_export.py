@@ -120,3 +120,11 @@ def test_law_is_refused_without_an_exported_skill(content, tmp_path):
         (tmp_path / "skill.json").write_text(content)
     with pytest.raises(InputError, match="is no exported skill"):
         load_law(tmp_path)
+
+
+def test_target_of_missing_sibling_names_the_line_that_installs_it(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("guiderail.tools.cli.export.find_plugins", lambda kind: iter(()))
+    with pytest.raises(SystemExit) as ended:
+        main(["export", "pretrained:connector", "--target", "cpp", "--out", str(tmp_path / "skill")])
+    line = 'guiderail export --target cpp needs guiderail-cpp, which is not installed: pip install "guiderail[cpp]"'
+    assert (ended.value.code, capsys.readouterr().err) == (2, f"guiderail: {line}\n")

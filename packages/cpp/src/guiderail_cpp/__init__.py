@@ -1,0 +1,1 @@
+"""Export of skills to C++."""

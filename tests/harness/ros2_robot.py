@@ -1,0 +1,101 @@
+"""Program that plays a robot with ROS 2 on the loopback interface, with faults of network and robot.
+
+It publishes joint states and wrenches, and records the targets that it receives. A line on its standard input ends it;
+it then prints the number of targets, the last one, and the controllers that it was asked to switch to, as JSON.
+"""
+
+import heapq
+import json
+import os
+import random
+import selectors
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+CONFIG = """<CycloneDDS><Domain><General><Interfaces><NetworkInterface name="lo"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<MaxAutoParticipantIndex>30</MaxAutoParticipantIndex><Peers><Peer address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+PERIOD = 0.05  # period of the messages [s]
+POSITIONS = np.array([0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.0])
+
+
+def use_loopback() -> None:
+    """Restrict Cyclone DDS in this process, and in processes that it starts, to the loopback interface."""
+    path = Path(tempfile.mkdtemp()) / "loopback.xml"
+    path.write_text(CONFIG)
+    os.environ["CYCLONEDDS_URI"] = path.as_uri()
+
+
+class RobotProcess:
+    """Process that plays the robot at an address, with faults by name."""
+
+    def __init__(self, address: str, **faults: float):
+        command = [sys.executable, __file__, address, json.dumps(faults)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+
+    def end(self) -> dict:
+        """End the process and return what it received."""
+        output, _ = self._process.communicate("\n", timeout=60)
+        return json.loads(output)
+
+    def kill(self) -> None:
+        """Kill the process."""
+        self._process.kill()
+        self._process.communicate()
+
+
+def main(address: str, faults: dict) -> None:
+    from guiderail_hardware.drivers.ros2 import Ros2Address, Ros2Bus
+
+    bus = Ros2Bus(Ros2Address.parse(address), robot_side=True)
+    messages, rng = bus.messages, random.Random(0)
+    names = [f"panda_joint{number}" for number in range(1, 8)][:: -1 if faults.get("reversed") else 1]
+    queue: list = []
+    received: dict = {"targets": 0, "last": None, "switched": [], "replies": 0}
+    start, number = time.time(), 0
+    selector = selectors.DefaultSelector()
+    selector.register(sys.stdin, selectors.EVENT_READ)
+    while not selector.select(timeout=2e-3):
+        now = time.time()
+        if now - start > number * PERIOD and not (faults.get("silent_after") and now - start > faults["silent_after"]):
+            number += 1
+            is_faulty = now - start > faults.get("after", 1.0)
+            stamp = now + (faults.get("clock_jump", 0.0) if is_faulty else 0.0)
+            q = POSITIONS + 0.05 * np.sin(now - start) + (faults.get("jump", 0.0) if is_faulty else 0.0)
+            v = np.full(7, 0.05 * np.cos(now - start))
+            if is_faulty and faults.get("not_finite"):
+                v[3] = np.nan
+            used = names[:6] if is_faulty and faults.get("missing_joint") else names
+            order = [int(name[-1]) - 1 for name in used]
+            header = messages.Header(messages.Time(int(stamp), int(1e9 * (stamp % 1.0))), "base")
+            joints = messages.JointState(header, used, q[order].tolist(), v[order].tolist(), [0.0] * len(used))
+            wrench = messages.WrenchStamped(header, messages.Wrench(messages.Vector3(0.0, 0.0, 5.0)))
+            sent = [(bus.joints, joints)]
+            if not (is_faulty and faults.get("no_wrench")):
+                sent.insert(0, (bus.wrench, wrench))
+            for writer, message in sent:
+                if rng.random() >= faults.get("loss", 0.0):
+                    delay = faults.get("latency", 0.0) * (1.0 + rng.uniform(-1.0, 1.0) * faults.get("jitter", 0.0))
+                    heapq.heappush(queue, (now + delay, number, id(message), writer, message))
+        while queue and queue[0][0] <= now:
+            *_, writer, message = heapq.heappop(queue)
+            writer.write(message)
+        for target in bus.take(bus.targets):
+            p = target.pose.position
+            received["targets"] += 1
+            received["last"] = [p.x, p.y, p.z]
+        for request in bus.take(bus.requests):
+            received["switched"].append(list(request.activate_controllers))
+            refused = faults.get("refuses", False)
+            bus.responses.write(messages.SwitchControllerResponse(request.guid, request.number, not refused, "refused"))
+    print(json.dumps(received))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], json.loads(sys.argv[2]))
