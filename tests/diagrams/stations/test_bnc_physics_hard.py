@@ -1,4 +1,4 @@
-"""Contact physics of the hard connector, at the default time step and at a quarter of it."""
+"""Contact physics of the hard connector, at the study's contact settings and at finer settings."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 
-FINE = {"time_step": 0.0025}
+FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
 HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
@@ -19,9 +19,9 @@ STIFFNESS = Impedance().stiffness[2]
 LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
 
 
-@pytest.fixture(scope="module", params=[{}, FINE], ids=["default", "fine"])
+@pytest.fixture(scope="module", params=[{}, FINE], ids=["study", "fine"])
 def build(request):
-    """Return a function that builds a gantry station with one of the time steps."""
+    """Return a function that builds a gantry station at one of the contact settings."""
     options = {"difficulty": "hard", **request.param}
     workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
     return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
