@@ -122,6 +122,19 @@ def test_moving_and_resting_robot_conflict_when_their_clocks_are_close(offset):
     assert sequence.num_conflicts >= 1
 
 
+@pytest.mark.parametrize(("late", "is_conflict"), [(0, True), (1, False)])
+def test_clocks_must_return_within_the_maximum_number_of_statuses(late, is_conflict):
+    """The senders change after 200 statuses, or after 201."""
+    run = module.MAX_RETURN + late
+    times = [1.0 + n * PERIOD + 1e4 * (n // run % 2) for n in range(3 * run + 1)]
+    assert status_conflicts(*(status(t, 0.0) for t in times)) == is_conflict
+
+
+def test_two_short_intervals_conflict_when_time_stamps_go_back():
+    times = 1.0 + PERIOD * np.array([0.0, -0.25, 1.0, 0.75])
+    assert status_conflicts(*(status(t, 0.0) for t in times)) == 1
+
+
 @pytest.mark.parametrize("jump", [-1e4, -1.0, 1.0, 1e4])
 def test_restarted_clock_of_one_robot_does_not_conflict(jump):
     times = 1.0 + PERIOD * np.arange(60)
