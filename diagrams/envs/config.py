@@ -197,5 +197,7 @@ def _check_given_options(task: type[Task], options: Mapping[str, Any], known: se
     if not unknown:
         return
     elsewhere = [name for name in task.stations() if unknown[0] in option_fields(STATIONS.get(name).options or Options)]
-    remedy = f"it is an option of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], known)
+    is_entry = "." in str(unknown[0])  # entries of structured options would make the list of names too long
+    names = [name for name in known if is_entry or "." not in name]
+    remedy = f"it is an option of station={elsewhere[0]!r}" if elsewhere else did_you_mean(unknown[0], names)
     raise InputError(f"{task.name} has no option {brief(unknown[0])} here: {remedy}")

@@ -22,13 +22,13 @@ from unittest.mock import patch
 
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import InputPort, OutputPort
-from stable_baselines3.common.buffers import NStepReplayBuffer
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import checkpoint, fast_sb3, off_policy, trainer
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
 TASK = "BncConnector"
 EPISODES = 6
@@ -36,7 +36,7 @@ LEARNING_STARTS = 40  # transitions before the first gradient step
 
 # Owner and name of each measured function, and its part.
 PARTS: tuple[tuple[Any, str, str], ...] = (
-    (trainer, "make_environment", "building the environment"),
+    (trainer, "make_run_environment", "building the environment"),
     (trainer, "rollout", "rollout"),
     (trainer, "_save", "checkpoint"),
     (DiagramEnv, "reset", "reset"),
@@ -48,7 +48,7 @@ PARTS: tuple[tuple[Any, str, str], ...] = (
     (off_policy.OffPolicyLearner, "act", "acting"),
     (off_policy.OffPolicyLearner, "store", "replay buffer"),
     (off_policy.OffPolicyLearner, "learn", "gradient step"),
-    (NStepReplayBuffer, "sample", "replay"),
+    (DemonstrationReplayBuffer, "sample", "replay"),
     (fast_sb3.FastTrainingStep, "train", "gradient step"),
     (fast_sb3.BatchedMLP, "forward", "forward"),
     (fast_sb3.BatchedMLP, "backward", "backward"),

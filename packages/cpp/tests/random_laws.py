@@ -118,8 +118,8 @@ def skgrl(steps: int) -> Files:
 
 
 def skgrl_measured(steps: int) -> Files:
-    history = {"source": "measured", "length": 4, "variance": 1e-8}
-    config = connector(guidance="skgrl", history=history)
+    history = {"history": 4, "history.source": "measured", "history.variance": 1e-8}
+    config = connector(guidance="skgrl", **history)
     return _primitive(config, history=True, scale=8.0, steps=steps, pose_noise=2e-5)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
+from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail_cpp.arrays import primitive_arrays
 from guiderail_cpp.export import export_cpp
@@ -56,7 +57,7 @@ def test_export_refuses_equal_bounds():
     reference = ReferenceTrajectory(np.arange(4.0), np.zeros((4, 2)), np.tile(1e-4 * np.eye(2), (4, 1, 1)))
     constraints = LinearConstraints.box([0.0, -1.0], [0.0, 1.0])
     with pytest.raises(InputError, match="equal lower and upper bounds"):
-        primitive_arrays(LcNsKmp(reference, constraints=constraints), np.eye(2), is_measured=False)
+        primitive_arrays(PrimitiveLaw(LcNsKmp(reference, constraints=constraints)))
 
 
 def test_export_refuses_a_folder_that_exists(tmp_path):

@@ -191,7 +191,7 @@ TASK = {
              "pieces": [{"file": "part.obj", "modulus": 1e9}]},
     "socket": {"source": "s.stl", "visual": "part.obj", "mass": 0.1, "center": [0, 0, 0], "gyration": 0.01,
                "pieces": [{"file": "part.obj"}]},
-    "motion": {"travel": 0.02, "rim": 0.01, "push": 0.004}, "demonstrations": {"file": "d.csv"},
+    "motion": {"travel": 0.02, "first_contact": 0.01, "push": 0.004}, "demonstrations": {"file": "d.csv"},
     "scenario": ["table.yaml"], "measured": {"clearance": 1},
 }  # fmt: skip
 SCENARIO = b"""station: simulation

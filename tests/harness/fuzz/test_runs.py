@@ -21,7 +21,7 @@ from guiderail.models.policy import FORMAT, Policy, _digest
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.config import config_values, resolve_preset
 from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.run_folder import RunFolder
@@ -74,14 +74,15 @@ def try_config(target, folder, text):
     for name, value in expected["environment"].items():
         result = config.environment[name]
         assert (list(result) if isinstance(result, tuple) else result) == value or value != value
+    settings = config_values(config.learner)
     for name, value in expected["learner"].items():
-        result = getattr(config.learner, name)
+        result = settings[name]
         if isinstance(result, bool) or isinstance(value, bool):
             assert result in (0, 1)
             assert isinstance(result, bool)
         elif isinstance(result, str):
             assert result == str(value)
-        elif isinstance(result, tuple):
+        elif isinstance(result, tuple | list):
             assert list(result) == [int(n) for n in (value.split(",") if isinstance(value, str) else value)]
         else:
             assert result == float(value)

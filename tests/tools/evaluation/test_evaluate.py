@@ -224,7 +224,9 @@ def test_evaluate_saves_successful_episodes(tmp_path):
 def test_evaluate_refuses_to_save_poses_that_are_not_recorded(tmp_path, monkeypatch):
     spec = EnvSpec("guiderail/Outside-v0", lambda render_mode: PointEnv(), max_episode_steps=1)
     monkeypatch.setitem(gymnasium.registry, spec.id, spec)
-    with pytest.raises(InputError, match="Outside is no task of this package and records no poses: leave --save out"):
+    with pytest.raises(
+        InputError, match="Outside is no task of this package and records no poses: leave --save and --steps out"
+    ):
         evaluate("zero", "Outside", 1, save=tmp_path / "saved.npz")
 
 

@@ -18,7 +18,7 @@ def image():
 def features_of(image, encoder):
     """Return the features of one image in evaluation mode."""
     space = gymnasium.spaces.Box(0, 255, (image.size,), np.uint8)
-    extractor = ImageFeatures(space, image.shape, encoder, 0).eval()
+    extractor = ImageFeatures(space, image.shape, encoder).eval()
     packed = torch.as_tensor(pack_observation(image, image.shape))[None]
     with torch.no_grad():
         features = extractor(packed)[0].numpy()

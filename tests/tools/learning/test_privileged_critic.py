@@ -98,7 +98,8 @@ def test_fast_step_equals_the_step_of_stable_baselines3(plain, fast):
     learners = [make(kind, learning_rate=1e-4) for kind in (plain, fast)]
     np.random.seed(0)  # noqa: NPY002 (Stable-Baselines3 samples from it)
     batches = learners[0].model.replay_buffer.sample(4 * 8)
-    single_batches = iter(zip(*[array.split(8) for array in batches], strict=True))
+    split = [[None] * 4 if array is None else array.split(8) for array in batches]
+    single_batches = iter(zip(*split, strict=True))
     samplers = (lambda _, env=None: type(batches)(*next(single_batches)), lambda _, env=None: batches)
     for learner, sample in zip(learners, samplers, strict=True):
         learner.model.replay_buffer.sample = sample

@@ -32,7 +32,7 @@ TASK = {
     "name": "parts/pin",
     "plug": PART,
     "socket": PART,
-    "motion": {"travel": 0.02, "rim": 0.01},
+    "motion": {"travel": 0.02, "first_contact": 0.01},
     "demonstrations": {"components": 1},
 }
 POLICY = {"observation_shape": [1], "action_low": [-1], "action_high": [1]}
