@@ -241,9 +241,10 @@ class CartesianImpedanceController(ConvertibleSystem):
         """Set the gains in the context of the system.
 
         Raises:
-            InputError: If the posture has another number of joints, or the bound is not the one of the constructor;
-                lower a bound at ``max_wrench``.
+            InputError: If the context is another system's, the posture has another number of joints, or the bound is
+                not the one of the constructor; lower a bound at ``max_wrench``.
         """
+        declare.check_own_context(self, context)
         if np.shape(gains.posture) != np.shape(self._gains.posture):
             raise InputError(f"an impedance's posture must have {len(self._gains.posture)} joints, as in this plant")
         if gains.bound is not self._gains.bound:
@@ -252,7 +253,12 @@ class CartesianImpedanceController(ConvertibleSystem):
             context.get_mutable_numeric_parameter(index).SetFromVector(numbers)
 
     def set_payload(self, context: Context, payload: Payload) -> None:
-        """Set the payload that is compensated, in the context of the system."""
+        """Set the payload that is compensated, in the context of the system.
+
+        Raises:
+            InputError: If the context is another system's.
+        """
+        declare.check_own_context(self, context)
         numbers = np.array([payload.mass, *payload.center])
         context.get_mutable_numeric_parameter(self._parameters[-1]).SetFromVector(numbers)
 

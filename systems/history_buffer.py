@@ -41,7 +41,8 @@ class HistoryBuffer(LeafSystem):
         period: Control period [s], positive.
         near: Pose (6,), [x y z Rz Ry Rx], such as the first mean of the reference; None: outputs are stored unchanged.
             With it, the angles of the first output are those of its orientation nearest to `near`, and the angles of
-            each output those nearest to the output before (`nearest_pose`), so that the history has no jumps.
+            each output those nearest to the output before (`nearest_pose`), so that the history has no jumps. Without
+            it, `LcNsKmpSystem` refuses a start more than half a turn from its reference.
 
     Raises:
         InputError: If an argument is out of range; at initialization, if ``initial_output`` is not connected or not

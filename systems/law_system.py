@@ -33,6 +33,7 @@ class LawSystem(LeafSystem):
         - fallback
 
     ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,).
+    ``wrench`` must not depend on ``desired_pose`` at the initialization; take it from a sensor or behind a hold.
     ``held_action`` is the action of the present control step. The inputs are sampled at control steps, and the state of
     the law is discrete state: there is no direct feedthrough, so that feedback of the measured pose causes no algebraic
     loop.

@@ -9,6 +9,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
 from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.laws.law import checked_vector
 from guiderail.models.laws.primitive import output_or_nearest, predict
 from guiderail.models.primitives import LcNsKmp
@@ -44,12 +45,12 @@ class LcNsKmpSystem(LeafSystem):
         - constraint_violation
         - fallback
 
-    ``null_space_action`` is (O,), the policy's action in [−1, 1], constant during a control step. ``history`` is
-    (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the primitive by the
-    length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of ``history``, so that its
-    command starts at the end of the previous command. ``reference_window`` is ((H+1)(O + O²),) for the horizon H of
-    `primitive`: means and covariances, the current step first. If this port is connected, they replace those of the
-    reference trajectory, and all primitives must have the horizon H. ``command`` is (O,).
+    ``null_space_action`` is (O,), the policy's action in [−1, 1], which is not clipped here, constant during a control
+    step. ``history`` is (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the
+    primitive by the length of its history (`HistoryLengthSchedule`). Each primitive uses the newest part of
+    ``history``, so that its command starts at the end of the previous command. ``reference_window`` is ((H+1)(O + O²),)
+    for the horizon H of `primitive`: means and covariances, the current step first. If this port is connected, they
+    replace those of the reference trajectory, and all primitives must have the horizon H. ``command`` is (O,).
     ``constraint_violation`` (1,) is max(c − G y) of the command y: negative if all constraints are slack, and
     `ConstraintViolation.UNCONSTRAINED` if there is no constraint. ``fallback`` (1,) is 1 if no window within the
     constraints was found. The command is then the point within the constraints of the current step that is nearest to
@@ -74,8 +75,9 @@ class LcNsKmpSystem(LeafSystem):
         InputError: If an argument has the wrong type, a gain has the wrong shape or is not finite, the period is not
             positive, or the primitives in `shorter` do not have different histories of 1 to P − 1 outputs and the
             constraints of `primitive`. At initialization, if ``reference_window`` is connected and the primitives
-            have different horizons. At an evaluation, if the action, the history or the time is not finite, or no
-            primitive has the selected history length.
+            have different horizons. At an evaluation, if the action, the history or the time is not finite, no
+            primitive has the selected history length, or the history of a pose (O = 6) starts more than half a turn
+            from the reference.
     """
 
     def __init__(
@@ -197,6 +199,13 @@ class LcNsKmpSystem(LeafSystem):
         if self._history_port is not None:
             history = self._history_port.Eval(context).reshape(-1, primitive.num_outputs)[-length:]
         window = self._reference_window_port.Eval(context) if self._reference_window_port.HasValue(context) else None
+        if step == 0 and history is not None and window is None and primitive.num_outputs == POSE_SIZE:
+            angles = np.abs(history[-1, 3:] - primitive.reference.means[0, 3:]).max()
+            if angles > math.pi + 1e-6:  # a command between the two would be far from both
+                raise InputError(
+                    f"the history starts {angles:.2f} rad from the reference, more than half a turn: give the "
+                    "HistoryBuffer `near`, the first mean of the reference"
+                )
         output = predict(primitive, step, action, history, window)
         last_command = context.get_discrete_state().value(self._last_command)
         value.set_value(_Prediction(step, *output_or_nearest(primitive.constraints, step, output, last_command)))

@@ -1,4 +1,7 @@
-"""Validation of shared control templates before they are used: `guiderail template validate`."""
+"""Validation of shared control templates before they are used: `guiderail template validate`.
+
+The command is in `tools/cli/template.py`; the checks of a template are in `models/templates/validate.py`.
+"""
 
 from __future__ import annotations
 

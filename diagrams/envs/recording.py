@@ -1,4 +1,7 @@
-"""Recording of a station that follows a given motion, for demonstrations, benchmarks and tests of physics."""
+"""Recording of a station that follows a given motion, for demonstrations, benchmarks and tests of physics.
+
+No environment uses it: contact probes, guiderail-parts and research do. The record of an episode is `trace.py`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Settings of an environment as its task reads them."""
+"""Settings of an environment as its task reads them.
+
+Base of `EnvConfig`, in a file of its own because tasks need it and `config.py` imports tasks.
+"""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike
 from pydrake.geometry import Meshcat
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import Context, Diagram, OutputPort, PortDataType
 
 from guiderail.diagrams.envs.scene import View
@@ -72,6 +73,17 @@ class Symmetry:
         return cls(*(np.diag(np.asarray(each, float))[None] for each in signs))
 
 
+def plant_steps(diagram: Diagram) -> list[float]:
+    """Return the time steps of all discrete plants in a diagram, nested ones included [s]."""
+    steps = []
+    for system in diagram.GetSystems():
+        if isinstance(system, Diagram):
+            steps += plant_steps(system)
+        elif isinstance(system, MultibodyPlant) and system.time_step() > 0.0:
+            steps.append(system.time_step())
+    return steps
+
+
 @dataclass(frozen=True)
 class TaskDiagram:
     """Built diagram of a task, with the data that `DiagramEnv` needs to run it.
@@ -124,8 +136,8 @@ class TaskDiagram:
 
     Raises:
         InputError: If the diagram lacks a port, the size of the observation does not match its space,
-            `control_period` is not positive, `num_steps` is not a positive whole number, or the size of a symmetry does
-            not match the observation and the action.
+            `control_period` is not positive or no multiple of a discrete plant's time step, `num_steps` is not a
+            positive whole number, or the size of a symmetry does not match the observation and the action.
     """
 
     diagram: Diagram
@@ -158,6 +170,13 @@ class TaskDiagram:
             raise InputError(f"the observation has {port.size()} entries, but observation_space has the shape {shape}")
         if not is_whole(self.num_steps, 1) or not as_number(self.control_period, "control_period") > 0:
             raise InputError(f"a task can't last {self.num_steps} steps of {self.control_period} s")
+        for step in plant_steps(self.diagram):
+            number = round(self.control_period / step)
+            if number < 1 or abs(number * step - self.control_period) > 1e-6:
+                raise InputError(
+                    f"the control period of {self.control_period:g} s is no whole multiple of a plant's time step of "
+                    f"{step:g} s: choose another time step"
+                )
         for symmetry in (self.symmetry, self.near_symmetry):
             if symmetry is not None and (
                 symmetry.observations.shape[1:] != 2 * self.observation_space.shape

@@ -1,4 +1,8 @@
-"""Probe of simulated contact: drag, lever arm and capture of a workpiece that is pressed on the rim of its fixture."""
+"""Probe of simulated contact: drag, lever arm and capture of a workpiece that is pressed on the rim of its fixture.
+
+Not a task: `create-task` (guiderail-parts) and `converge` (guiderail-studies) run it; a task only returns its
+`RimContact`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Base class of insertion tasks: a workpiece in the tool and a fixture at an uncertain position."""
+"""Base class of insertion tasks: a workpiece in the tool and a fixture at an uncertain position.
+
+`InsertionTask` is general. `DemonstratedInsertion` and the rewards, tuned for the connector, are shared with the clamp
+and parts: a change alters all of them.
+"""
 
 from __future__ import annotations
 

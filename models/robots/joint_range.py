@@ -1,4 +1,7 @@
-"""Constraints on the commanded pose: joint limits of an arm, and distance from singular postures."""
+"""Constraints on the commanded pose: joint limits of an arm, and distance from singular postures.
+
+`JointRange` implements `StateConstraints` of `models/control/motion_constraints.py`; a station of an arm makes it.
+"""
 
 from functools import lru_cache
 

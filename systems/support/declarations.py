@@ -221,6 +221,19 @@ def part_output(
     return system.DeclareVectorOutputPort(name, size or 1, calc, prerequisites_of_calc=tickets(system, [source]))
 
 
+def check_own_context(system: LeafSystem, context: Context) -> None:
+    """Raise an `InputError` unless a context is that of the system, and not of a diagram around it.
+
+    In the context of a diagram, a parameter's index would be that of another system.
+    """
+    try:
+        system.ValidateContext(context)
+    except RuntimeError:
+        raise InputError(
+            f"the context is not that of '{system.get_name()}': pass system.GetMyMutableContextFromRoot(root_context)"
+        ) from None
+
+
 def start_pose(pose: np.ndarray) -> np.ndarray:
     """Check the measured pose (O,) at initialization and return it; it is the first command of a motion.
 

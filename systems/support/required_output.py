@@ -1,4 +1,7 @@
-"""Check that an output of a system is read, because a diagram in which it is not connected would be unsafe."""
+"""Check that an output of a system is read, because a diagram in which it is not connected would be unsafe.
+
+Used by `PhaseWrenchLimit` and `SctStateMachine`, which raise the error.
+"""
 
 import numpy as np
 from pydrake.systems.framework import Context, LeafSystem

@@ -40,7 +40,7 @@ class TemplateFrames:
         missing = [name for name in template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {template.name} needs the frame {missing[0]}: give its pose")
-        self.names = template.frames
+        self._system, self.names = system, template.frames
         self._indices = [
             system.DeclareNumericParameter(BasicVector(_checked_pose(name, frames[name]))) for name in template.frames
         ]
@@ -64,8 +64,9 @@ class TemplateFrames:
         """Set the poses of frames by name in the context of the system; other frames do not move.
 
         Raises:
-            InputError: If the template has no such frame, or a pose is not finite.
+            InputError: If the context is another system's, the template has no such frame, or a pose is not finite.
         """
+        declare.check_own_context(self._system, context)
         for name in frames:
             if name not in self.names:
                 raise InputError(f"the template has no frame {name}, only {', '.join(self.names)}")

@@ -571,6 +571,17 @@ def test_changed_gains_are_refused_when_they_do_not_fit():
         law.system.set_gains(law.context, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7), bound=bound))
 
 
+@pytest.mark.parametrize("changed", ["gains", "payload"])
+def test_parameters_are_refused_in_the_context_of_a_diagram(changed):
+    """There, the parameters of another controller would be changed."""
+    law, builder = Law(), DiagramBuilder()
+    builder.AddSystem(law.system)
+    root = builder.Build().CreateDefaultContext()
+    value = law.gains if changed == "gains" else Payload(1.0)
+    with pytest.raises(InputError, match=r"pass system\.GetMyMutableContextFromRoot"):
+        getattr(law.system, f"set_{changed}")(root, value)
+
+
 def test_payload_is_compensated():
     """A payload of 2 kg at the tool center does not displace the tool if the controller has it as a parameter."""
     displacements = []

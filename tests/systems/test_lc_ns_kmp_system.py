@@ -348,3 +348,30 @@ def test_connected_motion_time_determines_the_step():
         time.GetMutableData().set_value([step * PERIOD])
         command = system.get_command_output_port().Eval(context)
         np.testing.assert_array_equal(command, p.predict(step, action).output)
+
+
+@pytest.mark.parametrize("start", [3.1, -3.1])
+def test_history_a_full_turn_from_the_reference_is_refused_unless_near_is_given(start):
+    """Its commands would be between the reference and the robot, far from both."""
+    means = np.zeros((20, 6))
+    means[:, 5] = 3.1
+    reference = ReferenceTrajectory(PERIOD * np.arange(20), means, np.tile(0.01 * np.eye(6), (20, 1, 1)))
+    pose = np.array([0.0, 0.0, 0.0, 0.0, 0.0, start])
+    for near in (None, means[0]):
+        builder = DiagramBuilder()
+        kmp = builder.AddSystem(LcNsKmpSystem(LcNsKmp(reference, history=3, horizon=4), None, PERIOD))
+        history = builder.AddSystem(HistoryBuffer(6, 3, PERIOD, near=near))
+        source = builder.AddSystem(ConstantVectorSource(pose))
+        zero = builder.AddSystem(ConstantVectorSource(np.zeros(6)))
+        for port in (history.get_output_input_port(), history.get_initial_output_input_port()):
+            builder.Connect(source.get_output_port(), port)
+        builder.Connect(zero.get_output_port(), kmp.get_null_space_action_input_port())
+        builder.Connect(history.get_history_output_port(), kmp.get_history_input_port())
+        simulator = Simulator(builder.Build())
+        simulator.Initialize()
+        context = kmp.GetMyContextFromRoot(simulator.get_context())
+        if near is None and start < 0.0:
+            with pytest.raises(InputError, match=r"starts 6\.20 rad from the reference"):
+                kmp.get_command_output_port().Eval(context)
+        else:
+            assert abs(kmp.get_command_output_port().Eval(context)[5] - 3.1) < 0.1

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform
+from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
@@ -70,6 +71,10 @@ def test_input_mapping_uses_a_frame_set_by_a_reset(system):
 def test_input_mapping_refuses_an_unknown_frame(system):
     with pytest.raises(InputError, match="no frame cup, only mug_tip"):
         system.frames.set(system.CreateDefaultContext(), {"cup": RigidTransform()})
+    builder = DiagramBuilder()
+    builder.AddSystem(system)
+    with pytest.raises(InputError, match=r"pass system\.GetMyMutableContextFromRoot"):
+        system.frames.set(builder.Build().CreateDefaultContext(), {"mug_tip": RigidTransform()})
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf])

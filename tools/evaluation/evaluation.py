@@ -1,4 +1,8 @@
-"""Results of an evaluation: stored episodes, statistics of a policy and of baseline policies, and their comparison."""
+"""Results of an evaluation: stored episodes, statistics of a policy and of baseline policies, and their comparison.
+
+`evaluate.py` runs the episodes and imports this module. The digest in the names of files decides which stored episodes
+are used again.
+"""
 
 from __future__ import annotations
 

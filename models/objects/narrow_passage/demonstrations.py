@@ -4,6 +4,8 @@ They replace the hand-drawn demonstrations of the thesis (figures 4.3 and 5.3), 
 originals, they are smooth, have the same duration, vary where the plane is free, and agree in the passage. Their starts
 and goals differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean
 crosses the obstacle, and two of them enter the zone.
+
+`python -m research.generate narrow_passage` writes the packaged file; afterwards generate `mixtures` again.
 """
 
 from pathlib import Path

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from pydrake.gym import DrakeGymEnv
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from guiderail.diagrams.envs.env import INFO_KEYS, DiagramEnv
@@ -85,9 +86,13 @@ class Toy(LeafSystem):
         state.set_value(x)
 
 
-def make(num_steps=20, **arguments):
+def make(num_steps=20, plant_step=None, **arguments):
     """Return an environment of `Toy`, whose reset option `start` is the initial position."""
     builder = DiagramBuilder()
+    if plant_step is not None:
+        nested = DiagramBuilder()
+        nested.AddSystem(MultibodyPlant(plant_step)).Finalize()
+        builder.AddSystem(nested.Build())
     toy = builder.AddNamedSystem("toy", Toy())
     builder.ExportInput(toy.get_input_port(), "action")
     for i in range(toy.num_output_ports()):
@@ -437,6 +442,14 @@ def test_task_diagram_names_a_missing_port():
     builder.ExportOutput(toy.GetOutputPort("reward"), "reward")
     with pytest.raises(ValueError, match="observation"):
         TaskDiagram(builder.Build(), PERIOD, 3, gymnasium.spaces.Box(-1, 1, (4,)), (), ())
+
+
+@pytest.mark.parametrize("step", [0.03, 0.2])
+def test_time_step_of_a_nested_plant_divides_the_control_period(step):
+    make(plant_step=0.025)
+    make(plant_step=0.0)  # continuous
+    with pytest.raises(InputError, match=f"of 0.1 s is no whole multiple of a plant's time step of {step} s"):
+        make(plant_step=step)
 
 
 def test_step_is_refused_when_the_simulator_is_ahead():

@@ -21,9 +21,10 @@ from guiderail.diagrams.stations.impedance_control import (
 )
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
+from guiderail.models.laws.skill import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
-from guiderail.tools.export import GUIDED, SKILL_FILE, TrainedSkill, load_skill, to_json, write_files
+from guiderail.tools.export import GUIDED, TrainedSkill, load_skill, to_json, write_files
 from guiderail.tools.files import check_new
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
 from guiderail_cpp.recording import record_skill

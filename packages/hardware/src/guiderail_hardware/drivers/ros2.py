@@ -121,6 +121,10 @@ class Ros2Bus:
         switch = topic(requests, messages.SwitchControllerRequest)
         switched = topic(responses, messages.SwitchControllerResponse)
         service = Qos(Policy.Reliability.Reliable(10**9), Policy.History.KeepLast(8))
+        self.joints: Any
+        self.wrench: Any
+        self.requests: Any
+        self.responses: Any
         if robot_side:
             self.joints, self.wrench = (DataWriter(self._participant, each, qos=newest) for each in (joints, wrench))
             self.responses = DataWriter(self._participant, switched, qos=service)

@@ -2,6 +2,9 @@
 
 ROS 2 calls the type `pkg/msg/Name` on the bus `pkg::msg::dds_::Name_`, and the topic `/name` `rt/name`.
 """
+
+# mypy: disable-error-code="type-arg, assignment"
+# Cyclone DDS reads the annotations at run time; its `sequence` is not generic for type checkers.
 # Annotations are types, not texts, because Cyclone DDS reads them: no `from __future__ import annotations` here.
 
 from dataclasses import dataclass, field
