@@ -5,7 +5,7 @@ originals, they are smooth, have the same duration, vary where the plane is free
 and goals differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean
 crosses the obstacle, and two of them enter the zone.
 
-`python -m research.generate narrow_passage` writes the packaged file; afterwards generate `mixtures` again.
+`python -m research.generate passage-demonstrations` writes the packaged file; afterwards generate `mixtures` again.
 """
 
 from pathlib import Path
