@@ -35,7 +35,9 @@ def store(runs: Runs, out: Path, tables: Path = TABLES) -> list[Path]:
             training.append(_labeled(job.folder.episodes(), method=job.method, seed=job.seed))
         for number in job.after_episodes:
             for eval_set in job.study.eval_sets:
-                for file in sorted(folder.glob(f"{eval_set.name.replace(' ', '_')}-{number}-*.csv")):
+                files = folder.glob(f"{eval_set.name.replace(' ', '_')}-{number}-*.csv")
+                # An evaluation by another version of the package has a file of its own: the newest counts.
+                for file in sorted(files, key=lambda file: file.stat().st_mtime)[-1:]:
                     labels = {"method": job.method, "seed": job.seed, "after_episodes": number if job.learns else 0}
                     evaluated.append(_labeled(read_table(file), **labels))
     written = []
