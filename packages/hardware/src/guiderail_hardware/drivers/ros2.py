@@ -244,7 +244,9 @@ class Ros2Driver(PoseDriver):
     def _count_foreign_commands(self) -> None:
         """Count targets of other programs."""
         for sample in self._bus.take(self._bus.targets):
-            self.num_foreign_commands += int(sample.sample_info.publication_handle) != self._bus.target.instance_handle
+            # Cyclone DDS gives one of the two handles with a sign and the other without.
+            difference = int(sample.sample_info.publication_handle) - int(self._bus.target.instance_handle)
+            self.num_foreign_commands += difference % 2**64 != 0
 
     def check_setup(self) -> list[Check]:
         """Check the messages of the robot and the controller that receives targets."""
