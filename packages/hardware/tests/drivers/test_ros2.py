@@ -4,6 +4,7 @@ import os
 import time
 from importlib.util import find_spec
 from itertools import count
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -190,6 +191,19 @@ def test_address_names_topics_on_the_bus():
     assert (address.domain, address.topic(address.joints)) == (7, "rt/left/joint_states")
     assert (address.topic(address.target), address.topic(address.wrench)) == ("rt/global/target", "rt/left/ft")
     assert address.service("switch_controller")[0] == "rq/left/controller_manager/switch_controllerRequest"
+
+
+@pytest.mark.parametrize("handle", [5, -5])
+def test_own_target_is_not_foreign_whatever_the_sign_of_its_handle(handle):
+    """The middleware gives the sender of a sample without a sign, the handle of a writer with one."""
+    driver = object.__new__(Ros2Driver)
+    infos = [SimpleNamespace(publication_handle=sender % 2**64) for sender in (handle, handle, 7)]
+    taken = [SimpleNamespace(sample_info=info) for info in infos]
+    target = SimpleNamespace(instance_handle=handle)
+    driver._bus = SimpleNamespace(targets=None, target=target, take=lambda reader: taken)
+    driver.num_foreign_commands = 0
+    driver._count_foreign_commands()
+    assert driver.num_foreign_commands == 1
 
 
 class FollowingRobot:
