@@ -33,7 +33,8 @@ class Frames(EnvCallback):
     The environment must have been created with `render_mode="rgb_array"`.
 
     Attributes:
-        frames: Time [s], contact force [N] and image (height, width, 3) of each frame.
+        frames: Time [s], force of the impedance or, without one, of the contact [N], and
+            image (height, width, 3) of each frame.
     """
 
     def __init__(self, env: Any, max_frames: int = MAX_FRAMES):
