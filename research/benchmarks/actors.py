@@ -17,7 +17,7 @@ from typing import Any
 
 from guiderail.tools.learning.configure import configure, with_defaults
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 from research.benchmarks import with_progress
 
 EPISODES, SKIPPED = 12, 5  # number of episodes of a run, and number of the first ones, which are not timed
@@ -74,7 +74,7 @@ def _run(task: str, environment: Mapping[str, Any], cores: int, num_envs: int) -
         run_training(
             RunFolder(Path(folder) / "run"),
             config,
-            report=lambda row: clocks.append((time.perf_counter(), time.process_time())),
+            observers=Observers(lambda row: clocks.append((time.perf_counter(), time.process_time()))),
         )
     timed = EPISODES - SKIPPED
     wall, own = ((clocks[-1][i] - clocks[SKIPPED - 1][i]) / timed for i in range(2))

@@ -46,7 +46,7 @@ def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     with (
         tempfile.TemporaryDirectory() as folder,
         timed(StepLog, "on_episode_end") as step_log,
-        timed(trainer, "_save") as checkpoints,
+        timed(trainer.TrainingLoop, "write_checkpoint") as checkpoints,
     ):
         rows = trainer.run_training(RunFolder(Path(folder) / "run"), config)
     seconds = sum(row["wall_time"] for row in rows) + sum(checkpoints)

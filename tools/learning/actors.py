@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import gymnasium
 import numpy as np
 from stable_baselines3.common.utils import set_random_seed
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.policy import Policy
-from guiderail.tools.evaluation.episode import Callback, PolicyFn, Transition, has_image
+from guiderail.tools.evaluation.episode import Callback, Transition, has_image
 from guiderail.tools.evaluation.forks import Forks, KilledError, can_fork
 from guiderail.tools.evaluation.rollout import new_columns, rollout
 from guiderail.tools.learning.checkpoint import entries_of
 from guiderail.tools.learning.environment_set import select_environment
+from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 from guiderail.tools.learning.sb3 import load_module, module_arrays, restore_modules
@@ -42,74 +41,51 @@ class SimulatedEpisode(NamedTuple):
     is_greedy: bool  # True if the learner acted without exploration
 
 
-class ParallelLearner(Learner):
-    """Learner that trains in this process while N actors, which are forks of this process, simulate episodes.
+class ActorEpisodes(Episodes):
+    """Episodes that N actors, which are forks of this process, simulate while this process learns.
 
     Episode k uses the weights learned from the first k − N episodes, in their order; its random numbers depend only on
     the seed and k. The result of a run therefore depends on N but not on the timing of the processes; the conditions of
     episode k do not depend on N. With N = 1, an episode is simulated while the learner learns from the previous one.
     """
 
-    def __init__(
-        self,
-        learner: Learner,
-        env: gymnasium.Env,
-        *,
-        num_envs: int,
-        seed: int,
-        num_episodes: int,
-        demonstrator: tuple[Callable[[gymnasium.Env], PolicyFn], int] | None = None,
-        callbacks: tuple[Callback, ...] = (),
-    ):
-        """Construct the learner; the actors start with the first episode.
-
-        Args:
-            learner: Learner that is trained in this process.
-            env: Environment, already reset once, so that the values that are constant in the run are sampled.
-            num_envs: Number N of actors.
-            seed: Seed of the run.
-            num_episodes: Number of episodes of the run.
-            demonstrator: Function that makes the policy that acts instead of the learner in the first episodes, and
-                their number.
-            callbacks: Callbacks of the episodes; they run in the actors' processes.
+    def __init__(self, episodes: Episodes, learner: Learner):
+        """Construct the episodes in the environment of `episodes`, already reset once; the first one starts the actors.
 
         Raises:
             InputError: If the learner is not an `OffPolicyLearner`, observations have images, or this process cannot
                 fork.
         """
+        super().__init__(episodes.config, episodes.env, episodes.demonstrator)
         if not isinstance(learner, OffPolicyLearner):
             raise InputError("only an off-policy learner has parallel actors: choose tqc, sac, td3 or crossq")
         if not can_fork():
             raise InputError("parallel actors are forks, which this process cannot create: leave num_envs out")
-        if has_image(env.observation_space):
+        if has_image(self.env.observation_space):
             raise InputError("parallel actors are forks, which cannot render images: leave num_envs out")
-        self._learner, self._env, self._num_envs, self._seed = learner, env, num_envs, seed
-        self._num_episodes, self._demonstrator, self._callbacks = num_episodes, demonstrator, callbacks
+        self._learner, self._num_envs = learner, self.config.learner.num_envs
+        self._callbacks: tuple[Callback, ...] = ()  # they run in the actors' processes
         self._forks: Forks | None = None
         self._learned = self._assigned = 0  # numbers of episodes learned from and assigned
         self._simulated: dict[int, SimulatedEpisode] = {}
         self._snapshots = {0: _snapshot(learner)}  # by the number of episodes learned from
         self._earlier_episodes = 0  # episodes of the run that `init_from` names
 
-    def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action (A,) of the learner for an observation."""
-        return self._learner.act(observation)
-
-    def episode(self, index: int) -> dict[str, Any]:
+    def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
         """Learn from episode `index`, which must be the next one, and return its row.
 
         Raises:
             InputError: If an actor was killed or learning diverged. An exception in an actor is raised here.
         """
+        if self._forks is None:
+            self._callbacks, self._earlier_episodes = callbacks, self._learner.episodes - index
+            self._forks = Forks(self._simulate, min(self._num_envs, self.config.episodes - index))
         try:
             return self._learn(index)
         except KilledError:
             raise InputError("an actor was killed: resume the run, which continues from its last checkpoint") from None
 
     def _learn(self, index: int) -> dict[str, Any]:
-        if self._forks is None:
-            self._earlier_episodes = self._learner.episodes - index
-            self._forks = Forks(self._simulate, min(self._num_envs, self._num_episodes - index))
         while index not in self._simulated:
             self._exchange(None)
         learner, episode = self._learner, self._simulated.pop(index)
@@ -134,7 +110,7 @@ class ParallelLearner(Learner):
     def _exchange(self, timeout: float | None) -> None:
         """Assign episodes to idle actors and collect simulated ones; wait at most `timeout` [s], forever if None."""
         assert self._forks is not None
-        while self._forks.has_idle and self._assigned < self._num_episodes:
+        while self._forks.has_idle and self._assigned < self.config.episodes:
             if (required := self._required(self._assigned)) > self._learned:
                 break
             self._forks.submit((self._assigned, self._snapshots[required]))
@@ -145,68 +121,37 @@ class ParallelLearner(Learner):
     def _simulate(self, assignment: tuple[int, Snapshot]) -> SimulatedEpisode:
         """Simulate an episode; called in a fork."""
         (index, snapshot), learner = assignment, self._learner
-        conditions, exploration, process = np.random.SeedSequence([self._seed, index]).spawn(3)
-        select_environment(self._env, index)
-        self._env.unwrapped.np_random = np.random.default_rng(conditions)
+        conditions, exploration, process = np.random.SeedSequence([self.config.seed, index]).spawn(3)
+        select_environment(self.env, index)
+        self.env.unwrapped.np_random = np.random.default_rng(conditions)
         learner.random = np.random.default_rng(exploration)
         set_random_seed(int(process.generate_state(1)[0]))  # global generators, which Stable-Baselines3 uses
         load_weights(learner, snapshot.weights)
         learner.episodes, learner.transitions = self._earlier_episodes + index, snapshot.transitions
         learner.greedy_successes, learner.selection = snapshot.greedy_successes, None
-        act: PolicyFn = learner.act
-        if self._demonstrator is not None and index < self._demonstrator[1]:
-            act = self._demonstrator[0](self._env)
         recorder = _EpisodeRecorder(learner)
-        row = rollout(self._env, act, recorder, *self._callbacks, index=index)
+        row = rollout(self.env, self.policy(learner, index), recorder, *self._callbacks, index=index)
         return SimulatedEpisode(index, row, recorder.transitions, learner.is_greedy)
 
-    def finish(self) -> None:
+    def end(self) -> None:
         """End the actors, and discard the episodes that they simulated ahead."""
-        self.close()
-
-    def close(self) -> None:
-        """End the actors."""
         if self._forks is not None:
             self._forks.close()
             self._forks = None
 
-    def metrics(self) -> Mapping[str, float]:
-        """Return the metrics that the learner recorded since the last call."""
-        self._learner.records_metrics = self.records_metrics
-        return self._learner.metrics()
-
-    def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the policy of the learner; the entries of `description` are added to its description."""
-        return self._learner.policy(description)
-
-    def has_diverged(self) -> bool:
-        """Return True if a parameter of the actor network is NaN or infinite."""
-        return self._learner.has_diverged()
-
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return the state of the learner, and the snapshots that the next episodes use."""
-        arrays, values = self._learner.state()
-        stored = {f"learner/{name}": array for name, array in arrays.items()}
-        stored |= {
-            f"snapshot/{number}/{name}": array
+        """Return the snapshots that the next episodes use."""
+        arrays = {
+            f"{number}/{name}": array
             for number, snapshot in self._snapshots.items()
             for name, array in snapshot.weights.items()
         }
-        snapshots = {str(number): counts for number, (_, *counts) in self._snapshots.items()}
-        return stored, {"learner": values, "learned": self._learned, "snapshots": snapshots}
+        return arrays, {str(number): counts for number, (_, *counts) in self._snapshots.items()}
 
-    def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
-        """Restore a result of `state`; episodes simulated ahead of the checkpoint are simulated again.
-
-        Raises:
-            KeyError: If an entry is missing.
-            RuntimeError, ValueError: If the state does not fit this learner.
-        """
-        self._learner.restore(entries_of(arrays, "learner"), values["learner"])
-        self._snapshots = {}
-        for number, counts in values["snapshots"].items():
-            self._snapshots[int(number)] = Snapshot(entries_of(arrays, f"snapshot/{number}"), *counts)
-        self._learned = self._assigned = values["learned"]
+    def restore(self, rows: list[dict[str, Any]], arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Restore a result of `state`; episodes simulated ahead of the checkpoint are simulated again."""
+        self._snapshots = {int(k): Snapshot(entries_of(arrays, k), *counts) for k, counts in values.items()}
+        self._learned = self._assigned = len(rows)
 
 
 class _EpisodeRecorder(Callback):

@@ -143,8 +143,6 @@ def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     values = stored["learner"]
     if "acting" in values:  # pipelined; only the acting process counts the episodes
         arrays, values = entries_of(arrays, "learning"), values["learning"] | {"episodes": values["acting"]["episodes"]}
-    elif "learner" in values:  # with parallel actors
-        arrays, values = entries_of(arrays, "learner"), values["learner"]
     if "exploration" not in values:
         raise InputError(f"init_from names {run}, whose learner is not off-policy: name a run of the same algorithm")
     return arrays, values

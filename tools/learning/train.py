@@ -37,7 +37,7 @@ from guiderail.tools.learning.learner import check_log_formats
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, SetMember
 
 if TYPE_CHECKING:
-    from guiderail.tools.learning.supervision import Supervise
+    from guiderail.tools.learning.episodes import Supervise
 
 # Statistics of a run's summary.
 SUMMARY = (
@@ -261,16 +261,17 @@ def start_or_resume(
         )
     if not resume:
         warn_of_unfinished_source(config)
-    from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
+    from guiderail.tools.learning.trainer import (
+        Observers,
+        run_training,
+    )  # imports PyTorch: slow, so after the input checks
 
     demonstrator = _make_demonstrator(config) if num_demonstrated else None
     supervise = open_supervision() if config.human_in_the_loop and open_supervision is not None else None
     label = f"{len(config.members)} environments" if config.members else config.task
     with EpisodeProgress(config.episodes, name=label) as progress:
-        run_training(
-            folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervise=supervise,
-            log=formats, sb3_callbacks=sb3_callbacks,
-        )  # fmt: skip
+        observers = Observers(progress.update, formats, sb3_callbacks)
+        run_training(folder, config, resume=resume, demonstrator=demonstrator, supervise=supervise, observers=observers)
     if not pictures:
         return Run(out)
     _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)

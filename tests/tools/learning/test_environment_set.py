@@ -14,7 +14,7 @@ from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.environment_set import EnvironmentSet, find_members, load_variants
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.same_runs import differences
 
 SETTINGS = {"net_arch": "8", "gradient_steps": 1, "batch_size": 8, "learning_starts": 10}
@@ -45,7 +45,7 @@ def test_run_over_a_set_resumes_bit_for_bit(settings, tmp_path, forkserver):
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)
     with pytest.raises(Stopped):
-        run_training(stopped, config, report=stop_in_episode_2)
+        run_training(stopped, config, observers=Observers(stop_in_episode_2))
     run_training(stopped, stopped.config(), resume=True)
     assert differences(whole.path, stopped.path) == []
 

@@ -16,14 +16,14 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
-from guiderail.tools.learning import actors, trainer
+from guiderail.tools.learning import actors, episodes, trainer
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.configure import configure, resumed_config, with_defaults
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import SacLearner
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.train import start_or_resume, train
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 
 # Program that trains the run of `bead_config` and prints the number of each finished episode.
 CHILD = """
@@ -34,10 +34,10 @@ import bead
 bead.register()
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
 run_training(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
-      report=lambda row: print(row["episode"], flush=True))
+      observers=Observers(lambda row: print(row["episode"], flush=True)))
 """
 
 
@@ -160,7 +160,9 @@ def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_con
     short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")
     run_training(short, replace(config, episodes=episodes))
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))  # the checkpoint has the four episodes before
+        run_training(
+            stopped, config, observers=Observers(interrupt_in(4))
+        )  # the checkpoint has the four episodes before
     with pytest.raises(InputError, match="has done 4 episodes: give at least as many"):
         resumed_config(stopped, None, {}, {"episodes": 3}, None)
     with pytest.raises(InputError, match="--episodes ends it early"):
@@ -173,12 +175,12 @@ def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_con
 @pytest.mark.parametrize("num_envs", [0, 3])
 def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config, tmp_path, monkeypatch):
     successes = dict(enumerate([1, 1, 0, 1, 1, 1, 1, 1]))
-    rollout = trainer.rollout
+    rollout = episodes.rollout
 
     def rollout_with_success(*arguments, index, **options):
         return rollout(*arguments, index=index, **options) | {"success": successes[index]}
 
-    for module in (trainer, actors):
+    for module in (episodes, actors):
         monkeypatch.setattr(module, "rollout", rollout_with_success)
     learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
     config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
@@ -187,7 +189,7 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
     assert len(list(whole.steps.glob("*.parquet"))) == 6
     assert Policy.load(whole.path)
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))
+        run_training(stopped, config, observers=Observers(interrupt_in(4)))
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
     monkeypatch.delattr(RunFolder, "remove_policy")  # the policy of a finished run is not removed
@@ -197,8 +199,8 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
 
 
 def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypatch):
-    rollout = trainer.rollout
-    monkeypatch.setattr(trainer, "rollout", lambda *values, **options: rollout(*values, **options) | {"success": 1})
+    rollout = episodes.rollout
+    monkeypatch.setattr(episodes, "rollout", lambda *values, **options: rollout(*values, **options) | {"success": 1})
     learner = replace(bead_config.learner, stop_after_successes=2, demonstration_episodes=2)
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, learner=learner), demonstrator=zero_policy)
@@ -209,7 +211,7 @@ def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
     with pytest.raises(KeyboardInterrupt):
-        run_training(folder, replace(bead_config, episodes=3), resume=True, report=interrupt_in(2))
+        run_training(folder, replace(bead_config, episodes=3), resume=True, observers=Observers(interrupt_in(2)))
     with pytest.raises(InputError, match="finish the run with --resume"):
         Policy.load(folder.path)
     run_training(folder, replace(bead_config, episodes=3), resume=True)
@@ -225,7 +227,7 @@ def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
     rows = run_training(undisturbed, config)
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))
+        run_training(stopped, config, observers=Observers(interrupt_in(4)))
     run_training(stopped, config, resume=True)
     assert_same_run(undisturbed, stopped)
     # A run that is not pipelined acts with weights that are one episode newer.

@@ -93,7 +93,7 @@ def passage(episodes, **environment):
 
 def by(supervisor):
     """Return the start of episodes that a supervisor corrects."""
-    return lambda config, state: SupervisedTraining(config, supervisor, state)
+    return lambda config: SupervisedTraining(config, supervisor)
 
 
 def test_correction_becomes_transitions_and_via_points(tmp_path):

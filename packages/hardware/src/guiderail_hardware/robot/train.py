@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
+from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import EpisodeProgress
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import check_room, write_atomically
 from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
-from guiderail.tools.learning.learner import LEARNERS, learner_arguments
+from guiderail.tools.learning.episodes import Episodes
+from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.pipelined import PipelinedLearner
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.learning.train import SUMMARY
-from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
+from guiderail.tools.learning.trainer import TrainingLoop
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import record_size
@@ -113,6 +114,58 @@ def train_on_robot(
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": num_excluded}
 
 
+class RobotEpisodes(Episodes):
+    """Episodes on a robot, whose arm must not wait longer than the command timeout while they are saved."""
+
+    is_real_time = True
+
+    def __init__(self, config: RunConfig, env: RobotEnv, folder: RunFolder, learner: PipelinedLearner):
+        """Construct the episodes; the training process of `learner` writes their step log into `folder`."""
+        super().__init__(config, env)
+        self._robot, self._folder, self._pipelined = env, folder, learner
+        self._learned_before = 0  # number of episodes used for training before the run was resumed
+        self._index = 0
+
+    def restore(self, rows: list[dict[str, Any]], arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Count the episodes before the run was resumed."""
+        self._learned_before = sum(row["learned_from"] for row in rows[:-1])
+
+    def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
+        """Run one episode and return its row, with the columns of a robot."""
+        self._index, pipelined = index, self._pipelined
+        row = super().run(learner, *callbacks, index=index)
+        row |= {"learned_from": int(row["termination"] not in EXCLUDED_TERMINATIONS)}
+        row |= {"episodes_known": self._learned_before + pipelined.known, "late": pipelined.late}
+        return row | {"fault": self._robot.fault.name}
+
+    def saving_steps(
+        self, checkpoint: Callable[[], None], table: Callable[[], None], submit: Callable[[], None]
+    ) -> list[Callable[[], None]]:
+        """Return the steps of saving; the checkpoint does not wait for the training process."""
+        return [self.wait_until_learned, checkpoint, submit, self._write_step_log, table]
+
+    def wait_until_learned(self) -> None:
+        """Hold the arm until all submitted episodes are learned."""
+        while not self._pipelined.receive_learned():
+            self.idle()
+
+    def _write_step_log(self) -> None:
+        if self.config.step_log:
+            self._pipelined.write(step_log_file(self._folder.steps, self._index), table(self._robot.trace, self._index))
+
+    def idle(self) -> None:
+        """Hold the arm for a control step."""
+        self._robot.idle()
+
+    def end_episode(self) -> None:
+        """Bring the arm to rest if the operator requested a pause."""
+        self._robot.pause()
+
+    def end(self) -> None:
+        """Bring the arm to rest."""
+        self._robot.rest()
+
+
 def _train(
     folder: RunFolder,
     config: RunConfig,
@@ -133,53 +186,17 @@ def _train(
         niceness=NICENESS,
         imports=config.imports,
     )
-    rows: list[dict[str, Any]] = []
-    due: list[Callable[[], None]] = []  # remaining work of the last episode
-    learned_before = 0  # number of episodes used for training before the run was resumed
-
-    def wait_until_learned() -> None:
-        while not learner.receive_learned():
-            env.idle()
-
-    def write_step_log() -> None:
-        if config.step_log:
-            learner.write(step_log_file(folder.steps, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
-
-    def save_policy() -> None:
-        learned_policy(config, acting, env).save(folder.path, write=write_atomically)
+    episodes = RobotEpisodes(config, env, folder, learner)
+    loop = TrainingLoop(folder, learner, episodes, report)
 
     def save_learned() -> None:
         if learner.known:
-            save_policy()
+            loop.save_policy()
 
     try:
         learner.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
-        if resume:
-            rows += restore_checkpoint(folder, config, learner, env)[0]
-            learned_before = sum(row["learned_from"] for row in rows[:-1])
-        while len(rows) < config.episodes:
-            started = time.perf_counter()
-            row = rollout(env, learner.act, learner, index=len(rows))
-            row |= {"learned_from": int(row["termination"] not in EXCLUDED_TERMINATIONS)}
-            row |= {"episodes_known": learned_before + learner.known, "late": learner.late}
-            row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
-            rows.append(row)
-            due = [
-                wait_until_learned,
-                partial(write_checkpoint, folder, config, rows, learner, env),
-                learner.submit_episode,
-                write_step_log,
-                partial(folder.write_episodes, rows),
-            ]
-            while due:
-                due[0]()
-                due.pop(0)
-                env.idle()
-            report(row)
-            env.pause()
-        env.rest()
-        learner.finish()
+        return loop.run(resume=resume)
     except BaseException:
         with closing(learner):
             try:
@@ -188,10 +205,8 @@ def _train(
                 # An error in one step must not skip the others: the disk or the training process may have failed. The
                 # current policy is saved before and after the training process finishes. Only `wait_until_learned` is
                 # skipped, because it would resume the arm; the checkpoint waits for the weights without the arm.
-                remaining = (save for save in due if save is not wait_until_learned)
+                remaining = [save for save in loop.remaining if save != episodes.wait_until_learned]
                 for save in (*remaining, save_learned, learner.finish, save_learned):
                     with suppress(Exception):
                         save()
         raise
-    save_policy()
-    return rows
