@@ -15,7 +15,7 @@ bead.register()
 @pytest.fixture(scope="session")
 def bead_config():
     """Return the configuration of a run of about one second: small networks, updated from the second episode on."""
-    from guiderail.tools.learning.configure import configure
+    from guiderail.tools.learning.run_folder import configure
 
     settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=8, seed=5)

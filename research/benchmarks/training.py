@@ -26,8 +26,7 @@ from pydrake.systems.framework import InputPort, OutputPort
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import checkpoint, episodes, fast_sb3, off_policy, trainer
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
 TASK = "BncConnector"
@@ -142,7 +141,7 @@ def measure(
         episodes: Number of training episodes.
     """
     task = task or TASK
-    settings = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
+    settings = {"settings": {"learning_starts": LEARNING_STARTS}}
     config = configure(task, environment or {}, episodes=episodes, **settings)
     with tempfile.TemporaryDirectory() as folder, timed_parts() as profiler:
         start = time.perf_counter()

@@ -20,7 +20,7 @@ from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.config import check_episodes
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.train import train
 from guiderail.tools.visualization.curves import draw_passage
 from guiderail.tools.visualization.style import color, new_figure, save_figure
 
@@ -47,15 +47,8 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."
     )
     write_atomically(out / MARK, b"")
-    run = start_or_resume(
-        "NarrowPassage",
-        out,
-        environment={"guidance": "skgrl"},
-        preset=PRESET,
-        settings={"pipelined": True},
-        episodes=episodes,
-        seed=seed,
-    )
+    pipelined = {"pipelined": True}
+    run = train("NarrowPassage", "skgrl", out=out, preset=PRESET, settings=pipelined, episodes=episodes, seed=seed)
     before, after = _evaluate(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()

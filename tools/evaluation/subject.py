@@ -32,8 +32,7 @@ from guiderail.tools.evaluation.policies import (
     load_policy,
 )
 from guiderail.tools.files import path_exists
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, configure
 from guiderail.tools.pretrained import PRETRAINED, find_run
 
 

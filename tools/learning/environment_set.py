@@ -130,7 +130,7 @@ class TrainedSet:
 def make_run_environment(config: RunConfig) -> gymnasium.Env:
     """Make the environment of a run, or the set of its environments."""
     if not config.members:
-        return make_environment(config.task, config.environment)
+        return make_environment(config.task, config.resolved)
     envs: dict[str, gymnasium.Env] = {}
     try:
         for member in config.members:

@@ -22,10 +22,9 @@ from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.config import config_values, resolve_preset
-from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.train import SUMMARY
 from guiderail.tools.learning.trainer import TrainingLoop
 from guiderail.tools.tables import table_text

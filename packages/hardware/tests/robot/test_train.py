@@ -23,9 +23,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.pipelined import PipelinedLearner
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.models.joint_status import Fault, JointStatus
 from guiderail_hardware.robot import preflight

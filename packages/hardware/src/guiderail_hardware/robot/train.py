@@ -20,12 +20,17 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import EpisodeProgress
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import check_room, write_atomically
-from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.pipelined import PipelinedLearner
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.run_folder import (
+    RunConfig,
+    RunFolder,
+    configure,
+    resumed_config,
+    warn_of_unfinished_source,
+)
 from guiderail.tools.learning.train import SUMMARY
 from guiderail.tools.learning.trainer import TrainingLoop
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
@@ -49,7 +54,6 @@ def train_on_robot(
     *,
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
-    settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     assume_yes: bool = False,
     log: Log = print,
@@ -64,8 +68,7 @@ def train_on_robot(
         out: Run folder; with `resume`, the folder of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
-        given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
-        settings: Settings of the learner by name.
+        given: Arguments of `configure`: the choices of a run, and imports.
         resume: Continue a run from its last checkpoint; the address of the robot may differ.
         assume_yes: Skip the confirmation of the checks; resuming after a stop is always confirmed.
         log: Function that shows a message.
@@ -79,8 +82,8 @@ def train_on_robot(
     options = connection.environment_options(str(environment["station"]))
     if resume:
         unchanged = {name: value for name, value in environment.items() if name != "robot_url"}
-        choices = {name: value for name, value in given.items() if name != "imports"}
-        config = resumed_config(folder, task, unchanged, choices, settings)
+        choices: Any = {name: value for name, value in given.items() if name != "imports"}
+        config = resumed_config(folder, task, unchanged, choices)
         if config.simulated_driver not in (None, connection.sim):
             hint = "a simulated driver: give --sim" if config.simulated_driver else "a robot: leave --sim out"
             raise InputError(f"the run in {out} was trained with {hint}, or train again in another folder")
@@ -89,7 +92,7 @@ def train_on_robot(
         raise InputError("training needs a task: name a task, such as guiderail train-on-robot BncConnector --out RUN")
     else:
         folder.refuse_existing()
-        config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
+        config = configure(task, {**environment, **options}, **given)
         warn_of_unfinished_source(config)
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
