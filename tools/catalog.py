@@ -67,11 +67,7 @@ def describe_all() -> dict[str, Any]:
 
 
 def describe_task(name: str) -> dict[str, Any]:
-    """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options.
-
-    Raises:
-        InputError: If there is no task of that name.
-    """
+    """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options."""
     declared = TASKS.get(name)
     return {
         "description": _first_paragraph(declared),
@@ -106,9 +102,6 @@ def describe_task_groups(name: str) -> dict[str, dict[str, str]]:
     """Describe the options of a task in groups: basic, task, motion, station, disturbances, difficulties and reset.
 
     An entry of a structured option follows its option; its name is indented.
-
-    Raises:
-        InputError: If there is no task of that name.
     """
     texts = describe_task_options(name)
     if name not in TASKS.names():
@@ -153,9 +146,6 @@ def describe_task_options(name: str) -> dict[str, str]:
     """Describe the options of a task's environment and of its reset as text: meaning, range and default.
 
     For a task that is only registered with Gymnasium, the texts are the defaults.
-
-    Raises:
-        InputError: If there is no task of that name.
     """
     if name not in TASKS.names():
         return {key: f"{value!r}" for key, value in task_options(name).items()}
@@ -246,9 +236,6 @@ def describe_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
     """Validate a template and return its inputs, frames, states and transitions, with remarks.
 
     With `draw`, its state machine is drawn to a .png, .svg, .pdf, .dot or .gv file.
-
-    Raises:
-        InputError: If there is no such template, it has an error, or the drawing cannot be written.
     """
     from guiderail.models.templates import load_template
     from guiderail.models.templates.drawing import draw as draw_template

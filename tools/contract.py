@@ -21,12 +21,7 @@ _UNCHANGED = (gymnasium.error.ResetNeeded,)  # exceptions of an environment that
 def checked_reset(
     env: gymnasium.Env, seed: int | None = None, options: Mapping[str, Any] | None = None
 ) -> tuple[Any, dict[str, Any]]:
-    """Reset an environment; return the observation and `info`.
-
-    Raises:
-        InputError: If the reset raises an exception, or its result is not an observation of the observation space and a
-            dictionary.
-    """
+    """Reset an environment; return the observation and `info`."""
     with naming_failures("the environment's reset", *_UNCHANGED):
         try:
             result: Any = env.reset(seed=seed, options=None if options is None else dict(options))
@@ -52,12 +47,7 @@ def check_reset_result(env: gymnasium.Env, result: Any) -> tuple[Any, dict[str, 
 
 
 def checked_step(env: gymnasium.Env, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-    """Step an environment; return observation, reward, terminated, truncated and `info`.
-
-    Raises:
-        InputError: If the step raises an exception, or its result breaks the contract: five values; an observation of
-            the observation space, without NaN; a finite reward; two truth values; a dictionary.
-    """
+    """Step an environment; return observation, reward, terminated, truncated and `info`."""
     with naming_failures("the environment's step", *_UNCHANGED), naming_wrong_counts():
         result: Any = env.step(action)
     return check_step_result(env, result)
@@ -101,11 +91,7 @@ def check_step_result(env: gymnasium.Env, result: Any) -> tuple[Any, float, bool
 
 
 def check_values(env: gymnasium.Env, observation: Any, action: Any = None) -> None:
-    """Check that an observation, and an action that is not None, are within their spaces and have their data types.
-
-    Raises:
-        InputError: If a value is outside its space.
-    """
+    """Check that an observation, and an action that is not None, are within their spaces and have their data types."""
     for name, value, space in (
         ("observation", observation, env.observation_space),
         ("action", action, env.action_space),

@@ -15,10 +15,6 @@ def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
     """Write the mean of several runs' policies as a run folder with the configuration of the first run.
 
     The folder has no table of episodes and no checkpoint. Commands evaluate it like a run.
-
-    Raises:
-        InputError: If there are less than two runs, a run has no policy, the runs have different observations, actions
-            or guidance, or `out` exists.
     """
     if len(runs) < 2:
         raise InputError("an ensemble has the policies of several runs: name at least two")

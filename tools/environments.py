@@ -48,9 +48,6 @@ def task_named(name_or_folder: str) -> tuple[str, tuple[str, ...]]:
     """Return the name of a task from its name or folder, and the imports that a run of the task needs.
 
     An unknown name is returned unchanged.
-
-    Raises:
-        InputError: If the folder's task is not valid.
     """
     if name_or_folder in TASKS.names() or not is_task_folder(name_or_folder):
         return name_or_folder, ()
@@ -64,9 +61,6 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     The digest covers the task folder and the imported files. It also covers the files that an option of the environment
     names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names.
     Relative paths are skipped; `import_modules` returns absolute ones.
-
-    Raises:
-        InputError: If the task folder no longer exists, or a file cannot be read.
     """
     declared = TASKS.get(task) if task in TASKS.names() else None
     folder, folder_digest = (None, "") if declared is None else (declared.folder, declared.folder_digest())
@@ -87,11 +81,7 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none.
-
-    Raises:
-        InputError: If the task is unknown.
-    """
+    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none."""
     if task in TASKS.names():
         return check_environment(task, {})
     check_task_name(task)
@@ -108,11 +98,7 @@ def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]
 
 
 def resolve_environment(task: str, arguments: Mapping[str, Any]) -> Any:
-    """Return the validated `EnvConfig` of a registered task; for another task, its arguments with all defaults.
-
-    Raises:
-        InputError: If the task or an argument is unknown, or a value is invalid.
-    """
+    """Return the validated `EnvConfig` of a registered task; for another task, its arguments with all defaults."""
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
@@ -178,9 +164,6 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
 
     Guidance, station and difficulty are compared with the task's defaults. All other arguments are compared with the
     defaults that these three determine.
-
-    Raises:
-        InputError: If the task, guidance, station or difficulty is unknown.
     """
     environment = flat_environment(task, environment)
     names: tuple[str, ...] = ("guidance", "station", "difficulty")
@@ -195,9 +178,6 @@ def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapp
 
     A change of difficulty replaces the settings that the run's own difficulty determined. A change of station removes
     the options that the new station does not have.
-
-    Raises:
-        InputError: If the difficulty changes and the resulting arguments are not valid.
     """
     environment, changes = flat_environment(task, environment), flat_environment(task, changes)
     removed = _options_of_station_only(environment.get("station"), changes.get("station"))
@@ -255,11 +235,7 @@ def _parse_numbers(value: Any) -> Any:
 
 
 def make_environment(task: str, arguments: Any, render_mode: str | None = None) -> gymnasium.Env:
-    """Make the environment of a task from its options, or from a result of `resolve_environment`; see `make_env`.
-
-    Raises:
-        InputError: If the task or an argument is unknown, or options are incompatible.
-    """
+    """Make the environment of a task from its options, or from a result of `resolve_environment`; see `make_env`."""
     resolved = resolve_environment(task, arguments) if isinstance(arguments, Mapping) else arguments
     keywords = dict(resolved) if isinstance(resolved, Mapping) else {"task": resolved}
     if render_mode is not None or environment_id(task) != task:  # others may not have the argument
@@ -297,12 +273,7 @@ class OtherTask:
 
 
 def trained_task(env: gymnasium.Env, name: str) -> Any:
-    """Return the task of an environment, or an `OtherTask` for an environment of another package.
-
-    Raises:
-        InputError: If an environment of another package has no limit of steps, or its observations or actions are not
-            those that a learner takes.
-    """
+    """Return the task of an environment, or an `OtherTask` for an environment of another package."""
     task = getattr(env.unwrapped, "diagram", None)
     if hasattr(env.unwrapped, "trace") and task is not None:
         return task
@@ -346,11 +317,7 @@ def _step_limit(env: Any) -> int | None:
 
 
 def task_of(env: gymnasium.Env, name: str) -> Any:
-    """Return the task of an environment; `name` is the environment's name for the message.
-
-    Raises:
-        InputError: If the environment has no task of guiderail.
-    """
+    """Return the task of an environment; `name` is the environment's name for the message."""
     task = getattr(env.unwrapped, "diagram", None)
     if task is None:
         raise InputError(f"{name} has no task of guiderail, so it can only be evaluated: register a task for it")

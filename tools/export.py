@@ -67,9 +67,6 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
         run: Folder of a run, or `pretrained:NAME`.
         guidance: Kinds of guidance that can be exported.
         exported: Options of which only one value can be exported, with this value.
-
-    Raises:
-        InputError: If there is no such run, its policy observes images, or its guidance cannot be exported.
     """
     folder = RunFolder(find_run(run))
     config, policy = folder.config(), Policy.load(folder.path)
@@ -119,9 +116,6 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
 
     Returns:
         Paths of the files.
-
-    Raises:
-        InputError: As `load_skill`, or if the folder cannot be written.
     """
     check_new(out, "folder")
     skill = load_skill(run, GUIDED, EXPORTED)
@@ -197,11 +191,7 @@ def _size(term: Any, pose_size: int) -> int:
 
 
 def policy_to_onnx(policy: Policy) -> bytes:
-    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n).
-
-    Raises:
-        InputError: If the policy observes images.
-    """
+    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n)."""
     layers, description = policy.layers, policy.description
     if len(description["observation_shape"]) != 1 or "image_shape" in description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")

@@ -139,9 +139,6 @@ def from_tensors(value: Any) -> Any:
     """Return a policy's action in which tensors are NumPy arrays; an action without tensors is returned unchanged.
 
     Tensors may have gradients, be on a device, be sparse, or have a data type that NumPy lacks.
-
-    Raises:
-        InputError: If a tensor cannot be converted.
     """
     if isinstance(value, Mapping):
         return {name: from_tensors(entry) for name, entry in value.items()} if _has_tensor(value.values()) else value

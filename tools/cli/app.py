@@ -441,11 +441,7 @@ class RunOptions:
 
 
 def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
-    """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message.
-
-    Raises:
-        InputError: If a value has no `=`, or two values of one name differ.
-    """
+    """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message."""
     pairs: dict[str, str] = {}
     for pair in given or []:
         if "=" not in pair:
@@ -462,11 +458,7 @@ def check_same(name: str, value: Any, other: Any) -> None:
 
 
 def parse_floats(text: str, count: int, option: str) -> list[float]:
-    """Return `count` finite numbers from a comma-separated list.
-
-    Raises:
-        InputError: If the number of values is not `count`, or a value is not finite.
-    """
+    """Return `count` finite numbers from a comma-separated list."""
     from guiderail.models.common.arrays import parse_number
 
     try:
@@ -479,11 +471,7 @@ def parse_floats(text: str, count: int, option: str) -> list[float]:
 
 
 def parse_integers(text: str | None, option: str) -> list[int] | None:
-    """Return integers from a comma-separated list; None for None.
-
-    Raises:
-        InputError: If a value is not an integer.
-    """
+    """Return integers from a comma-separated list; None for None."""
     if text is None:
         return None
     if not re.fullmatch(r"\s*[-+]?[0-9]{1,18}\s*(,\s*[-+]?[0-9]{1,18}\s*)*", text):
@@ -492,11 +480,7 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
 
 
 def parse_environment(env: list[str] | None, **options: Any) -> dict[str, Any]:
-    """Return the options of an environment: values of `--env`, read as YAML, and all `options` that are not None.
-
-    Raises:
-        InputError: If a value of `--env` has no `=`, or two values of one option differ.
-    """
+    """Return the options of an environment: values of `--env`, read as YAML, and all `options` that are not None."""
     environment = {name: value for name, value in options.items() if value is not None}
     if env:
         from guiderail.tools.environments import as_value
@@ -508,11 +492,7 @@ def parse_environment(env: list[str] | None, **options: Any) -> dict[str, Any]:
 
 
 def import_files(imports: Sequence[str] | None) -> None:
-    """Import the modules and files that are given by `--import`.
-
-    Raises:
-        InputError: If an import fails.
-    """
+    """Import the modules and files that are given by `--import`."""
     if imports:
         from guiderail.tools.imports import import_modules
 
@@ -524,9 +504,6 @@ def find_task(name_or_folder: str, imports: Sequence[str] | None = None) -> tupl
 
     Returns:
         Name of the task, and the imports that a run must store. A text that is no folder is returned unchanged.
-
-    Raises:
-        InputError: If an import fails or the task folder is invalid.
     """
     import_files(imports)
     if not (Path(name_or_folder) / "task.yaml").is_file():

@@ -33,9 +33,6 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     """Train sKGRL with TQC to avoid an obstacle in the narrow passage, evaluate it and print the result.
 
     An existing demo in the folder `out` is replaced.
-
-    Raises:
-        InputError: If the folder contains anything other than a demo, or a number is out of range.
     """
     check_episodes(episodes)
     check_seed(seed)

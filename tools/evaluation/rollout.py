@@ -123,11 +123,7 @@ def _check_action(action: Any, env: gymnasium.Env) -> None:
 
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the columns that a callback adds to an episode's row.
-
-    Raises:
-        InputError: If the callback does not return a mapping, or returns a column that the row already has.
-    """
+    """Return the columns that a callback adds to an episode's row."""
     columns = callback.on_episode_end(row)
     if not isinstance(columns, Mapping):
         raise InputError(f"{type(callback).__name__}.on_episode_end must return a dictionary, not {brief(columns)}")

@@ -50,12 +50,7 @@ class ActorEpisodes(Episodes):
     """
 
     def __init__(self, episodes: Episodes, learner: Learner):
-        """Construct the episodes in the environment of `episodes`, already reset once; the first one starts the actors.
-
-        Raises:
-            InputError: If the learner is not an `OffPolicyLearner`, observations have images, or this process cannot
-                fork.
-        """
+        """Construct the episodes in the environment of `episodes`, which was reset; the first one starts the actors."""
         super().__init__(episodes.config, episodes.env, episodes.demonstrator)
         if not isinstance(learner, OffPolicyLearner):
             raise InputError("only an off-policy learner has parallel actors: choose tqc, sac, td3 or crossq")
@@ -72,11 +67,7 @@ class ActorEpisodes(Episodes):
         self._earlier_episodes = 0  # episodes of the run that `init_from` names
 
     def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
-        """Learn from episode `index`, which must be the next one, and return its row.
-
-        Raises:
-            InputError: If an actor was killed or learning diverged. An exception in an actor is raised here.
-        """
+        """Learn from episode `index`, which must be the next one, and return its row."""
         if self._forks is None:
             self._callbacks, self._earlier_episodes = callbacks, self._learner.episodes - index
             self._forks = Forks(self._simulate, min(self._num_envs, self.config.episodes - index))

@@ -107,11 +107,7 @@ def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mappin
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays and values that `save_checkpoint` wrote.
-
-    Raises:
-        InputError: If the file is missing, truncated or changed.
-    """
+    """Read the arrays and values that `save_checkpoint` wrote."""
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}: train again in another folder")
     try:
@@ -129,11 +125,7 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the state of a run's off-policy learner; without the last episode if the learner was pipelined.
-
-    Raises:
-        InputError: If the run has no checkpoint, or its learner is not off-policy.
-    """
+    """Return the state of a run's off-policy learner; without the last episode if the learner was pipelined."""
     from guiderail.tools.learning.run_folder import RunFolder  # imports pandas, which the learners do not need
 
     file = RunFolder(Path(run)).checkpoint

@@ -98,11 +98,7 @@ class BcLearner(Learner):
         return {"train/loss": loss} if np.isfinite(loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the cloned policy; the entries of `description` are added to the policy's description.
-
-        Raises:
-            InputError: If there were fewer demonstrations than `demonstration_episodes`.
-        """
+        """Return the cloned policy; the entries of `description` are added to the policy's description."""
         self._check_trained()
         return export_layers([*self.network], self._space, {"squash": "clip", **description})
 

@@ -257,9 +257,6 @@ def resolve_preset(
         preset: Name of a preset; `default_preset` by default.
         algorithm: Name of the learner; the preset's by default.
         settings: Values by name that replace those of the preset; numbers or text.
-
-    Raises:
-        InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.
     """
     if preset is not None and preset not in PRESETS:
         raise InputError(f"there is no preset {brief(preset)}: {did_you_mean(preset, PRESETS)}")
@@ -274,11 +271,7 @@ def resolve_preset(
 
 
 def config_class(algorithm: str) -> type[LearnerConfig]:
-    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported.
-
-    Raises:
-        InputError: If there is no such learner.
-    """
+    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported."""
     kind: type[LearnerConfig] = find_class("learner_config", algorithm, LEARNERS, "Config")
     return kind
 
@@ -289,11 +282,7 @@ def default_preset(algorithm: str) -> str | None:
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
-    """Validate settings against the configuration class of a learner; missing settings get its defaults.
-
-    Raises:
-        InputError: If there is no such learner or setting, or a value is out of range.
-    """
+    """Validate settings against the configuration class of a learner; missing settings get its defaults."""
     kind = config_class(algorithm)
     names = option_fields(kind)
     values = {**flat_options([kind], settings), "algorithm": algorithm}

@@ -65,10 +65,6 @@ def observe_privileged(
     Returns:
         An environment with the spaces of the critics, a policy class whose actor observes only the observation of
         `env`, and the number of privileged entries.
-
-    Raises:
-        InputError: If the observation is not a vector, the task declares no privileged observation or, with `symmetry`,
-            no symmetry of it, or the algorithm has no critic apart from its actor.
     """
     base: Any = env.unwrapped
     observed, hidden = env.observation_space, getattr(base, "privileged_space", None)
@@ -153,9 +149,6 @@ class ImageFeatures(BaseFeaturesExtractor):
 
         The encoder is "average_pooling", "convolutional" or "pixels" (none). In training mode, images are shifted by
         up to `RANDOM_SHIFT` pixels before convolutions.
-
-        Raises:
-            InputError: If the image is too small.
         """
         height, width, channels = shape
         side_of_squares = IMAGE_POOL if encoder == "average_pooling" else 1
@@ -214,9 +207,6 @@ def share_encoder(model: Any) -> None:
     """Make the actor of an actor-critic algorithm use the critic's encoder, which only the critic's loss trains.
 
     This is the architecture of DrQ (Yarats et al., 2021). Target critics shift images at random as well.
-
-    Raises:
-        InputError: If the algorithm has a target actor, whose encoder would not be updated.
     """
     actor, critic = model.actor, model.critic
     if getattr(model, "actor_target", None) is not None:
@@ -263,9 +253,6 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """Return the policy of a Stable-Baselines3 actor: linear layers with activations between them, and a final tanh.
 
     The entries of `description`, such as the observation's shape, are added to the policy's description.
-
-    Raises:
-        InputError: If the actor has other layers.
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     features = actor.features_extractor
@@ -295,9 +282,6 @@ def export_layers(
         space: Action space.
         description: Entries to add to the policy's description.
         encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution.
-
-    Raises:
-        InputError: If a layer has another type, or the layers are in another order.
     """
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []

@@ -91,9 +91,6 @@ class OnPolicyLearner(Learner):
 
         A transition is not stored if the simulation failed in it, or if its action is not from `act`, as a supervisor's
         correction. The previous transition is then treated as the episode's last, as at a time limit.
-
-        Raises:
-            InputError: If learning diverged.
         """
         buffer = self.model.rollout_buffer
         if "simulation_failure" in transition.info or self._sampled is None:

@@ -62,9 +62,6 @@ class PipelinedLearner(Learner):
             niceness: Niceness of the training process.
             imports: Modules, files (.py) or task folders that the training process imports, such as a module that
                 registers the learner.
-
-        Raises:
-            InputError: If the learner is not an `OffPolicyLearner`.
         """
         if not isinstance(acting, OffPolicyLearner):
             raise InputError("only an off-policy learner can be pipelined: choose tqc, sac, td3 or crossq")
@@ -95,11 +92,7 @@ class PipelinedLearner(Learner):
         return self._acting.act(observation)
 
     def on_episode_start(self) -> None:
-        """Start an episode with the newest weights; with `waits`, first wait for the weights of this episode.
-
-        Raises:
-            InputError: If learning diverged, a step log could not be written, or the training process has ended.
-        """
+        """Start an episode with the newest weights; with `waits`, first wait for the weights of this episode."""
         required = self.submitted - 1
         while self.known < required and self._waits:
             self._receive_weights()
@@ -127,22 +120,14 @@ class PipelinedLearner(Learner):
         return {}
 
     def submit_episode(self) -> None:
-        """Send the finished episode to the training process, unless it was excluded.
-
-        Raises:
-            InputError: If the training process has ended.
-        """
+        """Send the finished episode to the training process, unless it was excluded."""
         if self._pending is not None:
             self._send(("learn", self._pending, self.records_metrics))
             self._pending = None
             self.submitted += 1
 
     def receive_learned(self) -> bool:
-        """Receive the weights learned so far without waiting; return True if all submitted episodes are learned.
-
-        Raises:
-            InputError: As `on_episode_start`.
-        """
+        """Receive the weights learned so far without waiting; return True if all submitted episodes are learned."""
         while self.known < self.submitted and self._pipe.poll():
             self._receive_weights()
         return self.known == self.submitted
@@ -152,11 +137,7 @@ class PipelinedLearner(Learner):
         self._send(("write", path, table))
 
     def finish(self) -> None:
-        """Block until everything is learned and written, and end the training process.
-
-        Raises:
-            InputError: As `on_episode_start`.
-        """
+        """Block until everything is learned and written, and end the training process."""
         self.submit_episode()
         while self.known < self.submitted:
             self._receive_weights()

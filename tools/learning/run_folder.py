@@ -158,12 +158,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the run against other processes; the lock of a killed process has no effect.
-
-        Raises:
-            InputError: If another process writes into the run, the folder cannot be written, or a folder in it is a
-                link to a place outside.
-        """
+        """Lock the run against other processes; the lock of a killed process has no effect."""
         refuse_links(self.path)
         lock = filelock.FileLock(self.path / LOCK, timeout=0)
         try:
@@ -229,12 +224,7 @@ class RunFolder:
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
     def config(self) -> RunConfig:
-        """Read the configuration of the run, and import the modules that register its task and learner.
-
-        Raises:
-            InputError: If the folder is not a run, a folder in it is a link to a place outside, its configuration is
-                invalid, or the configuration names code that is not trusted (`trust_imports`).
-        """
+        """Read the configuration of the run, and import the modules that register its task and learner."""
         file = self.path / "config.yaml"
         refuse_links(self.path)
         try:
@@ -321,9 +311,6 @@ def configure(
         imports: Modules, files and task folders that register the task, as `import_modules` returns them.
         members: Environments of a set.
         **choices: Choices of the run.
-
-    Raises:
-        InputError: If a name is unknown or a value is out of range.
     """
     has_learner = choices.keys() & {"algorithm", "preset"} or task not in TASKS.names()
     declared: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)

@@ -31,11 +31,7 @@ class DemonstrationReplayBuffer(ReplayBuffer):
     num_demonstrated = 0
 
     def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
-        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations.
-
-        Raises:
-            InputError: If the buffer is full of demonstrations.
-        """
+        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
         if self.num_demonstrated >= self.buffer_size:
             raise InputError(
                 f"the demonstrations fill the replay buffer of {self.buffer_size} transitions: give a larger "
@@ -144,11 +140,7 @@ class Sb3Callbacks(Callback):
     """
 
     def __init__(self, callbacks: Any, learner: Learner):
-        """Construct the adapter for one or several callbacks of Stable-Baselines3.
-
-        Raises:
-            InputError: If the learner has no model of Stable-Baselines3, or a callback is not a `BaseCallback`.
-        """
+        """Construct the adapter for one or several callbacks of Stable-Baselines3."""
         model = getattr(learner, "model", None)
         if model is None:
             raise InputError(f"{type(learner).__name__} has no Stable-Baselines3 model, which its callbacks need")

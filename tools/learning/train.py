@@ -219,9 +219,6 @@ class Training:
 
         A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes.
         The task's scripted policy acts in the learner's `demonstration_episodes`.
-
-        Raises:
-            InputError: As `train`, or if there is no task without `resume`.
         """
         imports, formats = import_modules(self.imports), check_log_formats(self.log)
         folder = RunFolder(self.out)

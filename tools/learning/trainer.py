@@ -87,12 +87,6 @@ def run_training(
             (Vecerik et al., 2017).
         supervise: Start of the episodes of a run that is configured `human_in_the_loop`.
         observers: Progress, learning log and callbacks.
-
-    Raises:
-        InputError: If the folder of a new run is not empty, another process writes into it, settings are incompatible,
-            or a demonstrator, a supervisor or the package of a log format is missing; or if an episode fails, learning
-            diverges, or the learner returns no `Policy`. If the first episode fails, a folder that did not exist
-            before is removed, unless learning diverged.
     """
     _check_combination(config, has_demonstrator=demonstrator is not None, is_supervised=supervise is not None)
     observers = observers or Observers()
@@ -300,12 +294,7 @@ class TrainingLoop:
         self._last_saving_time += time.perf_counter() - started
 
     def write_checkpoint(self) -> None:
-        """Write the checkpoint: the run's identity, the episodes' rows, and the states of learner and environment.
-
-        Raises:
-            InputError: If `Learner.state` does not return arrays of numbers by name and values that JSON stores
-                unchanged, or if `Learner.state` of a user's learner fails.
-        """
+        """Write the checkpoint: the run's identity, the episodes' rows, and the states of learner and environment."""
         started, name = time.perf_counter(), f"{type(self._learner).__name__}.state"
         with _naming_failures(self._episodes.config, name):
             state = self._learner.state()
@@ -323,12 +312,7 @@ class TrainingLoop:
         self._last_saving_time += time.perf_counter() - started
 
     def restore(self) -> None:
-        """Restore rows, learner and episodes from the checkpoint; without checkpoint and table, there are no rows.
-
-        Raises:
-            InputError: If the checkpoint is missing or damaged, belongs to another task, seed, environment or learner,
-                or contains rows that differ from `episodes.csv`.
-        """
+        """Restore rows, learner and episodes from the checkpoint; without checkpoint and table, there are no rows."""
         folder, config, table = self._folder, self._episodes.config, self._folder.path / "episodes.csv"
         remove_step_logs(folder.steps, config.episodes)
         if not folder.checkpoint.exists() and not table.exists():

@@ -49,11 +49,7 @@ PLOTTED = {"success", "return", *(column for _, columns in PAIRS for column in c
 
 
 def plot_run(run: Path) -> Path:
-    """Draw `learning_curve.png` from the `episodes.csv` of a run.
-
-    Raises:
-        InputError: If there is no run, it has no finished episode, or its table lacks a column of `PLOTTED`.
-    """
+    """Draw `learning_curve.png` from the `episodes.csv` of a run."""
     folder = RunFolder(run)
     config, rows = folder.config(), folder.episodes()
     if not len(rows):

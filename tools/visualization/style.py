@@ -41,11 +41,7 @@ def new_figure(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figu
 
 
 def save_figure(figure: Figure, path: Path) -> Path:
-    """Write a picture in the format of its file ending, and return its path; equal figures give equal SVG files.
-
-    Raises:
-        InputError: If the ending is none of `guiderail.tools.files.PICTURES`, or the file cannot be written.
-    """
+    """Write a picture in the format of its file ending, and return its path; equal figures give equal SVG files."""
     check_picture(path)
     content, kind = io.BytesIO(), path.suffix[1:].lower()
     with matplotlib.rc_context({"svg.hashsalt": "guiderail", "svg.fonttype": "none"}):
