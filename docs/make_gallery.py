@@ -34,7 +34,7 @@ from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.train import train
 from guiderail.tools.visualization.camera import path_in_picture
-from guiderail.tools.visualization.curves import draw_passage
+from guiderail.tools.visualization.figures import draw_passage
 from guiderail_parts.create_task import create_task
 
 HERE = Path(__file__).parent

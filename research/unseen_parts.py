@@ -21,10 +21,10 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.ensemble import write_ensemble
 from guiderail.tools.environments import make_environment, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.export import write_ensemble
 from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import Choices
 from guiderail.tools.learning.train import Training, train

@@ -302,7 +302,7 @@ def trained_task(env: gymnasium.Env, name: str) -> Any:
 
 def _step_limit(env: Any) -> int | None:
     """Return the largest number of actions in an episode; None if no wrapper limits it."""
-    from guiderail.tools.guided.env import GuidedEnv
+    from guiderail.tools.guided.guided_env import GuidedEnv
 
     repeat, limits = 1, []
     while isinstance(env, gymnasium.Wrapper):

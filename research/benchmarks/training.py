@@ -26,8 +26,8 @@ from pydrake.systems.framework import InputPort, OutputPort
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import checkpoint, episodes, fast_sb3, off_policy, trainer
+from guiderail.tools.learning.off_policy import DemonstrationReplayBuffer
 from guiderail.tools.learning.run_folder import RunFolder, configure
-from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
 
 TASK = "BncConnector"
 EPISODES = 6

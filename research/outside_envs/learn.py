@@ -125,7 +125,7 @@ def train(
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
     from guiderail.tools.learning.networks import NormalizedReLU, asymmetric_policy
-    from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
+    from guiderail.tools.learning.off_policy import DemonstrationReplayBuffer
 
     rows: list[Row] = []
     first, last = settings.entropy_per_action

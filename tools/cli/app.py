@@ -130,7 +130,7 @@ REGISTRIES = {
 LISTED: dict[str, Callable[[], list[str]]] = {
     **{key: _names(place) for key, place in REGISTRIES.items()},
     "tasks": _names("guiderail.diagrams.tasks.registry:known_tasks"),
-    "presets": _names("guiderail.tools.learning.config:PRESETS"),
+    "presets": _names("guiderail.tools.learning.learner_config:PRESETS"),
 }
 """Lists that `guiderail list` prints, by name."""
 

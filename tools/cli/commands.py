@@ -132,8 +132,8 @@ def train(
 def _check_early(names: list[str], run: cli.RunOptions, options: TrainOptions, environment: Mapping[str, Any]) -> None:
     """Raise an InputError for an unknown name or an existing folder, before anything slow is imported."""
     from guiderail.tools.files import refuse_existing_run
-    from guiderail.tools.learning.config import PRESETS
     from guiderail.tools.learning.learner import LEARNERS, check_log_formats
+    from guiderail.tools.learning.learner_config import PRESETS
 
     for name in names:
         check_task_name(name)
@@ -273,7 +273,7 @@ def ensemble(
     The folder is evaluated like a run: guiderail evaluate runs/mean. The standard deviation of the networks' actions is
     the column disagreement of the step log that evaluate --steps writes.
     """
-    from guiderail.tools.ensemble import write_ensemble
+    from guiderail.tools.export import write_ensemble
 
     members = write_ensemble(runs, out).members
     print_result({"policy": str(out), "networks": len(members)}, as_json)
@@ -343,7 +343,7 @@ def visualize(
     from guiderail.tools.evaluation.subject import EpisodeSpec
     from guiderail.tools.files import check_picture, check_video
     from guiderail.tools.visualization.camera import write_image, write_video
-    from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.figures import plot_run
     from guiderail.tools.visualization.replay import default_page, write_page
 
     environment = cli.parse_environment(env, station=station)
@@ -463,7 +463,7 @@ def _describe_entry(name: str, as_json: bool) -> dict[str, Any] | None:
     from guiderail.tools.catalog import describe_all, describe_guidance_options, indent_entries
 
     if name in cli.LISTED["presets"]() or name in cli.LISTED["learners"]():
-        from guiderail.tools.learning.config import config_values, resolve_preset
+        from guiderail.tools.learning.learner_config import config_values, resolve_preset
 
         is_preset = name in cli.LISTED["presets"]()
         values = config_values(resolve_preset(name if is_preset else None, None if is_preset else name, None))

@@ -39,7 +39,7 @@ from guiderail.tools.evaluation.evaluation import (
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.policies import as_policy, is_compatible
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.evaluation.subject import (
     Subject,
@@ -52,6 +52,7 @@ from guiderail.tools.evaluation.subject import (
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.environment_set import member_configs
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations

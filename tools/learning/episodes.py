@@ -7,9 +7,10 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from guiderail.models.common.errors import naming_failures
-from guiderail.tools.evaluation.episode import Callback, PolicyFn
+from guiderail.models.common.errors import InputError, brief, naming_failures
+from guiderail.tools.evaluation.episode import Callback, PolicyFn, Transition
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.learning.learner import LEARNERS, Learner
 from guiderail.tools.learning.run_folder import RunConfig
@@ -79,3 +80,62 @@ class Episodes:
 
 Supervise = Callable[[RunConfig], Episodes]
 """Function that starts the episodes of a run that a supervisor corrects."""
+
+
+class Sb3Callbacks(Callback):
+    """Adapter that calls callbacks of Stable-Baselines3 in the episodes of a run.
+
+    The callbacks receive the learner's `model`, an algorithm of Stable-Baselines3. `num_timesteps` counts the run's
+    transitions, including those before it was resumed. `locals` has the entries `infos`, `rewards`, `dones`, `actions`
+    and `new_obs`, each of length 1 as for one environment.
+
+    Attributes:
+        is_stopped: True once a callback returned False from `on_step`; training ends after the episode.
+    """
+
+    def __init__(self, callbacks: Any, learner: Learner):
+        """Construct the adapter for one or several callbacks of Stable-Baselines3."""
+        model = getattr(learner, "model", None)
+        if model is None:
+            raise InputError(f"{type(learner).__name__} has no Stable-Baselines3 model, which its callbacks need")
+        callback_list = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
+        for callback in callback_list:
+            if not isinstance(callback, BaseCallback):
+                raise InputError(f"{brief(callback)} is no callback of Stable-Baselines3: derive it from BaseCallback")
+        self._model, self._callback, self._is_started = model, CallbackList(callback_list), False
+        # Transitions of the run that `init_from` names are not counted.
+        self._learner, self._first = learner, getattr(learner, "transitions", 0)
+        self.is_stopped = False
+
+    def on_episode_start(self) -> None:
+        """Report the start of training before the first episode, and the start of a rollout in each episode."""
+        if not self._is_started:
+            self._model.num_timesteps = getattr(self._learner, "transitions", 0) - self._first
+            self._callback.init_callback(self._model)
+            self._callback.on_training_start({"self": self._model}, {})
+            self._is_started = True
+        self._callback.on_rollout_start()
+
+    def on_step(self, transition: Transition) -> None:
+        """Call `on_step` of the callbacks."""
+        self._model.num_timesteps += 1
+        self._callback.update_locals(
+            {
+                "infos": [dict(transition.info)],
+                "rewards": [transition.reward],
+                "dones": [transition.is_last],
+                "actions": [transition.action],
+                "new_obs": transition.next_observation[None],
+            }
+        )
+        self.is_stopped = not self._callback.on_step() or self.is_stopped
+
+    def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Report the end of the rollout."""
+        self._callback.on_rollout_end()
+        return {}
+
+    def close(self) -> None:
+        """Report the end of training."""
+        if self._is_started:
+            self._callback.on_training_end()

@@ -39,7 +39,8 @@ from guiderail.tools.files import (
     write_error,
 )
 from guiderail.tools.imports import import_stored
-from guiderail.tools.learning.config import (
+from guiderail.tools.learning.learner import LearnerConfig
+from guiderail.tools.learning.learner_config import (
     MAX_EPISODES,
     check_episodes,
     config_values,
@@ -48,7 +49,6 @@ from guiderail.tools.learning.config import (
     make_config,
     resolve_preset,
 )
-from guiderail.tools.learning.learner import LearnerConfig
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")

@@ -23,12 +23,11 @@ from guiderail.tools.environments import check_environment, register_environment
 from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
-from guiderail.tools.evaluation.rollout import EpisodeProgress
 from guiderail.tools.evaluation.subject import counts_collisions
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import OffPolicyConfig
 from guiderail.tools.learning.environment_set import EnvironmentSet, Variants, find_members, load_variants
 from guiderail.tools.learning.learner import check_log_formats
+from guiderail.tools.learning.learner_config import OffPolicyConfig
 from guiderail.tools.learning.run_folder import (
     Choices,
     RunConfig,
@@ -38,6 +37,7 @@ from guiderail.tools.learning.run_folder import (
     resumed_config,
     warn_of_unfinished_source,
 )
+from guiderail.tools.progress import EpisodeProgress
 
 if TYPE_CHECKING:
     from guiderail.tools.learning.episodes import Supervise
@@ -285,7 +285,7 @@ def draw_pictures(out: Path) -> dict[str, str]:
     If the replay page cannot be drawn on this machine, the reason is returned in place of its path.
     """
     from guiderail.tools.evaluation.subject import EpisodeSpec
-    from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.figures import plot_run
     from guiderail.tools.visualization.replay import default_page, write_page
 
     try:

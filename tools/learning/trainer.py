@@ -42,7 +42,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
 if TYPE_CHECKING:
-    from guiderail.tools.learning.sb3 import Sb3Callbacks
+    from guiderail.tools.learning.episodes import Sb3Callbacks
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -125,7 +125,7 @@ def run_training(
         closed_first.callback(learning_log.close)
         callbacks = None
         if observers.sb3_callbacks is not None:
-            from guiderail.tools.learning.sb3 import Sb3Callbacks
+            from guiderail.tools.learning.episodes import Sb3Callbacks
 
             if config.learner.pipelined or config.learner.num_envs:
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
@@ -133,12 +133,12 @@ def run_training(
         stack.enter_context(folder.locked())
         if config.learner.pipelined:
             from guiderail.tools.learning.networks import SpacesOnlyEnv
-            from guiderail.tools.learning.pipelined import PipelinedLearner
+            from guiderail.tools.learning.processes import PipelinedLearner
 
             child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
             learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
         elif config.learner.num_envs:
-            from guiderail.tools.learning.actors import ActorEpisodes
+            from guiderail.tools.learning.processes import ActorEpisodes
 
             episodes = ActorEpisodes(episodes, learner)
             closed_first.callback(episodes.end)

@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.episode import EnvCallback, Transition
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
-from guiderail.tools.visualization.style import new_figure, save_figure
+from guiderail.tools.visualization.figures import new_figure, save_figure
 
 _LOGGER = logging.getLogger(__name__)
 

@@ -21,9 +21,9 @@ from guiderail.models.policy import FORMAT, Policy, _digest
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.config import config_values, resolve_preset
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner_config import config_values, resolve_preset
 from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.train import SUMMARY
 from guiderail.tools.learning.trainer import TrainingLoop

@@ -15,8 +15,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.config import PRESETS, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments, register_learner
+from guiderail.tools.learning.learner_config import PRESETS, resolve_preset
 from guiderail.tools.learning.networks import export_layers, export_policy
 from guiderail.tools.learning.off_policy import OffPolicyLearner
 from guiderail.tools.learning.run_folder import RunFolder

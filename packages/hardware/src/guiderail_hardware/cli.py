@@ -95,7 +95,7 @@ def deploy(
     if episodes is not None:
         if force_limit is not None:
             raise InputError("an evaluation has the force limit of the training: leave --force-limit out")
-        from guiderail_hardware.robot.evaluate import evaluate_on_robot
+        from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
 
         result = evaluate_on_robot(
             run, connection, episodes, station=station, policy=policy, assume_yes=yes, out=out, log=print_message
@@ -136,7 +136,7 @@ def train_on_robot(
     choices = run.choices()
     if choices["settings"].get("num_envs", "0") != "0":
         raise InputError("there is one robot: leave num_envs out")
-    from guiderail_hardware.robot.train import train_on_robot as train
+    from guiderail_hardware.robot.robot_training import train_on_robot as train
 
     result = train(
         name,

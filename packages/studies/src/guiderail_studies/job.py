@@ -43,7 +43,7 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import flat_settings
+from guiderail.tools.learning.learner_config import flat_settings
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, configure, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome

@@ -17,13 +17,12 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import EpisodeProgress
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import check_room, write_atomically
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
-from guiderail.tools.learning.pipelined import PipelinedLearner
+from guiderail.tools.learning.processes import PipelinedLearner
 from guiderail.tools.learning.run_folder import (
     RunConfig,
     RunFolder,
@@ -33,6 +32,7 @@ from guiderail.tools.learning.run_folder import (
 )
 from guiderail.tools.learning.train import SUMMARY
 from guiderail.tools.learning.trainer import TrainingLoop
+from guiderail.tools.progress import EpisodeProgress
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import record_size
