@@ -39,9 +39,9 @@ def bead_run(_bead_run, tmp_path):
 @pytest.fixture(autouse=True, scope="session")
 def simplify_pictures():
     """Omit the layout of labels, half of the time of a picture, and show one episode on the page of a run."""
-    from guiderail.tools.visualization import replay, style
+    from guiderail.tools.visualization import figures, replay
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(style, "LAYOUT", None)
+        patch.setattr(figures, "LAYOUT", None)
         patch.setattr(replay, "EPISODES", 1)
         yield

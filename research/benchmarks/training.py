@@ -26,7 +26,7 @@ from pydrake.systems.framework import InputPort, OutputPort
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.tools.learning import checkpoint, episodes, fast_sb3, off_policy, trainer
-from guiderail.tools.learning.off_policy import DemonstrationReplayBuffer
+from guiderail.tools.learning.networks import DemonstrationReplayBuffer
 from guiderail.tools.learning.run_folder import RunFolder, configure
 
 TASK = "BncConnector"

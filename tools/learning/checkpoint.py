@@ -133,7 +133,7 @@ def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if not file.is_file():
         raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
     arrays, stored = load_checkpoint(file)
-    values = stored["learner"]
+    arrays, values = {k: v for k, v in arrays.items() if not k.startswith("episodes/")}, stored["learner"]
     if "acting" in values:  # pipelined; only the acting process counts the episodes
         arrays, values = entries_of(arrays, "learning"), values["learning"] | {"episodes": values["acting"]["episodes"]}
     if "exploration" not in values:

@@ -1,4 +1,4 @@
-"""Networks of Stable-Baselines3 learners: images, activations, export, and critics that observe more than the actor."""
+"""Networks and replay buffer of Stable-Baselines3 learners: images, activations, export, privileged critics."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from sb3_contrib.common.torch_layers import BatchRenorm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
@@ -321,3 +324,50 @@ def export_layers(
 
 
 _ACTIVATIONS = {torch.nn.ReLU: "relu", torch.nn.Tanh: "tanh"}
+
+
+class DemonstrationReplayBuffer(ReplayBuffer):
+    """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
+
+    The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
+
+    Attributes:
+        fraction: Fraction of demonstrations in a batch, once the buffer also has other transitions.
+        num_demonstrated: Number of rows of demonstrations.
+    """
+
+    fraction = 0.5
+    num_demonstrated = 0
+
+    def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
+        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
+        if self.num_demonstrated >= self.buffer_size:
+            raise InputError(
+                f"the demonstrations fill the replay buffer of {self.buffer_size} transitions: give a larger "
+                "--set buffer_size=..."
+            )
+        super().add(*args, **kwargs)  # type: ignore[arg-type]
+        if self.full and self.pos < self.num_demonstrated:
+            self.pos = self.num_demonstrated
+
+    @property
+    def newest(self) -> int:
+        """Index of the row that was added last."""
+        is_wrapped = self.full and self.pos == self.num_demonstrated
+        return self.buffer_size - 1 if is_wrapped else self.pos - 1
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Return a batch with evenly spaced demonstrated rows.
+
+        Several batches can be sampled at once and then divided into equal parts: the numbers of demonstrations in the
+        parts differ by at most one.
+        """
+        size, first = self.size(), self.num_demonstrated
+        if not 0 < first < size:
+            return super().sample(batch_size, env)
+        count = np.arange(batch_size + 1) * self.fraction
+        is_demonstrated = np.diff(np.floor(count + 1e-9)) > 0
+        low, high = np.where(is_demonstrated, 0, first), np.where(is_demonstrated, first, size)
+        # NumPy's global generator is used, as in Stable-Baselines3's own buffers.
+        indices = np.random.randint(low, high)  # noqa: NPY002
+        return self._get_samples(indices, env=env)

@@ -18,10 +18,7 @@ import torch
 from gymnasium import spaces
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import SAC, TD3
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.diagrams.envs.task_diagram import Symmetry
@@ -41,6 +38,7 @@ from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
 from guiderail.tools.learning.learner_config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.networks import (
+    DemonstrationReplayBuffer,
     ImageFeatures,
     NormalizedReLU,
     SpacesOnlyEnv,
@@ -53,53 +51,6 @@ from guiderail.tools.learning.networks import (
     share_encoder,
     with_privileged,
 )
-
-
-class DemonstrationReplayBuffer(ReplayBuffer):
-    """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
-
-    The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
-
-    Attributes:
-        fraction: Fraction of demonstrations in a batch, once the buffer also has other transitions.
-        num_demonstrated: Number of rows of demonstrations.
-    """
-
-    fraction = 0.5
-    num_demonstrated = 0
-
-    def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
-        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
-        if self.num_demonstrated >= self.buffer_size:
-            raise InputError(
-                f"the demonstrations fill the replay buffer of {self.buffer_size} transitions: give a larger "
-                "--set buffer_size=..."
-            )
-        super().add(*args, **kwargs)  # type: ignore[arg-type]
-        if self.full and self.pos < self.num_demonstrated:
-            self.pos = self.num_demonstrated
-
-    @property
-    def newest(self) -> int:
-        """Index of the row that was added last."""
-        is_wrapped = self.full and self.pos == self.num_demonstrated
-        return self.buffer_size - 1 if is_wrapped else self.pos - 1
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """Return a batch with evenly spaced demonstrated rows.
-
-        Several batches can be sampled at once and then divided into equal parts: the numbers of demonstrations in the
-        parts differ by at most one.
-        """
-        size, first = self.size(), self.num_demonstrated
-        if not 0 < first < size:
-            return super().sample(batch_size, env)
-        count = np.arange(batch_size + 1) * self.fraction
-        is_demonstrated = np.diff(np.floor(count + 1e-9)) > 0
-        low, high = np.where(is_demonstrated, 0, first), np.where(is_demonstrated, first, size)
-        # NumPy's global generator is used, as in Stable-Baselines3's own buffers.
-        indices = np.random.randint(low, high)  # noqa: NPY002
-        return self._get_samples(indices, env=env)
 
 
 class OffPolicyLearner(Learner):
