@@ -599,7 +599,7 @@ def files() -> str:
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
     from guiderail.tools.evaluation.step_log import MEANINGS
-    from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
+    from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (

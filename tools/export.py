@@ -19,8 +19,9 @@ from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.laws.skill import PRIMITIVE_FILE, SKILL_FILE
-from guiderail.models.policy import Policy
+from guiderail.models.policy import Ensemble, Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
+from guiderail.tools.evaluation.subject import refuse_guidance_change
 from guiderail.tools.files import check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
@@ -67,9 +68,6 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
         run: Folder of a run, or `pretrained:NAME`.
         guidance: Kinds of guidance that can be exported.
         exported: Options of which only one value can be exported, with this value.
-
-    Raises:
-        InputError: If there is no such run, its policy observes images, or its guidance cannot be exported.
     """
     folder = RunFolder(find_run(run))
     config, policy = folder.config(), Policy.load(folder.path)
@@ -119,9 +117,6 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
 
     Returns:
         Paths of the files.
-
-    Raises:
-        InputError: As `load_skill`, or if the folder cannot be written.
     """
     check_new(out, "folder")
     skill = load_skill(run, GUIDED, EXPORTED)
@@ -147,6 +142,30 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
         entry["output"] = output
     files = {POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue()}
     return write_files(out, files | {SKILL_FILE: to_json(description)})
+
+
+def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
+    """Write the mean of several runs' policies as a run folder with the configuration of the first run.
+
+    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run.
+    """
+    if len(runs) < 2:
+        raise InputError("an ensemble has the policies of several runs: name at least two")
+    folders = [RunFolder(find_run(run)) for run in runs]
+    configs = [folder.config() for folder in folders]
+    for config in configs[1:]:
+        refuse_guidance_change(configs[0].environment, config.environment)
+    try:
+        ensemble = Ensemble([Policy.load(folder.path) for folder in folders])
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{error}: give runs of the same task and options") from error
+    folder = RunFolder(out)
+    with folder.locked():
+        folder.create(configs[0])
+        ensemble.save(out, write=write_atomically)
+    return ensemble
 
 
 def write_files(out: Path, files: Mapping[str, bytes]) -> list[Path]:
@@ -197,11 +216,7 @@ def _size(term: Any, pose_size: int) -> int:
 
 
 def policy_to_onnx(policy: Policy) -> bytes:
-    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n).
-
-    Raises:
-        InputError: If the policy observes images.
-    """
+    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n)."""
     layers, description = policy.layers, policy.description
     if len(description["observation_shape"]) != 1 or "image_shape" in description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")

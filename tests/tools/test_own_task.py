@@ -20,12 +20,11 @@ from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
 from guiderail.systems.reward_system import RewardTerm
-from guiderail.tools.catalog import describe_task_options
+from guiderail.tools.catalog import describe_task_options, describe_template
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.train import train
-from guiderail.tools.validate_template import validate_template
 from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10
@@ -424,7 +423,7 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
 
 def test_validate_template_accepts_the_name_of_a_template(monkeypatch):
     monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    first, second = validate_template(Path("pouring"))["transitions"]
+    first, second = describe_template(Path("pouring"))["transitions"]
     assert first == "translational → tilt below 0.25 m, back above 0.27 m"
     assert second == "tilt → pour below 0.075 m, no way back"
 

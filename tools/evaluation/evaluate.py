@@ -39,7 +39,7 @@ from guiderail.tools.evaluation.evaluation import (
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.policies import as_policy, is_compatible
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.evaluation.subject import (
     Subject,
@@ -52,6 +52,7 @@ from guiderail.tools.evaluation.subject import (
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.environment_set import member_configs
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
@@ -161,9 +162,6 @@ def evaluate_run(
     Hidden values that are constant in a run are the same as in its training. With `skips_incompatible`, a policy whose
     observation or action shape does not match the environment has no rows. Further arguments are those of
     `evaluate_policy`.
-
-    Raises:
-        InputError: If the environment cannot be made, or an argument is out of range.
     """
     with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
@@ -191,9 +189,6 @@ def evaluate_once(
 
     Returns:
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
-
-    Raises:
-        InputError: If the stored file is damaged or cannot be written, or an argument is invalid.
     """
     compute = partial(
         evaluate_run, config, make_policy, environment, **{"label": name, "skips_incompatible": True, **kwargs}
@@ -211,10 +206,6 @@ def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.
 
     The episodes are stored in the run's folder, and read from there if they are stored already. They are simulated in
     as many processes as there are cores.
-
-    Raises:
-        InputError: If the run has no policy, a stored file is damaged or cannot be written, or `episodes` is not a
-            whole number of at least 1.
     """
     policy = Policy.load(folder.path)
     tables = []

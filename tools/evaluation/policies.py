@@ -88,12 +88,7 @@ class ForeignPolicy(Callback):
         self._act, self._name = act, name
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action for an observation.
-
-        Raises:
-            InputError: If the observation has another shape than the policy takes, or the function raised an exception
-                or called `sys.exit`.
-        """
+        """Return the action for an observation."""
         if self.observation_shape is not None and self.observation_shape != np.shape(observation):
             raise InputError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
         try:
@@ -240,9 +235,6 @@ def as_policy(given: Any) -> PolicyFn:
     """Convert a function or an object with a `predict` method to a policy whose errors name the policy.
 
     A policy of this package, or a callable `Callback`, is returned unchanged.
-
-    Raises:
-        InputError: If `given` is neither.
     """
     if isinstance(given, type) and (hasattr(given, "predict") or "__call__" in vars(given)):
         raise InputError(f"{given.__name__} is a class: give a policy, such as {given.__name__}()")
@@ -271,10 +263,6 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
             (.pt, .ts, .torchscript); or `module:function`, where `module` is a module's name or a file (.py), and
             `function` is any policy that `as_policy` takes, or a class of such policies.
         trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
-
-    Raises:
-        InputError: If the file or function is missing, the file is damaged, it can execute code and is not trusted, or
-            its package is not installed.
     """
     if (function := function_of(str(source))) is not None:
         return _load_function(*function)
@@ -413,10 +401,6 @@ def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[s
     """Return `as_policy(policy)` if its observation and action shapes match an environment.
 
     `learned_in` are the options of the environment in training; the error message names those that differ.
-
-    Raises:
-        InputError: If the shape of the policy's observations or actions differs from the environment's, a model's
-            action space has other bounds, or the policy raises an exception.
     """
     policy = as_policy(policy)
     raised: Exception | None = None
@@ -574,11 +558,7 @@ def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapp
 
 
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
-
-    Raises:
-        InputError: If `make_policy` returns no function.
-    """
+    """Return True if a policy's observations and actions have the layout of the environment's."""
     act = make_policy(env)
     if not callable(act):
         raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")

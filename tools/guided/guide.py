@@ -139,12 +139,7 @@ class _FittedSegment:
             self.primitive_for(self.as_linear(segment.constraints))  # refuses invalid constraints before an episode
 
     def as_linear(self, constraints: Any) -> LinearConstraints:
-        """Return the linear constraints of a segment; demonstrated bounds become a box for each step.
-
-        Raises:
-            InputError: If the value is no constraint, does not fit the reference, or has limits of the motion that
-                residual guidance does not enforce.
-        """
+        """Return the linear constraints of a segment; demonstrated bounds become a box for each step."""
         if constraints is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(constraints, DemonstratedBounds):
@@ -188,11 +183,7 @@ class _FittedSegment:
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """Settings of guidance by demonstrations.
-
-    Raises:
-        InputError: If `history` is not a whole number of at least 1; `PrimitiveGuide` checks the other settings.
-    """
+    """Settings of guidance by demonstrations."""
 
     # κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
@@ -218,10 +209,6 @@ class PrimitiveGuide(Guide):
             (moved to the nearest point within the linear constraints).
         settings: Settings.
         period: Control period [s]; required for `MotionConstraints`, and unless every segment has `num_steps`.
-
-    Raises:
-        InputError: If an argument is out of range, a segment has fewer than three demonstrations, or segments have
-            different outputs.
     """
 
     def __init__(
@@ -252,11 +239,7 @@ class PrimitiveGuide(Guide):
         self.num_steps = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments)
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin the first segment.
-
-        Raises:
-            InputError: If a frame or constraints are invalid, or `MotionConstraints` have no period.
-        """
+        """Begin the first segment."""
         self._recent = [np.array(pose, dtype=float)]
         self._is_ended = False
         self._begin_segment(0, env, observation)
@@ -393,10 +376,6 @@ class TemplateGuide(Guide):
             `RigidTransform` of `guiderail.models.common.transforms` or of Drake.
         period: Control period [s], positive.
         extra: Value for `to_action`, or (name of the state) → value.
-
-    Raises:
-        InputError: If the period is missing or not positive, active constraints of a state contradict each other, or a
-            state limits force or torque.
     """
 
     num_outputs = POSE_SIZE
@@ -418,12 +397,7 @@ class TemplateGuide(Guide):
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin in the template's state for the measured pose.
-
-        Raises:
-            InputError: If the pose of an object is missing or no transform, a pose is not finite, or the measured pose
-                is more than 0.2 m or 1 rad outside of the active constraints.
-        """
+        """Begin in the template's state for the measured pose."""
         frames = self._frames_of(env, observation)
         if not isinstance(frames, Mapping):
             raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
@@ -463,9 +437,6 @@ class LawGuide(Guide):
 
     Args:
         law: Law.
-
-    Raises:
-        InputError: If `law` is not a law.
     """
 
     def __init__(self, law: Law):

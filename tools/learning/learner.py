@@ -201,9 +201,6 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
     """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
     If a supervisor or via-points correct the demonstrations, the symmetry is None.
-
-    Raises:
-        InputError: If observations have images, and the learner does not accept images.
     """
     if not config.learner.takes_images and has_image(task.observation_space):
         name = config.learner.algorithm
@@ -239,11 +236,7 @@ class LearningLog:
     """
 
     def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
-        """Construct the log, which opens files in `folder` at the first entry.
-
-        Raises:
-            InputError: If a format is unknown, or its package is not installed.
-        """
+        """Construct the log, which opens files in `folder` at the first entry."""
         self._folder, self._formats = folder, check_log_formats(formats)
         self._logger: Any = None
 

@@ -10,9 +10,8 @@ from guiderail.models.policy import FORMAT, Policy
 from guiderail.models.primitives import ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.learner import LEARNERS, Learner
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail_hardware.teleop.interventions import (
     LABEL_REWARDS,
@@ -93,7 +92,7 @@ def passage(episodes, **environment):
 
 def by(supervisor):
     """Return the start of episodes that a supervisor corrects."""
-    return lambda config, state: SupervisedTraining(config, supervisor, state)
+    return lambda config: SupervisedTraining(config, supervisor)
 
 
 def test_correction_becomes_transitions_and_via_points(tmp_path):

@@ -22,7 +22,6 @@ from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.tools.contract import check_reset_result, check_step_result, check_values, naming_wrong_counts
 from guiderail.tools.guided.guide import (
     PRIMITIVE_GUIDANCE,
     Guide,
@@ -33,6 +32,7 @@ from guiderail.tools.guided.guide import (
     predict_request,
 )
 from guiderail.tools.guided.segment import Constraints, Segment
+from guiderail.tools.spaces import check_reset_result, check_step_result, check_values, naming_wrong_counts
 
 OBSERVED = ("phase", "command")
 SUCCESSES = ("is_success", "success")  # entries of `info` that report success
