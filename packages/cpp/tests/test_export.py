@@ -53,11 +53,11 @@ def test_description_lists_signals_and_action(tmp_path):
     assert [entry["name"] for entry in skill["action"]] == ["input 0", "input 1", "input 2"]
 
 
-def test_export_refuses_equal_bounds():
+def test_export_refuses_equal_bounds_when_it_has_a_history():
     reference = ReferenceTrajectory(np.arange(4.0), np.zeros((4, 2)), np.tile(1e-4 * np.eye(2), (4, 1, 1)))
     constraints = LinearConstraints.box([0.0, -1.0], [0.0, 1.0])
     with pytest.raises(InputError, match="equal lower and upper bounds"):
-        primitive_arrays(PrimitiveLaw(LcNsKmp(reference, constraints=constraints)))
+        primitive_arrays(PrimitiveLaw(LcNsKmp(reference, constraints=constraints, history=2)))
 
 
 def test_export_refuses_a_folder_that_exists(tmp_path):
