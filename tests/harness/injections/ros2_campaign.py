@@ -427,7 +427,7 @@ class Campaign:
                     self.station.resume(self.context)
             self.step_once()
         else:
-            raise SystemExit(f"the arm does not resume: {self.arm_state.name}, {self.fault.name}")
+            raise AssertionError(f"does not resume: {self.arm_state.name}, {self.fault.name}")
         for _ in range(round(seconds / PERIOD)):
             self.step_once()
 
@@ -441,7 +441,7 @@ class Campaign:
             number = number + 1 if is_equal else 0
             if number * PERIOD > seconds:
                 return
-        raise SystemExit("the arm does not return to its motion")
+        raise AssertionError("does not return to its motion")
 
     def undisturbed_speeds(self) -> np.ndarray:
         """Return the speed of the fastest joint in each step of a period of the motion [rad/s]."""
@@ -531,14 +531,22 @@ def main() -> int:
         injections = [(kind,) for kind in kinds]
         injections += list(pairs_of(kinds, arguments.pairs // arguments.instants, rng))
         for number, chosen in enumerate(injections):
-            campaign.run_until_settled(speeds, float(rng.uniform(0.02, 0.3)))
+            wait = float(rng.uniform(0.02, 0.3))
             result = campaign.inject(chosen, speeds, [arguments.seed, instant, number])
+            if campaign.arm.poll() is not None:  # killed; its connections stay known for a while
+                campaign = Campaign(next(domains))
+            try:
+                campaign.run_until_settled(speeds, wait)
+            except AssertionError as error:
+                result.failures.append(str(error))
+                campaign.close()
+                campaign = Campaign(next(domains))
+                campaign.run_until_settled(speeds, wait)
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
             for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)
                 print(f"FAIL  {name}, instant {instant}: {failure} ({result.cause})", flush=True)
-            if campaign.arm.poll() is not None:  # killed; its connections stay known for a while
-                campaign = Campaign(next(domains))
+        print(f"instant {instant} is done", flush=True)
     campaign.close()
     failed = print_table(results, CAMPAIGN)
     total = sum(len(rows) for rows in results.values())
