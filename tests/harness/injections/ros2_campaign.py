@@ -419,7 +419,7 @@ class Campaign:
 
     def run_until_following(self, seconds: float) -> None:
         """Advance until the arm follows its command, and then for `seconds` [s]."""
-        for _ in range(round(3.0 / PERIOD)):
+        for _ in range(round(8.0 / PERIOD)):  # a drift of a position is forgotten in seconds
             if self.arm_state == ArmState.RUNNING and self.fault == Fault.NONE:
                 break
             if self.arm_state == ArmState.OFF:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import random
 import time as clock
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlsplit
@@ -33,6 +34,7 @@ logger = logging.getLogger(__name__)
 
 MAX_WRENCH_AGE = 0.1  # age above which a wrench is no measurement of the present contact [s]
 MAX_STATUS_AGE = 0.02  # age above which a joint state is no target of a stop [s]
+NUM_POSES = 3  # number of targets until most wrong statuses are detected
 NUM_MESSAGES = 32  # number of messages that are taken at a time
 SWITCH_TIMEOUT = 2.0  # longest wait for the controller manager [s]
 MAX_DOMAIN = 232  # largest number of a DDS domain
@@ -197,8 +199,8 @@ class Ros2Driver(PoseDriver):
         self._wrench_arrival = -np.inf
         self._last: Any = None  # last joint state
         self._arrival = -np.inf  # local time of its arrival [s]
-        # Measured pose and joint positions at the last target, and its local time [s].
-        self._X_BaseCommanded, self._positions, self._positions_time = RigidTransform(), np.zeros(0), -np.inf
+        self._poses: deque[RigidTransform] = deque(maxlen=NUM_POSES)  # measured poses at the last targets
+        self._positions, self._positions_time = np.zeros(0), -np.inf  # joint positions at the last, and its local time
         self._is_active = False
         self._conflicts = 0
 
@@ -302,7 +304,8 @@ class Ros2Driver(PoseDriver):
             if self.address.controller:
                 self._switch([self.address.controller], [self.address.hold] if self.address.hold else [])
             self._is_active = True
-        self._X_BaseCommanded = X_BaseActual
+            self._poses.clear()
+        self._poses.append(X_BaseActual)
         self._send(bounded_target(X_BaseTool, X_BaseActual, impedance))
 
     def _is_reachable(self, positions: np.ndarray) -> bool:
@@ -347,14 +350,14 @@ class Ros2Driver(PoseDriver):
     def stop(self) -> None:
         """Hold the arm: the target becomes its last valid pose, and the controller `hold` takes over if there is one.
 
-        The newest status may be the wrong one for which the arm is stopped, so that it is no target: the pose is that
-        of the last target. If joint states have stopped, this pose is old, and the controller keeps the last target.
+        The newest statuses may be the wrong ones for which the arm is stopped, so that the pose is that of a target a
+        few periods before. If joint states have stopped, this pose is old, and the controller keeps the last target.
         """
         if not self._is_active:
             return
         self._is_active = False
         if clock.monotonic() - self._arrival <= MAX_STATUS_AGE:
-            self._send(self._X_BaseCommanded)
+            self._send(self._poses[0])
         if self.address.hold:
             self._switch([self.address.hold], [self.address.controller], waits=False)
 
