@@ -7,6 +7,7 @@ names the options that a method may choose. A changed protocol has another versi
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -15,6 +16,7 @@ from typing import Annotated, Any
 
 from pydantic import Field, ValidationError, model_validator
 
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml
@@ -107,11 +109,13 @@ class Protocol(Strict):
                 raise InputError(f"{option} of {name} is a name, a number or a list of them, not {brief(value)}")
         return flat
 
-    @property
-    def digest(self) -> str:
-        """Digest of everything that results depend on: the measured floors and times are left out."""
-        measured = {"tasks": {"__all__": {"floors", "core_seconds", "description"}}}
-        return hashlib.blake2b(self.model_dump_json(exclude=measured).encode(), digest_size=8).hexdigest()
+    def task_digest(self, name: str) -> str:
+        """Return the digest of everything in the protocol that the results on a task depend on."""
+        task = self.tasks[name].model_dump(include={"task", "env", "episodes"})
+        common = self.model_dump(mode="json", include={"version", "episodes", "first_seed"})
+        content = TASKS.get(self.resolve_task(name)[0]).folder_digest()
+        text = json.dumps([common, task, content], sort_keys=True)
+        return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
 
 
 def _is_plain(value: Any) -> bool:

@@ -21,6 +21,7 @@ from guiderail_studies.benchmark.protocol import (
     BenchmarkMethod,
     Protocol,
     floor_study,
+    load_protocol,
     method_study,
 )
 from guiderail_studies.engines.engine import Engine
@@ -170,7 +171,7 @@ def run_method(
     if not chosen:
         raise InputError(f"{method.name} does not apply to these tasks: name others")
     studies = [method_study(protocol, name, method, numbers) for name in chosen]
-    _write_method(protocol, method, out)
+    _write_method(protocol, method, chosen, out)
     hours = estimate_hours(protocol, method, chosen, len(numbers))
     number = len(chosen) * len(numbers)
     log(f"{number} runs of {method.name}, about {hours:.2g} core-hours; finished runs are not repeated")
@@ -188,29 +189,40 @@ def jobs_of(study: Any, out: Path) -> list[Job]:
     return [Job(study, method, seed, out / study.name) for seed in study.seeds]
 
 
-def _write_method(protocol: Protocol, method: BenchmarkMethod, out: Path) -> None:
+def _write_method(protocol: Protocol, method: BenchmarkMethod, tasks: Sequence[str], out: Path) -> None:
     """Write the method into the folder of its runs, or raise an InputError if it has runs of another one."""
-    file = out / METHOD_FILE
-    content = {"protocol": protocol.version, "digest": protocol.digest, "method": method.model_dump(mode="json")}
-    if file.exists() and json.loads(file.read_text(encoding="utf-8")) != content:
-        raise InputError(f"{out} has runs of another method, or of another protocol: name another folder with --out")
-    write_atomically(file, json.dumps(content, indent=1).encode())
+    digests = {}
+    if (out / METHOD_FILE).exists():
+        stored_protocol, stored, digests = stored_method(out)
+        if stored_protocol.version != protocol.version or stored != method:
+            raise InputError(
+                f"{out} has runs of another method, or of another protocol: name another folder with --out"
+            )
+    digests |= {name: protocol.task_digest(name) for name in tasks}
+    content = {"protocol": protocol.version, "digests": digests, "method": method.model_dump(mode="json")}
+    write_atomically(out / METHOD_FILE, json.dumps(content, indent=1).encode())
 
 
-def stored_method(out: Path) -> tuple[Protocol, BenchmarkMethod]:
-    """Return the protocol and the method of a folder of runs; raise an InputError if it has none."""
-    from guiderail_studies.benchmark.protocol import load_protocol
+def stored_method(out: Path) -> tuple[Protocol, BenchmarkMethod, dict[str, str]]:
+    """Return the protocol, the method and the digests of the tasks of a folder of runs.
 
+    Raises:
+        InputError: If there is no method in the folder, or the rules of a task have changed since its runs.
+    """
     file = out / METHOD_FILE
     if not file.is_file():
         raise InputError(f"there is no {METHOD_FILE} in {out}: name a folder that guiderail benchmark run wrote")
     content = json.loads(file.read_text(encoding="utf-8"))
     protocol = load_protocol(content["protocol"])
-    if content["digest"] != protocol.digest:
-        raise InputError(
-            f"{out} was run with another version of protocol {protocol.version}: run it again with this version"
-        )
-    return protocol, BenchmarkMethod.model_validate(content["method"])
+    check_digests(protocol, content["digests"], out)
+    return protocol, BenchmarkMethod.model_validate(content["method"]), content["digests"]
+
+
+def check_digests(protocol: Protocol, digests: Mapping[str, str], source: Path) -> None:
+    """Raise an InputError if tasks that were run are unknown to the protocol, or their rules have changed."""
+    for name, digest in digests.items():
+        if name not in protocol.tasks or protocol.task_digest(name) != digest:
+            raise InputError(f"{source} was run on {name} with other rules than protocol {protocol.version}: run it again")
 
 
 def finished_jobs(protocol: Protocol, method: BenchmarkMethod, out: Path) -> Iterator[tuple[str, Job]]:

@@ -25,7 +25,7 @@ from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import read_table, table_text
 from guiderail_studies.benchmark.protocol import EVALUATED_FILE, BenchmarkMethod, Protocol, load_protocol
-from guiderail_studies.benchmark.run import finished_jobs, run_row, stored_method
+from guiderail_studies.benchmark.run import check_digests, finished_jobs, run_row, stored_method
 from guiderail_studies.declaration import Strict
 from guiderail_studies.job import cpu_time
 
@@ -43,7 +43,7 @@ class Submission(Strict):
 
     format: str
     protocol: int
-    protocol_digest: str
+    digests: dict[str, str]  # digest of each task's rules, by task
     method: BenchmarkMethod
     versions: dict[str, str]  # versions of the packages that the episodes depend on
     files: dict[str, str]  # digest of every other file, by its path
@@ -69,7 +69,7 @@ def submit(runs: Path, out: Path) -> dict[str, Any]:
         InputError: If no run is finished, or the folder cannot be written.
     """
     check_new(out, "submission")
-    protocol, method = stored_method(runs)
+    protocol, method, digests = stored_method(runs)
     rows: list[dict[str, Any]] = []
     with atomic_folder(out) as folder:
         for task, job in finished_jobs(protocol, method, runs):
@@ -87,7 +87,7 @@ def submit(runs: Path, out: Path) -> dict[str, Any]:
         submission = Submission(
             format=FORMAT,
             protocol=protocol.version,
-            protocol_digest=protocol.digest,
+            digests={name: digests[name] for name in dict.fromkeys(row["task"] for row in rows)},
             method=method.model_copy(update={"imports": ()}),
             versions=installed_versions(),
             files={path.relative_to(folder).as_posix(): file_digest(path) for path in files},
@@ -134,11 +134,12 @@ def read_submission(folder: Path) -> tuple[Submission, Protocol]:
     if submission.format != FORMAT:
         raise InputError(f"{file} has another format than {FORMAT!r}: submit again with this version of guiderail")
     protocol = load_protocol(submission.protocol)
-    if submission.protocol_digest != protocol.digest:
-        raise InputError(f"{folder} was run with other rules than protocol {protocol.version}: run it again")
+    check_digests(protocol, submission.digests, folder)
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()} - {SUBMISSION}
     expected = {TABLE, *(f"{task}/{seed}/{name}" for task, seed in _runs(submission, protocol) for name in RUN_FILES)}
-    if different := sorted(found ^ set(submission.files)) or sorted(found ^ expected):
+    different = sorted(found ^ set(submission.files)) or sorted(found ^ expected)
+    different = different or sorted({*submission.digests} ^ {task for task, _ in _runs(submission, protocol)})
+    if different:
         raise InputError(f"{folder} has a file too many or too few, {brief(different[0])}: submit again")
     for name, digest in submission.files.items():
         if file_digest(folder / name) != digest:
