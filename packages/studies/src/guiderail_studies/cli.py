@@ -262,7 +262,7 @@ def benchmark_run(
         load_protocol(protocol),
         load_method(method),
         out,
-        tasks=split_names(task),
+        tasks=cli.split_names(task),
         seeds=cli.parse_integers(seeds, "--seeds"),
         engine=make_engine("process", processes),
         log=print_message,
@@ -290,7 +290,7 @@ def benchmark_floors(
 
     engine = make_engine("process", processes)
     rows, failures = check_floors(
-        load_protocol(protocol), out, tasks=split_names(task), episodes=episodes, engine=engine
+        load_protocol(protocol), out, tasks=cli.split_names(task), episodes=episodes, engine=engine
     )
     rates = {f"{row['task']}, {row['policy']}": row["success_rate"] for row in rows}
     print_result(rates | {"refused": failures}, as_json)
