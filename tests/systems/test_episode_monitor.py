@@ -101,7 +101,6 @@ def test_first_term_takes_precedence():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: EpisodeMonitor([], PERIOD),
         lambda: EpisodeMonitor([above(1)], 0.0),
         lambda: EpisodeMonitor([above(1), TerminationTerm("success", {"u": 2}, lambda u: True)], PERIOD),
         lambda: TerminationTerm("lost", {"u": 1}, lambda u: True),
@@ -109,9 +108,6 @@ def test_first_term_takes_precedence():
         lambda: above(1, steps=0),
         lambda: above(1, steps=float("nan")),
         lambda: above(1, steps=float("inf")),
-        lambda: above(1, min_progress=-0.1),
-        lambda: above(1, min_progress=float("nan")),
-        lambda: above(1, min_progress=float("inf")),
         lambda: above(1, steps=0.9995),
         lambda: above(1, steps=1.5),
     ],

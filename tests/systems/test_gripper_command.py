@@ -73,10 +73,8 @@ def test_reset_restores_the_initial_opening(is_initialized):
 @pytest.mark.parametrize(
     "arguments",
     [
-        {"lower": np.zeros(1)},
         {"opening": np.array([0.05, 0.0])},
         {"opening": np.array([np.nan, 0.0])},
-        {"upper": np.array([[0.04, 1.0]]), "lower": LOWER[None], "opening": OPENING[None]},
         {"period": 0.0},
     ],
 )

@@ -82,8 +82,6 @@ def test_initialization_restores_the_longest_length():
         {"contact_threshold": np.nan},
         {"release_threshold": np.nan},
         {"release_threshold": -0.1},
-        {"dwell_steps": 0},
-        {"wrench_size": 0},
         {"lengths": []},
         {"lengths": [0, 3]},
         {"lengths": [1, 2.5]},
