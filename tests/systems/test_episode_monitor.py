@@ -42,13 +42,6 @@ def above(limit, **parameters):
     return TerminationTerm("blocked", {"u": 1}, lambda u: u[0] > limit, **parameters)
 
 
-def test_monitor_has_its_ports():
-    system = EpisodeMonitor([above(1), TerminationTerm("success", {"v": 3}, lambda v: False)], PERIOD)
-    assert [system.get_input_port(i).get_name() for i in range(system.num_input_ports())] == ["u", "v"]
-    assert system.get_signal_input_port("v").size() == 3
-    assert system.GetOutputPort("termination").size() == 1
-
-
 def test_termination_includes_the_step_that_has_just_ended():
     episode = Episode(above(1))
     assert [episode.step(0), episode.step(2)] == [0, BLOCKED]

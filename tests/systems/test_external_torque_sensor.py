@@ -114,18 +114,3 @@ def test_noise_and_drift_are_computed_from_the_seed(arm):
 def test_drift_is_a_random_walk_with_its_deviation(arm):
     ends = np.array([measure(arm, drift=1.0, seconds=0.995, seed=seed)[0] - CONTACT for seed in range(20)])
     assert ends.std() == pytest.approx(np.sqrt(0.1), rel=0.25)  # drift is the deviation after 10 s; here 1 s
-
-
-@pytest.mark.parametrize(
-    ("noise", "drift", "period"),
-    [
-        (0.0, 0.0, 0.0),
-    ],
-)
-def test_constructor_refuses_arguments_out_of_range(arm, noise, drift, period):
-    plant, model = arm
-    with pytest.raises(InputError):
-        ExternalTorqueSensor(
-            plant, model.tool[0], np.resize(noise, np.size(noise) if np.size(noise) > 1 else 7), np.full(7, drift),
-            period=period,
-        )  # fmt: skip

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from guiderail.systems.force_monitor import ForceMonitor
+from guiderail.systems.wrench_signals import ForceMonitor
 
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
 
@@ -38,7 +38,3 @@ def test_saturation_begins_at_exactly_0_999_of_a_limit():
     limits = np.full(6, 1000.0)
     assert read([np.nextafter(999.0, 0.0)] + [0.0] * 5, limits)[1] == 0.0
     assert read([999.0] + [0.0] * 5, limits)[1] == 1.0
-
-
-def test_limits_may_be_a_list_of_numbers_below_one():
-    assert read([0.0] * 5 + [0.01], [0.01] * 6)[1] == 1.0

@@ -7,7 +7,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import nearest_pose
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory
-from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 
@@ -47,27 +47,10 @@ def history(system, context):
     return system.get_history_output_port().Eval(context).reshape(3, 2)
 
 
-def test_buffer_has_its_ports(system):
-    inputs = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
-    assert inputs == ["output", "initial_output"]
-    assert [system.get_output_port(i).get_name() for i in range(system.num_output_ports())] == ["history"]
-    assert system.get_history_output_port().size() == 6
-
-
-def test_buffer_has_no_direct_feedthrough(system):
-    assert not system.HasAnyDirectFeedthrough()
-
-
 def test_history_without_initialization_is_refused(system):
     context = system.CreateDefaultContext()
     with pytest.raises(InputError, match=r"call Simulator\.Initialize\(\)"):
         history(system, context)
-
-
-@pytest.mark.parametrize("period", ["0.1", None, [0.1]])
-def test_period_must_be_a_number(period):
-    with pytest.raises(InputError, match="a system's period must be a number, not"):
-        HistoryBuffer(1, 1, period)
 
 
 @pytest.mark.parametrize("inputs", [{"initial_output": np.nan}, {"output": 1.0, "initial_output": np.inf}])
@@ -136,17 +119,6 @@ def test_initialization_fills_the_history_again(system):
     port.GetMutableData().set_value([7.0, 8.0])
     simulator.Initialize()
     np.testing.assert_array_equal(history(system, context), [[7.0, 8.0]] * 3)
-
-
-@pytest.mark.parametrize("arguments", [(2, 3, 0.0), (2, 3, float("nan"))])
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    with pytest.raises(InputError):
-        HistoryBuffer(*arguments)
-
-
-def test_input_of_another_size_is_refused(system):
-    with pytest.raises(Exception, match="size"):
-        system.get_output_input_port().FixValue(system.CreateDefaultContext(), [1.0, 2.0, 3.0])
 
 
 @pytest.mark.parametrize("seed", range(30))

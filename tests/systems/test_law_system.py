@@ -127,10 +127,6 @@ def test_function_cannot_modify_the_inputs():
     assert read("held_action") == [0.5]
 
 
-def test_system_has_no_direct_feedthrough():
-    assert not LawSystem(Integrator(2, 1), 3, PERIOD).HasAnyDirectFeedthrough()
-
-
 def test_constructor_refuses_what_is_not_a_law():
     with pytest.raises(InputError, match="guidance needs a Law"):
         LawSystem(5, 1, PERIOD)

@@ -6,7 +6,7 @@ from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink, Zero
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
-from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 from oracles.prerequisites import changed_outputs
 
@@ -42,17 +42,6 @@ def names(system, kind):
     """Return the names of the input or output ports of a system."""
     count = getattr(system, f"num_{kind}_ports")()
     return [getattr(system, f"get_{kind}_port")(i).get_name() for i in range(count)]
-
-
-def test_system_has_its_ports():
-    system = LcNsKmpSystem(primitive(), None, PERIOD)
-    assert names(system, "input") == ["null_space_action", "history", "motion_time", "reference_window"]
-    assert names(system, "output") == ["command", "constraint_violation", "fallback"]
-    assert system.get_history_input_port().size() == 6
-    assert system.get_command_output_port().size() == 2
-    assert system.get_reference_window_input_port().size() == 9 * (2 + 4)
-    without_history = LcNsKmpSystem(primitive(history=0), None, PERIOD)
-    assert names(without_history, "input") == ["null_space_action", "motion_time", "reference_window"]
 
 
 def test_window_of_three_outputs_has_covariances_of_nine_entries():

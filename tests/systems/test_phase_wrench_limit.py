@@ -107,16 +107,6 @@ def test_invalid_number_is_zero_at_the_start():
     np.testing.assert_array_equal(rig.bound, np.r_[0.0, 0.0, HIGH[2:]])
 
 
-def test_bound_is_copied_and_may_be_a_list():
-    bound = HIGH.copy()
-    system = PhaseWrenchLimit(bound, RATE.tolist(), period=PERIOD)
-    bound[:] = 0.0
-    context = system.CreateDefaultContext()
-    system.get_state_max_wrench_input_port().FixValue(context, np.full(8, np.inf))
-    np.testing.assert_array_equal(system.get_phase_max_wrench_output_port().Eval(context), HIGH)
-    PhaseWrenchLimit(HIGH.tolist(), RATE, period=PERIOD)
-
-
 def test_initialization_resets_the_bound():
     rig = Rig(LOW)
     rig.run(2)

@@ -109,10 +109,6 @@ def test_action_is_zero_before_the_first_update_and_after_reset():
     assert loop.run(2) == [1.0] * 2
 
 
-def test_system_has_no_direct_feedthrough():
-    assert not PolicySystem(scaled_policy, 3, 3, PERIOD).HasAnyDirectFeedthrough()
-
-
 def test_policy_observes_arrays_as_in_an_environment():
     """A vector is float32. An image has no alpha channel and is a copy."""
     observations = []

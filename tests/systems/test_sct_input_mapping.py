@@ -34,13 +34,6 @@ def requested_pose(system, action, state, pose=POSE, frames=None):
     return system.get_requested_pose_output_port().Eval(context)
 
 
-def test_input_mapping_has_its_ports(system):
-    names = [system.get_input_port(i).get_name() for i in range(system.num_input_ports())]
-    assert names == ["action", "pose", "state", "frame_poses"]
-    assert system.get_action_input_port().size() == 3
-    assert system.get_output_port().get_name() == "requested_pose"
-
-
 @pytest.mark.parametrize("state", [0, 1, 2])
 def test_requested_pose_is_displaced_by_the_template(system, template, state):
     action = np.array([0.3, 0.9, -0.4])

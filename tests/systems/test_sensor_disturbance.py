@@ -69,15 +69,6 @@ def test_initialization_restarts_noise_and_delay():
     np.testing.assert_allclose(episodes[1], episodes[0], atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [{"period": 0.0}],
-)
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    with pytest.raises(InputError):
-        SensorDisturbance(**{"period": PERIOD, "noise": np.zeros(1), **arguments})
-
-
 def test_delay_of_an_episode_is_at_most_the_constructor_argument():
     sensor = SensorDisturbance(PERIOD, np.zeros(1), delay=3)
     simulator = Simulator(sensor)
