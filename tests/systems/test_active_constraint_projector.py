@@ -213,7 +213,7 @@ def test_waiting_command_moves_inside_when_an_object_moves():
 
 @pytest.mark.parametrize(("tolerance", "expected"), [(0.1, 0.5), (0.09995, 0.5 + 0.5 * PERIOD)])
 def test_waiting_command_moves_only_above_the_tolerance(monkeypatch, tolerance, expected):
-    monkeypatch.setattr("guiderail.models.laws.template.INSIDE", tolerance)
+    monkeypatch.setattr("guiderail.models.laws.template_law.INSIDE", tolerance)
     rig = Rig(start=START + [0.0, 0.0, 0.2, 0.0, 0.0, 0.0])
     rig.system.frames.set(rig.context, {"slab": RigidTransform([0.0, 0.0, 0.5])})  # violation of exactly 0.1 m
     assert rig.step(NOT_FINITE)[0][2] == pytest.approx(expected, abs=1e-9)

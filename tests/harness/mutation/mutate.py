@@ -60,7 +60,7 @@ TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
-    "models/templates/constraints.py": TEMPLATES,
+    "models/templates/active_constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/geometry.py": TEMPLATES,
     "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
