@@ -28,7 +28,7 @@ from scipy.spatial.transform import Rotation
 from guiderail.diagrams.stations.arm import add_arm, controller_model
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.cartesian_impedance import damping_matrix, impedance_torques, spring_wrench
+from guiderail.models.control.cartesian_impedance import ArmImpedance, damping_matrix, impedance_torques, spring_wrench
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains, Payload
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
@@ -192,9 +192,9 @@ class Law:
     def __getitem__(self, port):
         return self.system.GetOutputPort(port).Eval(self.context)
 
-    def check(self, **changes):
+    def check(self, bound=None, **changes):
         """Assert that the outputs are those of the control law with changed arguments; return the expected outputs."""
-        expected = impedance_torques(**(self.arguments | changes))
+        expected = impedance_torques(ArmImpedance(**(self.arguments | changes)), bound)
         np.testing.assert_allclose(self["generalized_force"], expected.torque, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(self["impedance_wrench"], expected.wrench, rtol=1e-7, atol=1e-7)
         assert self["saturation"].tolist() == [expected.is_saturated]
