@@ -7,7 +7,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.laws.template import TemplateLaw, TemplateState
+from guiderail.models.laws.template_law import TemplateLaw, TemplateState
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter

@@ -13,7 +13,7 @@ from pydrake.systems.framework import BasicVector, BasicVector_, Context
 
 from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
+from guiderail.models.control.cartesian_impedance import ArmImpedance, JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.convertible_system import ConvertibleSystem
@@ -258,11 +258,11 @@ class CartesianImpedanceController(ConvertibleSystem):
         plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
         law = self._law_arguments(self._plant, plant_context, X_TPd, gains, payload.mass, np.array(payload.center))
-        return impedance_torques(**law, bound=self._bound(context))
+        return impedance_torques(law, self._bound(context))
 
     def _law_arguments(
         self, plant: Any, plant_context: Any, X_TPd: Any, gains: Any, mass: Any, center: np.ndarray
-    ) -> dict[str, Any]:
+    ) -> ArmImpedance:
         """Return the arguments of the law, for a plant of any scalar type; `mass` and `center` are of the payload."""
         frames = (self._tool_center, self._target)
         tool_center, target = (plant.get_frame(frame.index()) for frame in frames)
@@ -289,21 +289,21 @@ class CartesianImpedanceController(ConvertibleSystem):
             if self._compensate_gravity:
                 weight = mass * plant.gravity_field().gravity_vector()
                 gravity_torque = gravity_torque - J_center.T @ weight
-        return {
-            "K": gains.stiffness,
-            "damping_ratio": gains.damping_ratio,
-            "wrench_limits": gains.wrench_limits,
-            "R_axes": R_TAxes,
-            "p_error": X_TPd.translation() - X_TP.translation(),
-            "eta": eta,
-            "epsilon": epsilon,
-            "J": J[[3, 4, 5, 0, 1, 2]],
-            "M": M,
-            "v": v,
-            "posture_torque": gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
-            "gravity_torque": gravity_torque,
-            "torque_limits": self._torque_limits,
-        }
+        return ArmImpedance(
+            K=gains.stiffness,
+            damping_ratio=gains.damping_ratio,
+            wrench_limits=gains.wrench_limits,
+            R_axes=R_TAxes,
+            p_error=X_TPd.translation() - X_TP.translation(),
+            eta=eta,
+            epsilon=epsilon,
+            J=J[[3, 4, 5, 0, 1, 2]],
+            M=M,
+            v=v,
+            posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
+            gravity_torque=gravity_torque,
+            torque_limits=self._torque_limits,
+        )
 
     def declare_converted(self, system: Any, scalar: type) -> None:
         """Declare the ports, states and parameters of this system in `system`, a system of `AutoDiffXd`.
@@ -347,7 +347,7 @@ class CartesianImpedanceController(ConvertibleSystem):
             X_TP = tool_center.CalcPose(plant_context, target)
             measured = [*X_TP.translation(), *RollPitchYaw_[scalar](X_TP.rotation()).vector()[::-1]]
             law = self._law_arguments(plant, plant_context, X_TPd, gains, payload[0], payload[1:])
-            return differentiable_torques(**law), np.array(measured)
+            return differentiable_torques(law), np.array(measured)
 
         sources = [state, desired_pose, inputs["max_wrench"], system.all_parameters_ticket()]
         law = declare.cache(system, "law", calc_law, sources)

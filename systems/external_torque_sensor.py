@@ -9,7 +9,7 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
 from guiderail.models.common.arrays import as_numbers
-from guiderail.systems.sensor_disturbance import DRIFT_TIME
+from guiderail.systems.disturbances import DRIFT_TIME
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_bodies

@@ -6,7 +6,7 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.laws.template import requested_pose
+from guiderail.models.laws.template_law import requested_pose
 from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -31,7 +31,7 @@ class SctInputMapping(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If a frame is missing or not finite. At an evaluation, if the period is not positive.
+        InputError: If the period is not positive, or a frame is missing or not finite.
 
     Attributes:
         frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
@@ -40,6 +40,7 @@ class SctInputMapping(LeafSystem):
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
+        declare.check_period(period)
         self._template, self._period = template, period
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

@@ -63,9 +63,11 @@ class TemplateFrames:
         """Set the poses of frames by name in the context of the system; other frames do not move.
 
         Raises:
-            InputError: If the context is another system's, or a pose is not finite.
+            InputError: If the context is another system's, the template has no such frame, or a pose is not finite.
         """
         declare.check_own_context(self._system, context)
+        if unknown := [name for name in frames if name not in self.names]:
+            raise InputError(f"the template has no frame {unknown[0]}, only {', '.join(self.names)}")
         poses = {name: _checked_pose(name, X_WF) for name, X_WF in frames.items()}
         for name, pose in poses.items():
             index = self._indices[self.names.index(name)]

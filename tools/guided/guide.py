@@ -19,7 +19,7 @@ from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_t
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws.law import Command, Law, check_law, safe_command
 from guiderail.models.laws.primitive import PrimitiveLaw, Request, predict
-from guiderail.models.laws.template import TemplateLaw
+from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import LONG, MIN_DEMONSTRATIONS, Selection, fit

@@ -22,6 +22,7 @@ import ast
 import importlib
 import json
 import os
+import re
 import resource
 import sys
 import tempfile
@@ -42,6 +43,13 @@ import yaml
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from mutation.mutations import ROOT, Mutant, mutants
 
+
+def _systems(path: Path) -> list[str]:
+    """Return the names of the systems of a file, in snake case, by which their test files are named."""
+    names = re.findall(r"^class (\w+)\((?:LeafSystem|ConvertibleSystem)\)", path.read_text(), re.MULTILINE)
+    return [re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in names]
+
+
 CONSTANTS = (bool, int, float, str, tuple, list, frozenset, set, np.ndarray)
 WRAPPERS = (property, classmethod, staticmethod, cached_property)
 TEST_MODULES: set[str] = set()
@@ -52,7 +60,7 @@ TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
-    "models/templates/constraints.py": TEMPLATES,
+    "models/templates/active_constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/geometry.py": TEMPLATES,
     "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
@@ -67,7 +75,7 @@ TARGETS = {
     f"{HARDWARE}/src/guiderail_hardware/drivers/driver_guard.py": [f"{HARDWARE}/tests/drivers/test_driver_guard.py"],
     f"{HARDWARE}/src/guiderail_hardware/monitor.py": [f"{HARDWARE}/tests/drivers/test_monitor.py"],
     **{
-        f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
+        f"systems/{path.name}": [f"tests/systems/test_{name}.py" for name in _systems(path)]
         for path in sorted((ROOT / "systems").glob("*.py"))
         if path.stem != "__init__"
     },
@@ -294,7 +302,8 @@ def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[
     chosen = {test for test in seconds if any(line in mutated for line in lines.get(test, ()))}
     # Only the first test executes a shared fixture, and no test executes constants and defaults. Therefore all tests of
     # the test file with the same name are added.
-    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
+    own = {f"test_{Path(mutant.file).stem}", *(Path(name).stem for name in TARGETS[mutant.file])}
+    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem in own}
     chosen = sorted(chosen or seconds, key=lambda test: (seconds[test] + 1e-3) / (1.0 + kills[test]))
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
     failed = _first_failure(mutant.file, mutant.tree(), chosen, items, limit)
