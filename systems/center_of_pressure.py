@@ -3,7 +3,6 @@
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
-from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.models.control.wrench import center_of_pressure
@@ -18,14 +17,6 @@ class CenterOfPressure(LeafSystem):
 
     A point force along z at p has the torque τ = p × f, so the center of pressure is p for any magnitude of the force.
 
-    .. pydrake_system::
-
-        name: CenterOfPressure
-        input_ports:
-        - wrench
-        output_ports:
-        - center_of_pressure
-
     ``wrench`` is (6,), force and torque about the tool center [N, Nm]. ``center_of_pressure`` is (2,), x and y [m].
 
     Args:
@@ -37,7 +28,7 @@ class CenterOfPressure(LeafSystem):
 
     def __init__(self, min_force: float):
         super().__init__()
-        if not 0.0 < as_number(min_force, "min_force") < np.inf:
+        if not 0.0 < min_force < np.inf:
             raise InputError(f"a center of pressure needs a positive, finite minimum force, not {min_force} N")
         self._wrench_port = self.DeclareVectorInputPort("wrench", WRENCH_SIZE)
         declare.output(

@@ -3,10 +3,9 @@
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class CommandDisturbance(LeafSystem):
@@ -17,15 +16,6 @@ class CommandDisturbance(LeafSystem):
     u_t is the command of period t, and y_t is the delivered command. y_{−1} and u_{−1}, …, u_{−k} are the measured pose
     at initialization. Every command, including the first, is therefore delayed by k periods.
 
-    .. pydrake_system::
-
-        name: CommandDisturbance
-        input_ports:
-        - command
-        - pose
-        output_ports:
-        - delivered_command
-
     All ports have size n. ``pose`` is the measured pose, read at initialization only.
 
     Args:
@@ -35,13 +25,12 @@ class CommandDisturbance(LeafSystem):
         delay: Delay k of a command, in periods, at least 0.
 
     Raises:
-        InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
+        InputError: If the probability is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
         super().__init__()
-        size, delay = as_count(size, "the size of a command"), as_count(delay, "the delay of commands", 0)
-        if not 0.0 <= as_number(loss_probability, "loss_probability") < 1.0:
+        if not 0.0 <= loss_probability < 1.0:
             raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {loss_probability}")
         self._loss_probability, self._delay = loss_probability, delay
         self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
@@ -61,12 +50,8 @@ class CommandDisturbance(LeafSystem):
     get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
 
     def set_seed(self, context: Context, seed: int) -> None:
-        """Set the seed of the random losses; `context` is this system's.
-
-        Raises:
-            InputError: If the seed is not a whole number of at least 0.
-        """
-        context.get_mutable_numeric_parameter(self._seed).SetFromVector(declare.seed_parameter(seed))
+        """Set the seed of the random losses; `context` is this system's."""
+        context.get_mutable_numeric_parameter(self._seed).SetFromVector([seed])
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = declare.start_pose(self._pose_port.Eval(context))

@@ -3,8 +3,7 @@
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_numbers, is_finite
-from guiderail.models.common.errors import InputError
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.transforms import POSE_SIZE, nearest_pose
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -16,30 +15,16 @@ class ContinuousPose(LeafSystem):
     Measured angles are within ±π and jump by a full turn at ±π; [Rz Ry Rx] also jump to (Rz + π, π − Ry, Rx + π) at
     Ry = ±π/2. A history, a progress, limits and an observation of the output have no such jumps.
 
-    .. pydrake_system::
-
-        name: ContinuousPose
-        input_ports:
-        - pose
-        output_ports:
-        - continuous_pose
-
     Both ports are (6,), [x y z Rz Ry Rx] in meters and radians. The pose before is sampled every period and is `near`
     at initialization. A pose that is not finite is output unchanged and not stored.
 
     Args:
         near: Pose (6,) of which the first output is the nearest equivalent, such as the first mean of a reference.
         period: Sampling period [s], positive; the pose turns by less than half a turn in it.
-
-    Raises:
-        InputError: If `near` is not a finite pose, or the period is not positive.
     """
 
     def __init__(self, near: np.ndarray, period: float):
         super().__init__()
-        near = as_numbers(near, "near")
-        if near.shape != (POSE_SIZE,) or not is_finite(near):
-            raise InputError(f"near is a finite pose (6,), not {near}")
         self._pose_port = self.DeclareVectorInputPort("pose", POSE_SIZE)
         self._last = self.DeclareDiscreteState(near)
         declare.output(self, "continuous_pose", POSE_SIZE, self._continuous_pose, [self._pose_port, self._last])

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class HistoryLengthSchedule(LeafSystem):
@@ -18,14 +17,6 @@ class HistoryLengthSchedule(LeafSystem):
     the next longer of `lengths` after every `dwell_steps` control steps. Contact is detected with hysteresis: it begins
     when the measured force exceeds `contact_threshold` and ends when the force is at most `release_threshold`. A force
     of NaN counts as contact.
-
-    .. pydrake_system::
-
-        name: HistoryLengthSchedule
-        input_ports:
-        - wrench
-        output_ports:
-        - history_length
 
     ``wrench`` is (W,), measured; its first three entries, or all entries if W is less than 3, are a force [N].
     ``history_length`` is (1,), the number P of stored outputs; it is discrete state, initially the longest length.
@@ -56,16 +47,12 @@ class HistoryLengthSchedule(LeafSystem):
         super().__init__()
         if not len(lengths) or not all(length >= 1 and float(length).is_integer() for length in lengths):
             raise InputError(f"history lengths are whole numbers from 1, at least one of them, not {list(lengths)}")
-        contact_threshold = as_number(contact_threshold, "contact_threshold")
-        if not 0.0 <= as_number(release_threshold, "release_threshold") <= contact_threshold < np.inf:
-            raise InputError(
-                "contact_threshold must be finite and release_threshold from 0 to contact_threshold, not "
-                f"{contact_threshold} N and {release_threshold} N"
-            )
+        if not 0.0 <= release_threshold <= contact_threshold < np.inf:
+            raise InputError(f"a contact begins above {contact_threshold} N: let it end at 0 to this force")
         self._lengths = sorted({int(length) for length in lengths}, reverse=True)
         self._contact_threshold, self._release_threshold = contact_threshold, release_threshold
-        self._dwell_steps = as_count(dwell_steps, "dwell_steps")
-        self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
+        self._dwell_steps = dwell_steps
+        self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
         # [index into `_lengths`, longest first; 1 in contact, else 0; steps in free space since contact or an increase]
         self._state = self.DeclareDiscreteState(3)
         declare.scalar_output(

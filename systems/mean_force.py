@@ -4,7 +4,7 @@ import numpy as np
 from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class MeanForce(LeafSystem):
@@ -15,15 +15,6 @@ class MeanForce(LeafSystem):
     A control step consists of many plant steps. The force of the last plant step does not include contacts that ended
     earlier in the control step, and during an impact it depends on the length of the plant step. The mean avoids both.
 
-    .. pydrake_system::
-
-        name: MeanForce
-        input_ports:
-        - force_sum
-        output_ports:
-        - force
-        - magnitude
-
     ``force_sum`` is (D,), the sum over all plant steps so far [N]. ``force`` is (D,), the mean over the plant steps
     since the last control step [N]. ``magnitude`` is (1,), its norm [N].
 
@@ -31,15 +22,11 @@ class MeanForce(LeafSystem):
         size: Number D of force components, at least 1.
         substeps: Number of plant steps per control step, at least 1.
         period: Control period [s], positive.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(self, size: int, substeps: int, period: float):
         super().__init__()
-        size = as_count(size, "the size of a mean force")
-        self._scale = 1.0 / as_count(substeps, "the substeps of a mean force")
+        self._scale = 1.0 / substeps
         self._force_sum_port = self.DeclareVectorInputPort("force_sum", size)
         self._last_sum = declare.sample(self, self._force_sum_port, period)
         sources = [self._force_sum_port, self._last_sum]

@@ -6,7 +6,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_bodies, transform_to_pose
@@ -17,14 +16,6 @@ class MeasuredPose(LeafSystem):
 
         X_TP = X_TW X_WP
 
-    .. pydrake_system::
-
-        name: MeasuredPose
-        input_ports:
-        - body_poses
-        output_ports:
-        - pose
-
     ``body_poses`` is the plant's output. ``pose`` is (6,), [x y z Rz Ry Rx] in meters and radians.
 
     Args:
@@ -33,14 +24,12 @@ class MeasuredPose(LeafSystem):
         X_WT: Pose of frame T in the world.
 
     Raises:
-        InputError: If an argument is of another type, the plant is not finalized, or the body is of another plant.
+        InputError: If the body is of another plant.
     """
 
     def __init__(self, plant: MultibodyPlant, body: RigidBody, X_WT: RigidTransform):
         super().__init__()
         check_bodies(plant, "body", [body])
-        if not isinstance(X_WT, RigidTransform):
-            raise InputError(f"X_WT is a RigidTransform, not {brief(X_WT)}")
         self._body = int(body.index())
         self._X_TW = X_WT.inverse()
         self._body_poses_port = self.DeclareAbstractInputPort(

@@ -14,14 +14,6 @@ from guiderail.systems.support.drake_multibody import transform_to_pose
 class PoseFromTransform(LeafSystem):
     """Convert a rigid transform into pose coordinates; the inverse of `TransformFromPose`.
 
-    .. pydrake_system::
-
-        name: PoseFromTransform
-        input_ports:
-        - transform
-        output_ports:
-        - pose
-
     ``transform`` is an abstract `RigidTransform`. ``pose`` is (6,) [x y z Rz Ry Rx] in meters and radians, Rz and Rx in
     [−π, π], Ry in [−π/2, π/2].
     """

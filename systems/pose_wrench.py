@@ -17,15 +17,6 @@ class PoseWrench(LeafSystem):
     positions are the tool's pose coordinates. The wrench of the environment on the tool, without the tool's weight and
     inertia, is therefore computed from the plant's generalized contact forces.
 
-    .. pydrake_system::
-
-        name: PoseWrench
-        input_ports:
-        - pose
-        - generalized_force
-        output_ports:
-        - wrench
-
     ``pose`` is X_TP, the pose of the tool center P in a frame T, as (6,) [x y z a b c] in meters and radians.
     ``generalized_force`` is (6,), along and about these coordinates [N, Nm]. ``wrench`` is (6,), [fx fy fz tx ty tz] at
     P in the axes of T [N, Nm].

@@ -17,14 +17,6 @@ class RelativePoses(LeafSystem):
 
         X_RB = X_RW X_WB
 
-    .. pydrake_system::
-
-        name: RelativePoses
-        input_ports:
-        - body_poses
-        output_ports:
-        - relative_poses
-
     ``body_poses`` is the plant's output. ``relative_poses`` is (6·n,) for n bodies: the position of each body [m] and
     its orientation as a rotation vector of at most π radians.
 
@@ -34,7 +26,7 @@ class RelativePoses(LeafSystem):
         reference: Body R.
 
     Raises:
-        InputError: If there is no body, the plant is not finalized, or a body is of another plant.
+        InputError: If a body is of another plant.
     """
 
     def __init__(self, plant: MultibodyPlant, bodies: Sequence[RigidBody], reference: RigidBody):

@@ -7,9 +7,9 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.laws.template import requested_pose
-from guiderail.models.templates.template import SharedControlTemplate, check_template
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -22,17 +22,6 @@ class SctInputMapping(LeafSystem):
     not finite, or ``state`` is not the number of a state, the requested pose is NaN, and an `ActiveConstraintProjector`
     repeats its last safe command.
 
-    .. pydrake_system::
-
-        name: SctInputMapping
-        input_ports:
-        - action
-        - pose
-        - state
-        - frame_poses (optional)
-        output_ports:
-        - requested_pose
-
     ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians;
     ``state`` is (1,), the number of the template's state.
 
@@ -42,7 +31,7 @@ class SctInputMapping(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If the period is not positive, or a frame is missing or not finite.
+        InputError: If a frame is missing or not finite. At an evaluation, if the period is not positive.
 
     Attributes:
         frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
@@ -51,8 +40,6 @@ class SctInputMapping(LeafSystem):
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
-        check_period(period)
-        check_template(template, frames)
         self._template, self._period = template, period
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

@@ -12,14 +12,6 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class SpatialForceFromWrench(LeafSystem):
     """Convert a wrench, force first, into Drake's `SpatialForce`, whose vector has the torque first.
 
-    .. pydrake_system::
-
-        name: SpatialForceFromWrench
-        input_ports:
-        - wrench
-        output_ports:
-        - spatial_force
-
     ``wrench`` is (6,) [fx fy fz tx ty tz] in N and Nm. ``spatial_force`` is an abstract `SpatialForce` at the same
     point and in the same axes.
     """

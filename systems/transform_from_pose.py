@@ -15,14 +15,6 @@ class TransformFromPose(LeafSystem):
 
         X = (Rz(a) Ry(b) Rx(c), [x y z])
 
-    .. pydrake_system::
-
-        name: TransformFromPose
-        input_ports:
-        - pose
-        output_ports:
-        - transform
-
     ``pose`` is (6,) [x y z a b c] in meters and radians. ``transform`` is an abstract `RigidTransform`.
     """
 

@@ -13,14 +13,6 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class WrenchFromSpatialForce(LeafSystem):
     """Convert Drake's `SpatialForce` into a wrench, force first; the inverse of `SpatialForceFromWrench`.
 
-    .. pydrake_system::
-
-        name: WrenchFromSpatialForce
-        input_ports:
-        - spatial_force
-        output_ports:
-        - wrench
-
     ``spatial_force`` is an abstract `SpatialForce`. ``wrench`` is (6,) [fx fy fz tx ty tz] in N and Nm, at the same
     point and in the same axes.
     """

@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.transforms import WRENCH_SIZE
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class WrenchTare(LeafSystem):
@@ -18,29 +18,17 @@ class WrenchTare(LeafSystem):
     The next n finite samples are averaged; samples that are not finite are not counted. A contact force during these n
     samples would be subtracted as well.
 
-    .. pydrake_system::
-
-        name: WrenchTare
-        input_ports:
-        - measured_wrench
-        output_ports:
-        - tared_wrench
-
     Both ports are (6,), force first [N, Nm].
 
     Args:
         period: Sampling period [s], positive.
         skipped: Number s of skipped samples, at least 0.
         averaged: Number n of averaged samples, at least 1.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(self, period: float, skipped: int, averaged: int):
         super().__init__()
-        self._skipped = as_count(skipped, "the number of skipped samples", 0)
-        self._averaged = as_count(averaged, "the number of averaged samples")
+        self._skipped, self._averaged = skipped, averaged
         self._count = self.DeclareDiscreteState(1)  # number k of samples so far
         self._offset = self.DeclareDiscreteState(WRENCH_SIZE)  # mean of the averaged samples so far
         self._measured_wrench_port = self.DeclareVectorInputPort("measured_wrench", WRENCH_SIZE)

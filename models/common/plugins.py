@@ -22,7 +22,7 @@ GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "robustness", "converge", "certify", "report"),
+    "studies": ("study", "robustness", "converge", "certify", "report", "benchmark"),
     "data": ("dataset",),
     "lerobot": (),
     "mujoco": (),

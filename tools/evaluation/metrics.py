@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 import scipy  # `scipy.stats` is imported on first use
 
-from guiderail.diagrams.envs.trace import EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import QUASI_STATIC_TIME, EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import TOLERANCE as TOLERANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole, find_streak
 from guiderail.models.common.errors import InputError
@@ -30,7 +31,6 @@ MAX_ENUMERATED = 6  # largest number of seeds for which all resamples are enumer
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 REPORTS_SUCCESS = "reports_success"  # column of another package's environment: 1 if `info` has a success flag
-TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,6 +193,12 @@ COLUMNS = (
         "largest contact force of any control step, low-pass filtered (10 ms)",
         _statistic("peak_contact_force"),
     ),
+    Metric(
+        "quasi_static_force",
+        "N",
+        f"largest contact force that lasts {QUASI_STATIC_TIME:g} s",
+        _statistic("quasi_static_force"),
+    ),
     Metric("mean_force", "N", "force as in peak_force, mean over control steps", _statistic("mean_force")),
     Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
     *(
@@ -203,6 +209,7 @@ COLUMNS = (
     *_violations(_statistic),
     Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
+    Metric("cost", STEPS, "control steps with a violated constraint or in collision", _count("cost")),
     Metric("saturated_steps", STEPS, "control steps with the controller at a limit", _count("saturated_steps")),
     Metric(
         "fallback_steps",
@@ -262,7 +269,7 @@ def reports_success(rows: pd.DataFrame) -> bool:
 # Columns of text; `fault` exists on hardware only, and `environment` in runs over a set of environments.
 WORDS = ("termination", "fault", "environment")
 # Columns of whole numbers.
-COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
+COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost", "saturated_steps", "fallback_steps")
 
 
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:

@@ -49,6 +49,7 @@ from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome
 
 BEST_CONSTANT = "best_constant"
+CPU_TIME = " CPU time "  # begins the line with the CPU time of an attempt in the log of a job
 BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
 RUN_FILES = ("config.yaml", "episodes.csv", "policy.json", "policy.safetensors", "checkpoint", "steps", "logs")
 SELECTION_EPISODES = 10  # training episodes of each constant action, to select the best action
@@ -437,12 +438,27 @@ def attempt(
                 "everywhere, because results depend on them"
             )
     _append(job, f" attempt of study call {call}{BEGIN}{host}, process {os.getpid()}\n")
+    started = _process_times()
     try:
         rows = work(job)
     except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
         return log_failure(job, error)
+    finally:
+        _append(job, f"{CPU_TIME}{_process_times() - started:.1f} s\n")
     _append(job, " is done\n")
     return Outcome(tuple(rows))
+
+
+def cpu_time(job: Job) -> float:
+    """Return the CPU time of all attempts at a job that ended [s]; the time of killed attempts is unknown."""
+    log = job.log.read_text(encoding="utf-8", errors="replace") if job.log.exists() else ""
+    return sum(float(number) for number in re.findall(rf"{CPU_TIME}([0-9.]+) s$", log, re.MULTILINE))
+
+
+def _process_times() -> float:
+    """Return the CPU time of this process and of its child processes that have ended [s]."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def log_failure(job: Job, error: BaseException) -> Outcome:

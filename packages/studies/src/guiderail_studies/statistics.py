@@ -1,6 +1,7 @@
 """Statistics of methods over seeds: interquartile mean and probability of improvement (Agarwal et al., 2021).
 
-The package `rliable` has the same definitions; it needs plotting packages that nothing else here uses.
+The package `rliable` has the same definitions. Its latest version, 1.2.0, needs a version of `arch` that cannot be
+imported with pandas 3, which guiderail needs. `scipy.stats.bootstrap` refuses a task with a single seed.
 """
 
 from __future__ import annotations
@@ -30,7 +31,9 @@ def probability_of_improvement(first: Scores, second: Scores) -> np.ndarray:
     return 0.5 + 0.5 * np.mean(signs, axis=0)
 
 
-def bootstrap_interval(statistic: Callable[..., np.ndarray], *methods: Scores, seed: int = 0) -> tuple[float, float]:
+def bootstrap_interval(
+    statistic: Callable[..., np.ndarray], *methods: Scores, seed: int = 0, resamples: int = RESAMPLES
+) -> tuple[float, float]:
     """Return the 95 % interval of a statistic by percentiles of a stratified bootstrap.
 
     Seeds are resampled within each task and method.
@@ -39,8 +42,9 @@ def bootstrap_interval(statistic: Callable[..., np.ndarray], *methods: Scores, s
         statistic: Function of the scores of one or more methods.
         methods: Scores of each method.
         seed: Seed of the resampling; equal scores and seeds give equal intervals.
+        resamples: Number of resamples.
     """
     rng = np.random.default_rng(seed)
-    resampled = [[rng.choice(scores, (RESAMPLES, len(scores))) for scores in method] for method in methods]
+    resampled = [[rng.choice(scores, (resamples, len(scores))) for scores in method] for method in methods]
     low, high = np.quantile(statistic(*resampled), [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE])
     return float(low), float(high)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from research.results.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
+from guiderail_studies.statistics import bootstrap_interval, interquartile_mean, probability_of_improvement
 
 
 def test_interquartile_mean_ignores_the_outer_quarters():
