@@ -43,7 +43,9 @@ class PhaseWrenchLimit(LeafSystem):
         self._max_bound, rate = as_numbers(bound, "bound"), as_numbers(max_rate, "max_rate")
         is_allowed = (self._max_bound >= 0.0) & (rate > 0.0) & np.isfinite(self._max_bound) & np.isfinite(rate)
         if is_allowed.shape != (MAX_WRENCH_SIZE,) or not is_allowed.all():
-            raise InputError(f"wrench limits need eight finite bounds and rates, not {bound} and {max_rate}")
+            raise InputError(
+                f"wrench limits need eight finite bounds and rates, not {bound} and {max_rate}"
+            )
         self._max_change = rate * period
         self._limit_port = self.DeclareVectorInputPort("state_max_wrench", MAX_WRENCH_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)

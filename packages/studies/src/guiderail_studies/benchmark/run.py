@@ -222,9 +222,7 @@ def check_digests(protocol: Protocol, digests: Mapping[str, str], source: Path) 
     """Raise an InputError if tasks that were run are unknown to the protocol, or their rules have changed."""
     for name, digest in digests.items():
         if name not in protocol.tasks or protocol.task_digest(name) != digest:
-            raise InputError(
-                f"{source} was run on {name} with other rules than protocol {protocol.version}: run it again"
-            )
+            raise InputError(f"{source} was run on {name} with other rules than protocol {protocol.version}: run it again")
 
 
 def finished_jobs(protocol: Protocol, method: BenchmarkMethod, out: Path) -> Iterator[tuple[str, Job]]:
