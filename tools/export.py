@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -104,22 +104,38 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     return TrainedSkill(config, policy, task, prior, description)
 
 
-def export_skill(run: Path | str, out: Path) -> list[Path]:
-    """Write the policy of a run, the meaning of its observation and action, and the data of its guidance.
+@dataclass(frozen=True)
+class Exporter:
+    """Format of exported skills; a call writes the skill of a run into a new folder and returns the paths of its files.
+
+    Attributes:
+        guidance: Kinds of guidance that can be exported.
+        exported: Options of which only one value can be exported, with this value.
+        files: Function from a skill to the contents of its files, by their path in the folder.
+    """
+
+    guidance: Sequence[str]
+    exported: Mapping[str, Any]
+    files: Callable[[TrainedSkill], Mapping[str, bytes]]
+
+    def __call__(self, run: Path | str, out: Path) -> list[Path]:
+        """Write the skill of a run, its folder or `pretrained:NAME`, into the folder `out`, which must not exist."""
+        check_new(out, "folder")
+        files = self.files(load_skill(run, self.guidance, self.exported))
+        paths = [out / name for name in files]
+        for path, content in zip(paths, files.values(), strict=True):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content)
+        return paths
+
+
+def _onnx_files(skill: TrainedSkill) -> dict[str, bytes]:
+    """Return the policy, the meaning of its observation and action, and the data of its guidance.
 
     `policy.onnx` is the deterministic policy: observation (1, n) → action (1, A), both float32. `skill.json` lists the
     entries of both in their order, with names, units, centers and scales, and the settings of the guidance.
     `primitive.npz` has the reference, constraints and gains of a movement primitive.
-
-    Args:
-        run: Folder of a run, or `pretrained:NAME`.
-        out: Folder to write, which must not exist.
-
-    Returns:
-        Paths of the files.
     """
-    check_new(out, "folder")
-    skill = load_skill(run, GUIDED, EXPORTED)
     environment, config = skill.config.environment, skill.prior.primitive
     assert config is not None
     law = make_law(skill.prior, history=environment["guidance"] == "skgrl")
@@ -141,7 +157,11 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     for entry, output in zip(description["action"], law.outputs, strict=True):
         entry["output"] = output
     files = {POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue()}
-    return write_files(out, files | {SKILL_FILE: to_json(description)})
+    return files | {SKILL_FILE: to_json(description)}
+
+
+export_skill = Exporter(GUIDED, EXPORTED, _onnx_files)
+"""Write the skill of a run as ONNX, JSON and NumPy files."""
 
 
 def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
@@ -166,15 +186,6 @@ def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
         folder.create(configs[0])
         ensemble.save(out, write=write_atomically)
     return ensemble
-
-
-def write_files(out: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write files, by their path in the folder, into a new folder; return their paths."""
-    paths = [out / name for name in files]
-    for path, content in zip(paths, files.values(), strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
-    return paths
 
 
 def to_json(description: Mapping[str, Any]) -> bytes:

@@ -144,13 +144,6 @@ def test_scripted_policies_without_an_instance_are_accepted(kind):
     assert find_scripted_policy("lab/Own", "scripted") is hold
 
 
-@pytest.mark.parametrize("returned", [None, [np.zeros], {"hold": 3}])
-def test_scripted_policies_that_are_no_functions_are_refused(returned):
-    declare(scripted_policies=staticmethod(lambda difficulty: returned))
-    with pytest.raises(InputError, match="scripted_policies of lab/Own must return functions of an observation by"):
-        find_scripted_policy("lab/Own", "scripted")
-
-
 def test_settings_of_another_guidance_are_accepted():
     declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
     assert EnvConfig.resolve("lab/Own", {"difficulty": "hard"}).options["guidance"] == "kmp"

@@ -56,8 +56,6 @@ def rollout(
     """
     from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
 
-    if not isinstance(env, gymnasium.Env):
-        raise InputError(f"an episode runs in an environment, as gymnasium.make returns it, not in {brief(env)}")
     if not callable(act):
         act = as_policy(act)
     if seed is not None and (seed := as_whole(seed, "a seed")) < 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -118,10 +118,6 @@ def find_environment(env: Any) -> Any:
     """
     if env is None or isinstance(env, gymnasium.Env | os.PathLike):
         return env
-    if isinstance(env, gymnasium.vector.VectorEnv):
-        raise InputError(f"a policy is evaluated in a single environment, and {brief(env)} is a vector environment")
-    if isinstance(env, type) and issubclass(env, gymnasium.Env):
-        raise InputError(f"{env.__name__} is a class: give an environment, such as {env.__name__}()")
     if not isinstance(env, str):
         raise InputError(
             f"an evaluation needs a policy and then the name of a task, the id of an environment registered with "
@@ -207,14 +203,7 @@ def make_baselines(
         baselines: Names of baseline policies, or the functions themselves by name; None for the default set.
     """
     if isinstance(baselines, Mapping):
-        for name, make in baselines.items():
-            if not callable(make):
-                raise InputError(
-                    f"baseline {name} must be a function from an environment to a policy, not {brief(make)}"
-                )
         return baselines
-    if isinstance(baselines, str) or not (baselines is None or isinstance(baselines, Iterable)):
-        raise InputError(f"baselines are a list of names, or functions by name, not {brief(baselines)}")
     if config is not None:
         names = default_baselines(config.task, environment) if baselines is None else baselines
         return {name: make_baseline(config.task, name, config.seed) for name in names}

@@ -149,8 +149,6 @@ class _FittedSegment:
             if "residual" in self.guidance:
                 constraints.refuse_limits()
             constraints = constraints.linear
-        if not isinstance(constraints, LinearConstraints):
-            raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(constraints)}")
         constraints.check_sizes(self.num_outputs, self.num_steps)
         return constraints
 
@@ -194,11 +192,6 @@ class GuideSettings:
     # Representation of the last three of six outputs; None: by the demonstrations' names, otherwise "rotation_vector".
     orientation: Orientation | None = None
 
-    def __post_init__(self) -> None:
-        if not is_whole(self.history, 1):
-            raise InputError(f"history is a number of outputs, at least 1, not {brief(self.history)}")
-        object.__setattr__(self, "history", int(self.history))
-
 
 class PrimitiveGuide(Guide):
     """Guide by movement primitives, one segment after another.
@@ -218,6 +211,8 @@ class PrimitiveGuide(Guide):
             raise InputError(f"there is no guidance {brief(guidance)}: {did_you_mean(guidance, GUIDANCE)}")
         if not segments:
             raise InputError("guidance by demonstrations needs at least one segment")
+        if settings.history < 1:
+            raise InputError(f"history is a number of outputs, at least 1, not {settings.history}")
         for index, segment in enumerate(segments):
             if (number := segment.recorded.num_demonstrations) < MIN_DEMONSTRATIONS:
                 raise InputError(
@@ -339,8 +334,7 @@ def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[i
     """Return the indices of the outputs that an action moves; raise an InputError unless they are distinct indices."""
     if action_dims is None:
         return list(range(num_outputs))
-    is_list = isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1
-    dims = list(action_dims) if is_list else [-1]
+    dims = list(action_dims)
     if len(set(dims)) < len(dims) or not all(is_whole(o, 0) and o < num_outputs for o in dims):
         raise InputError(
             f"action_dims are distinct indices of the outputs, from 0 to {num_outputs - 1}, not {brief(action_dims)}"
@@ -399,14 +393,9 @@ class TemplateGuide(Guide):
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
         """Begin in the template's state for the measured pose."""
         frames = self._frames_of(env, observation)
-        if not isinstance(frames, Mapping):
-            raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
         missing = [name for name in self.template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {self.template.name} needs the frame {missing[0]}: give its pose")
-        for name, X_WF in frames.items():
-            if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
-                raise InputError(f"the frame {name} is a RigidTransform, as of Drake, not {brief(X_WF)}")
         self._frames = {name: RigidTransform(X_WF) for name, X_WF in frames.items()}
         self._begin(TemplateLaw(self.template, self._frames, self._period), pose)
         self._now = self._state

@@ -254,11 +254,7 @@ class TrainingLoop:
         started, index, config = time.perf_counter(), len(self.rows), self._episodes.config
         environment_name = select_environment(self._episodes.env, index)
         row = self._episodes.run(self._learner, *callbacks, index=index)
-        diverged = self._learner.has_diverged()
-        if not isinstance(diverged, bool | np.bool_):
-            name = f"{type(self._learner).__name__}.has_diverged"
-            raise InputError(f"{name} must return True or False, not {brief(diverged)}")
-        if diverged:
+        if self._learner.has_diverged():
             raise divergence_error()
         if environment_name is not None:
             row["environment"] = environment_name
@@ -370,8 +366,6 @@ def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -
 
 def _checked_state(name: str, state: Any) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
     """Return a learner's arrays and values; raise an InputError if a checkpoint would change them."""
-    if not (isinstance(state, tuple) and len(state) == 2 and all(isinstance(part, Mapping) for part in state)):
-        raise InputError(f"{name} must return two dictionaries, not {brief(state)}")
     arrays, values = state
     for key, array in arrays.items():
         if np.asarray(array).dtype.kind not in "fiub":

@@ -65,8 +65,6 @@ def draw_runs(
     axis: Axes,
     runs: Sequence[Sequence[float] | np.ndarray],
     *,
-    color: str,
-    label: str,
     window: int = WINDOW,
     band: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]] = lambda values: (values.min(0), values.max(0)),
     **line: Any,
@@ -76,19 +74,17 @@ def draw_runs(
     Args:
         axis: Axes.
         runs: Values over the episodes of each run, at least one run; longer runs are cut to the shortest.
-        color: Color of line and band.
-        label: Label for a legend.
         window: Episodes of the moving mean.
         band: Function from smoothed values (runs, n) to the lower and upper end of the band, (n,) each; by default the
             range of the runs.
-        line: Further arguments of the line.
+        line: Arguments of the line, such as `color`, which the band has too, and `label`.
     """
     length = min(len(run) for run in runs)
     smooth = np.stack([rolling(run, window)[:length] for run in runs])
     episodes = np.arange(1, length + 1)
     if len(runs) > 1:
-        axis.fill_between(episodes, *band(smooth), color=color, alpha=0.15, linewidth=0)
-    axis.plot(episodes, smooth.mean(axis=0), color=color, label=label, **line)
+        axis.fill_between(episodes, *band(smooth), color=line.get("color"), alpha=0.15, linewidth=0)
+    axis.plot(episodes, smooth.mean(axis=0), **line)
 
 
 def legend(figure: Figure, axis: Axes) -> None:

@@ -117,31 +117,6 @@ def test_log_has_an_entry_for_training_after_the_last_episode(tmp_path):
     assert logged["train/loss"].tolist()[1] == 0.5
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"settings": [("learning_rate", 1e-3)]}, "settings of the learner are values by name, not"),
-        ({"out": None}, "out is the path of the run's folder, not None"),
-        ({"log": 5}, "log is a format or a list of formats, not 5"),
-    ],
-)
-def test_train_refuses_arguments_of_another_type(arguments, message, tmp_path):
-    with pytest.raises(InputError, match=message):
-        train("NarrowPassage", **{"guidance": "kgrl", "out": tmp_path / "run", **arguments})
-    assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("values", [None, {"a": object()}, {"a": "word"}, {3: 1.0}, [1.0]])
-def test_log_refuses_metrics_that_are_not_numbers_by_name(values, tmp_path):
-    class Invalid:
-        def metrics(self):
-            return values
-
-    log = LearningLog(tmp_path, ["csv"])
-    with pytest.raises(InputError, match=r"Invalid\.metrics must return numbers by name"):
-        log.record([{"episode": 0, "return": 1.0, "steps": 3}], Invalid().metrics)
-
-
 def test_train_resumes_a_run_without_its_task(tmp_path):
     arguments = {"algorithm": "sac", "pictures": False}
     train("NarrowPassage", "kgrl", out=tmp_path / "parts", episodes=1, **arguments)
