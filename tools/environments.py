@@ -21,7 +21,6 @@ from guiderail.diagrams.envs.options import (
     Options,
     PrimitiveOptions,
     TemplateOptions,
-    check_choice,
     flat_options,
     kernel_from_options,
     option_fields,
@@ -129,7 +128,7 @@ def declared_models(task: str) -> list[type[Options]]:
 
     Options of guidance and stations whose package declares no plug-in for them are missing.
     """
-    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS, "Options")]
+    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS)]
     models += [PrimitiveOptions, TemplateOptions, Disturbances]
     models += [point.load() for kind in ("station_options", "guidance_options") for _, point in find_plugins(kind)]
     return list(dict.fromkeys(models))
@@ -152,10 +151,6 @@ def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
     registered = ((TASKS, [task]), (GUIDANCE, GUIDANCE.names()), (STATIONS, STATIONS.names()))
     if not all(registry.is_packaged(name) for registry, names in registered for name in names):
         return
-    declared = find_class("task_options", task, TASKS, "Options")
-    for option, choices in (("reward", declared.rewards), ("observation", declared.observations)):
-        if option in options and choices:
-            check_choice(option, options[option], list(choices), task)
     models = declared_models(task)
     options = flat_options(models, options)
     for option in options:
@@ -194,12 +189,12 @@ def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
     from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
 
     config = EnvConfig.resolve(task, environment)
-    declared = config.make_task()
-    if "demonstrations" not in declared.provides():
+    reference = config.reference()
+    if reference is None:
         return None
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
-    share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
+    share = estimated_share(reference, kernel_from_options(values), **chosen)
     if share >= MIN_SHARE:
         return None
     return (

@@ -22,6 +22,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from guiderail.diagrams.envs.config import prior_of
+from guiderail.diagrams.envs.options import STANDARD, choices_of
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief, naming_failures, require_extra
@@ -548,9 +550,9 @@ def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> 
     """
     kind = TASKS.get(task)
     values = {
-        "guidance": possible_guidance(kind.provides()),
-        "observation": list(kind.observations),
-        "difficulty": list(kind.difficulties),
+        "guidance": possible_guidance(prior_of(kind).provides),
+        "observation": list(choices_of(kind, "observation")),
+        "difficulty": [STANDARD, *kind.presets],
     }
     candidates = [
         {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}

@@ -12,7 +12,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 
 FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
-HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
 # Height of the plug's mouth on top of the lugs, relative to the locked pose [m].
@@ -23,7 +23,7 @@ LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORK
 def build(request):
     """Return a function that builds a gantry station at one of the contact settings."""
     options = {"difficulty": "hard", **request.param}
-    workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
+    workcell = EnvConfig.resolve("BncConnector", options).declared.workcell()
     return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
 
 

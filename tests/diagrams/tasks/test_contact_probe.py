@@ -9,7 +9,7 @@ from guiderail.diagrams.tasks.contact_probe import SPEEDS, ContactProbe, drag, p
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import sdf
 
-CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
 
 def test_contact_of_the_connector_has_not_converged_at_the_default_step():
@@ -23,14 +23,14 @@ def test_contact_of_the_connector_has_not_converged_at_the_default_step():
 
 def test_drag_of_the_connector_approaches_its_friction_with_fine_contact():
     fine = EnvConfig.resolve("BncConnector", {"difficulty": "hard", "contact_margin": 0.0, "equal_area": True})
-    task = fine.make_task()
+    task = fine.declared
     ratio = drag(task.workcell(), task.rim_contact(), SPEEDS[0], time_step=PLANT_PERIOD / 4)
     assert ratio == pytest.approx(sdf.FRICTION, rel=0.2)
 
 
 def test_drag_of_the_clamp_is_its_friction_at_20_mm_per_s():
     """At 40 mm/s it is 1.0 at the default time step, and the friction at a quarter of it."""
-    clamp = EnvConfig.resolve("GridClamp", {"difficulty": "hard"}).make_task()
+    clamp = EnvConfig.resolve("GridClamp", {"difficulty": "hard"}).declared
     contact = clamp.rim_contact()
     assert drag(clamp.workcell(), contact, 0.02) == pytest.approx(contact.friction, rel=0.15)
     fine = drag(clamp.workcell(), contact, 0.04, time_step=PLANT_PERIOD / 4)
@@ -45,4 +45,4 @@ def test_drag_is_infinite_error_without_contact():
 
 def test_probe_raises_for_a_task_without_rim():
     with pytest.raises(InputError, match="no rim"):
-        probe_contact(EnvConfig.resolve("NarrowPassage", {}).make_task())
+        probe_contact(EnvConfig.resolve("NarrowPassage", {}).declared)

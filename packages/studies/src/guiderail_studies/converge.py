@@ -187,7 +187,7 @@ def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.diagrams.tasks.contact_probe import probe_contact
 
-    made = EnvConfig.resolve(task, dict(condition.environment)).make_task()
+    made = EnvConfig.resolve(task, dict(condition.environment)).declared
     names = ("drag_20", "drag_40", "lever_mm", "capture_mm", "cost")
     if getattr(made, "rim_contact", lambda: None)() is None:
         return dict.fromkeys(names)
