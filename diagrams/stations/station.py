@@ -343,6 +343,11 @@ def add_position_ports(
     return desired.get_input_port(), positions.get_output_port()
 
 
+def plant_period(workcell: Workcell, longest: float = PLANT_PERIOD) -> float:
+    """Return the default time step of a plant with a workcell, at most that of the station [s]."""
+    return min(getattr(workcell, "time_step", None) or PLANT_PERIOD, longest)
+
+
 def add_workcell_plant(
     builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
 ) -> tuple[MultibodyPlant, SceneGraph, Robot]:

@@ -39,8 +39,8 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.center_of_pressure import CenterOfPressure
-from guiderail.systems.relative_poses import RelativePoses
+from guiderail.systems.body_poses import RelativePoses
+from guiderail.systems.wrench_signals import CenterOfPressure
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 

@@ -45,7 +45,7 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
 from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_of, jack_surfaces, plug_surfaces
+from guiderail.models.objects.bnc_connector.sdf import FRICTION, TOUCHING, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 
@@ -67,19 +67,12 @@ class BncWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "jack"
     workpiece: ClassVar[str] = "plug"
+    time_step = CONTROL_PERIOD / 4
     # Pairs of surfaces that cannot touch in a connector of these dimensions, or whose contact another pair models.
-    filtered_pairs = (
-        (("lug_0", "lug_1", "pad"), ("bore",)),
-        (("barrel", "pad"), ("slots",)),
-        (("lug_0", "lug_1", "barrel"), ("seat",)),
-    )
+    filtered_pairs = tuple(((name,), tuple({*TOUCHING.values()} - {touched})) for name, touched in TOUCHING.items())
     dimensions: BncDimensions = field(default_factory=BncDimensions)  # dimensions of the connector
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the jack, (3,) [m]
     friction: float = FRICTION  # friction coefficient of the connector's metal
-    margin: float = MARGIN  # distance at which contact with the jack begins in Drake [m]; not used in MuJoCo
-    # True if the polygons of barrel and bore in Drake have the areas of their circles. Otherwise the barrel's polygon
-    # lies inside its circle and the bore's outside, and the plug drops in at larger offsets.
-    equal_area: bool = False
 
     @property
     def X_WF(self) -> RigidTransform:
@@ -96,7 +89,7 @@ class BncWorkcell(MovableWorkcell):
     def sdf(self, body: str) -> Path:
         """Return the path of the SDF file of jack or plug."""
         name = JACK_SDF.name if body == self.fixture else PLUG_SDF.name
-        return folder_of(self.dimensions, self.friction, self.margin, self.equal_area) / name
+        return folder_of(self.dimensions, self.friction) / name
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Add the jack, and a board under it without collision geometry."""
@@ -248,7 +241,7 @@ class BncConnector(BncOptions, DemonstratedInsertion):
     def workcell(self) -> BncWorkcell:
         """Return the jack in the world and the plug in the tool."""
         dimensions = replace(NOMINAL.with_bore_clearance(self.bore_clearance), mouth_chamfer=self.mouth_chamfer)
-        return BncWorkcell(dimensions, friction=self.friction, margin=self.contact_margin, equal_area=self.equal_area)
+        return BncWorkcell(dimensions, friction=self.friction)
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the demonstrations in the options."""
