@@ -101,7 +101,7 @@ def train_on_robot(
         raise InputError("the operator ends training on a robot: leave the setting stop_after_successes out")
     config = replace(config, simulated_driver=connection.sim)
     if config.step_log:
-        num_steps = EnvConfig.resolve(config.task, config.environment).make_task().num_steps
+        num_steps = EnvConfig.resolve(config.task, config.environment).num_steps
         check_room(step_log_file(folder.steps, 0), config.episodes * record_size(num_steps))
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as (env, timing):
         folder.write_config(config)
