@@ -16,8 +16,8 @@ from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.tables import read_table
 from guiderail_studies.declaration import load_study
 from guiderail_studies.job import Job
-from research.results.sections import BASELINES, SECTIONS, Row, Section
 from guiderail_studies.statistics import Scores, bootstrap_interval, interquartile_mean, probability_of_improvement
+from research.results.sections import BASELINES, SECTIONS, Row, Section
 from research.studies import study_path
 
 COLUMNS = (
