@@ -235,9 +235,6 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     `peak_contact_force`; without an impedance, `peak_force` is the largest `contact_force`. `steps` is the last
     `control_steps`, which `GuidedEnv` counts, or the number of actions if `info` does not have it. `is_terminated` is
     False if the episode was truncated.
-
-    Raises:
-        InputError: If `control_steps` is no whole number.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -276,12 +273,7 @@ COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost"
 
 
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
-    """Return a table of episodes unchanged; `source` is its file, for the message.
-
-    Raises:
-        InputError: If a column other than `WORDS` has text, a column of `COUNTS` has a number that is not whole, or
-            `success` has a number other than 0 and 1.
-    """
+    """Return a table of episodes unchanged; `source` is its file, for the message."""
     text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
     wrong = [*(text if len(rows) else ()), *fractional]
@@ -409,9 +401,6 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
     """Return statistics of episodes by name, with a prefix; each is None if there are no episodes.
 
     With a task, its own statistics may be named too.
-
-    Raises:
-        InputError: If a statistic is unknown, or the episodes lack a column that a statistic is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
     statistics: dict[str, Any] = {}

@@ -9,7 +9,6 @@ import typer
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
-from guiderail.tools.cli.evaluate import SEED, split_names
 
 cli.CHOICES["methods"] = lambda: [*import_module("guiderail_studies.benchmark.protocol").shipped_methods()]
 cli.CHOICES["axes"] = lambda: [axis.name for axis in import_module("guiderail_studies.robustness").AXES]
@@ -63,7 +62,7 @@ def robustness(
     ],
     task: cli.PolicyTask = None,
     episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
-    seed: cli.Seed = SEED,
+    seed: cli.Seed = cli.SEED,
     axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
     env: cli.Env = None,
     baselines: cli.Baselines = None,
@@ -95,7 +94,7 @@ def robustness(
         seed=seed,
         environment=cli.parse_environment(env),
         axes=axes,
-        baselines=split_names(baselines),
+        baselines=cli.split_names(baselines),
         out=out,
         log=print_message,
         processes=processes,
@@ -120,7 +119,7 @@ def converge(
     steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
     engines: Annotated[str, option("Engines: drake and mujoco, comma-separated.")] = "drake",
     episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
-    seed: cli.Seed = SEED,
+    seed: cli.Seed = cli.SEED,
     env: cli.Env = None,
     out: Annotated[Path | None, option("Folder to write.  [default: converge in the run]")] = None,
     processes: cli.Processes = None,
@@ -263,7 +262,7 @@ def benchmark_run(
         load_protocol(protocol),
         load_method(method),
         out,
-        tasks=split_names(task),
+        tasks=cli.split_names(task),
         seeds=cli.parse_integers(seeds, "--seeds"),
         engine=make_engine("process", processes),
         log=print_message,
@@ -291,7 +290,7 @@ def benchmark_floors(
 
     engine = make_engine("process", processes)
     rows, failures = check_floors(
-        load_protocol(protocol), out, tasks=split_names(task), episodes=episodes, engine=engine
+        load_protocol(protocol), out, tasks=cli.split_names(task), episodes=episodes, engine=engine
     )
     rates = {f"{row['task']}, {row['policy']}": row["success_rate"] for row in rows}
     print_result(rates | {"refused": failures}, as_json)

@@ -43,9 +43,8 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import flat_settings
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
+from guiderail.tools.learning.learner_config import flat_settings
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, configure, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome
 
@@ -109,7 +108,7 @@ class Job:
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings
         of_study, of_method = (flat_environment(study.task, env) for env in (study.env, method.env))
-        environment, given = {**of_study, **of_method}, with_defaults(study.task, given)
+        environment, given = {**of_study, **of_method}, given
         given |= {"imports": study.imports, "seed": self.seed}
         config = configure(study.task, environment, episodes=max(episodes, 1), **given)
         if config.learner.stop_after_successes:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from numbers import Real
 from pathlib import Path
@@ -22,9 +22,7 @@ from guiderail.models.primitives.full_turns import Orientation
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON
 from guiderail.models.primitives.poses import check_orientation
 from guiderail.models.templates import SharedControlTemplate, load_template
-from guiderail.tools.contract import check_reset_result, check_step_result, check_values, naming_wrong_counts
 from guiderail.tools.guided.guide import (
-    PRIMITIVE_GUIDANCE,
     Guide,
     GuideSettings,
     LawGuide,
@@ -33,6 +31,7 @@ from guiderail.tools.guided.guide import (
     predict_request,
 )
 from guiderail.tools.guided.segment import Constraints, Segment
+from guiderail.tools.spaces import check_reset_result, check_step_result, check_values, naming_wrong_counts
 
 OBSERVED = ("phase", "command")
 SUCCESSES = ("is_success", "success")  # entries of `info` that report success
@@ -125,48 +124,37 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         check_env: bool = False,
     ):
         super().__init__(env)
-        if not isinstance(check_env, bool):
-            raise InputError(f"check_env is True or False, not {brief(check_env)}")
         self._is_checked = check_env  # False after the first episode
         if not is_whole(action_repeat, 1):
             raise InputError(f"action_repeat is a number of steps, at least 1, not {brief(action_repeat)}")
         settings = GuideSettings(action_scale, action_dims, history, history_variance, horizon, orientation)
         if period is not None and not (isinstance(period, Real) and 0.0 < period < np.inf):
             raise InputError(f"the period of the environment must be a positive number of seconds, not {brief(period)}")
-        for what, function in (("pose", pose), ("to_action", to_action), ("template_frames", template_frames)):
-            if not callable(function) and not (what == "template_frames" and function is None):
-                raise InputError(f"{what} is a function of the environment and its observation, not {brief(function)}")
-        observed = tuple(observe) if isinstance(observe, Iterable) and not isinstance(observe, str) else (observe,)
-        if not all(name in OBSERVED for name in observed):
+        if not all(name in OBSERVED for name in observe):
             raise InputError(f"observe has some of {', '.join(OBSERVED)}, not {brief(observe)}")
         if orientation is not None:
             check_orientation(orientation)
         if isinstance(guidance, Law):
             guidance = LawGuide(guidance)
+        of_primitive = {"demonstrations": demonstrations, "constraints": constraints, "frame": frame}
+        of_template = {"template": template, "template_frames": template_frames}
         if isinstance(guidance, Guide):
-            unused = {
-                "demonstrations": demonstrations, "constraints": constraints, "frame": frame, "template": template,
-                "template_frames": template_frames, "action_dims": action_dims, "orientation": orientation,
-            }  # fmt: skip
-            if superfluous := [name for name, value in unused.items() if value is not None]:
-                raise InputError(f"a guide does not use {superfluous[0]}: leave it out, or give the guide's name")
+            chosen = {"action_dims": action_dims, "orientation": orientation}
+            _refuse_unused("a guide", of_primitive | of_template | chosen)
             self.guide = guidance
         elif guidance == "template":
             if template is None or template_frames is None:
                 raise InputError("guidance by a template needs template= and template_frames=")
             if orientation == "rotation_vector":
                 raise InputError("poses of a template are [x y z Rz Ry Rx]: leave orientation out")
-            unused = {"demonstrations": demonstrations, "constraints": constraints, "frame": frame}
-            if superfluous := [name for name, value in unused.items() if value is not None]:
-                raise InputError(f"guidance by a template does not use {superfluous[0]}: leave it out")
+            _refuse_unused("guidance by a template", of_primitive)
             if not isinstance(template, SharedControlTemplate):
                 template = load_template(template)
             self.guide = TemplateGuide(template, template_frames, period)
-        elif guidance in PRIMITIVE_GUIDANCE and (template is not None or template_frames is not None):
-            raise InputError(f"guidance={guidance!r} does not use a template: leave it out, or use guidance='template'")
         else:
+            _refuse_unused(f"guidance={guidance!r}", of_template)
             self.guide = PrimitiveGuide(_segments(demonstrations, constraints, frame), guidance, settings, period)
-        self.action_repeat, self._observe = int(action_repeat), observed
+        self.action_repeat, self._observe = int(action_repeat), tuple(observe)
         self._pose, self._to_action = pose, to_action
         self._command: Command | None = None
         self._extra: Any = None
@@ -342,18 +330,21 @@ class GuidedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         return {"observation": self._observation, **extra}
 
 
+def _refuse_unused(user: str, arguments: Mapping[str, Any]) -> None:
+    """Raise an InputError if an argument is given that the guidance does not use."""
+    if superfluous := [name for name, value in arguments.items() if value is not None]:
+        raise InputError(f"{user} does not use {superfluous[0]}: leave it out")
+
+
 def _segments(demonstrations: Any, constraints: Any, frame: Any) -> list[Segment]:
     """Return the segments of a motion; a motion without segments becomes a single one."""
     if demonstrations is None:
         raise InputError("guidance by demonstrations needs demonstrations=")
     if isinstance(demonstrations, Demonstrations | str | Path):
         return [Segment(demonstrations, frame=frame, constraints=constraints)]
-    segments: list[Any] = list(demonstrations) if isinstance(demonstrations, Iterable) else [None]
-    if not all(isinstance(segment, Segment) for segment in segments):
-        raise InputError("demonstrations are Demonstrations, a file, or a list of Segment")
     if constraints is not None or frame is not None:
         raise InputError("give constraints and frame to each Segment")
-    return segments
+    return list(demonstrations)
 
 
 class GuidedVectorEnv(SyncVectorEnv):
@@ -367,16 +358,11 @@ class GuidedVectorEnv(SyncVectorEnv):
         **keywords: Keywords of `GuidedEnv`.
 
     Raises:
-        InputError: As `GuidedEnv`, or if `env_fns` is empty, has an entry that is no function, or two of its functions
-            return the same environment.
+        InputError: As `GuidedEnv`, or if two functions return the same environment.
     """
 
     def __init__(self, env_fns: Sequence[Callable[[], gymnasium.Env[Any, Any]]], **keywords: Any):
-        env_fns = list(env_fns) if isinstance(env_fns, Iterable) else [env_fns]
-        if not env_fns:
-            raise InputError("a vector environment needs at least one environment")
-        if not all(map(callable, env_fns)):
-            raise InputError("env_fns are functions that return an environment, such as lambda: env")
+        env_fns = list(env_fns)
         first = GuidedEnv(env_fns[0](), **keywords)
         own = {
             name: keywords[name]

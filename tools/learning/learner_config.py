@@ -14,13 +14,9 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAda
 from pydantic.dataclasses import dataclass
 
 from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
-from guiderail.diagrams.guidance.registry import GUIDANCE
-from guiderail.diagrams.stations.registry import STATIONS
-from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean, find_class
-from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
@@ -261,9 +257,6 @@ def resolve_preset(
         preset: Name of a preset; `default_preset` by default.
         algorithm: Name of the learner; the preset's by default.
         settings: Values by name that replace those of the preset; numbers or text.
-
-    Raises:
-        InputError: If a name is unknown, the preset is of another kind of learner, or a value is out of range.
     """
     if preset is not None and preset not in PRESETS:
         raise InputError(f"there is no preset {brief(preset)}: {did_you_mean(preset, PRESETS)}")
@@ -278,11 +271,7 @@ def resolve_preset(
 
 
 def config_class(algorithm: str) -> type[LearnerConfig]:
-    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported.
-
-    Raises:
-        InputError: If there is no such learner.
-    """
+    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported."""
     kind: type[LearnerConfig] = find_class("learner_config", algorithm, LEARNERS, "Config")
     return kind
 
@@ -293,11 +282,7 @@ def default_preset(algorithm: str) -> str | None:
 
 
 def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
-    """Validate settings against the configuration class of a learner; missing settings get its defaults.
-
-    Raises:
-        InputError: If there is no such learner or setting, or a value is out of range.
-    """
+    """Validate settings against the configuration class of a learner; missing settings get its defaults."""
     kind = config_class(algorithm)
     names = option_fields(kind)
     values = {**flat_options([kind], settings), "algorithm": algorithm}
@@ -317,39 +302,6 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
         raise InputError(
             f"the learner's {name} cannot be {brief(values.get(name))} ({first['msg'].lower()}): give a value{example}"
         ) from None
-
-
-def check_choices(
-    task: str,
-    *,
-    guidance: str | None,
-    station: str | None,
-    algorithm: str | None,
-    preset: str | None,
-    settings: Mapping[str, Any],
-    episodes: int | None,
-    seed: int | None,
-) -> None:
-    """Check the choices of a run that do not depend on its task's options, without importing Drake.
-
-    None selects the default. Guidance and station are checked only for a task of this package, because a task of
-    another package may have its own.
-
-    Raises:
-        InputError: If a name is unknown or a value is out of range.
-    """
-    for registry, name in ((GUIDANCE, guidance), (STATIONS, station)):
-        if name is not None and TASKS.is_packaged(task) and name not in registry.names():
-            registry.get(name)  # raises an InputError
-    if algorithm is not None or preset is not None:
-        resolve_preset(preset, algorithm, settings)
-    kinds = [config_class(learner) for learner in LEARNERS.usable()]
-    known = {name for kind in kinds for name in option_fields(kind)} - {"algorithm"}
-    for name in flat_options(kinds, settings):
-        if name not in known:
-            raise InputError(f"no learner has a setting {brief(name)}: {did_you_mean(name, known)}")
-    check_episodes(1 if episodes is None else episodes)
-    check_seed(0 if seed is None else seed)
 
 
 def check_episodes(episodes: object) -> int:

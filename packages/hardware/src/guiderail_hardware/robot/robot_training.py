@@ -2,31 +2,37 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium
+import numpy as np
 import pandas as pd
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
+from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
 from guiderail.tools.evaluation.step_log import step_log_file, table
 from guiderail.tools.files import check_room, write_atomically
-from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
-from guiderail.tools.learning.learner import LEARNERS, learner_arguments
+from guiderail.tools.learning.episodes import Episodes
+from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
-from guiderail.tools.learning.pipelined import PipelinedLearner
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.learning.processes import PipelinedLearner
+from guiderail.tools.learning.run_folder import (
+    RunConfig,
+    RunFolder,
+    configure,
+    resumed_config,
+    warn_of_unfinished_source,
+)
 from guiderail.tools.learning.train import SUMMARY
-from guiderail.tools.learning.trainer import learned_policy, restore_checkpoint, write_checkpoint
+from guiderail.tools.learning.trainer import TrainingLoop
+from guiderail.tools.progress import EpisodeProgress
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import record_size
@@ -48,7 +54,6 @@ def train_on_robot(
     *,
     environment: Mapping[str, Any],
     given: Mapping[str, Any],
-    settings: Mapping[str, Any] | None = None,
     resume: bool = False,
     assume_yes: bool = False,
     log: Log = print,
@@ -63,8 +68,7 @@ def train_on_robot(
         out: Run folder; with `resume`, the folder of the run to continue.
         connection: Connection to the robot driver.
         environment: Environment options by name, with a hardware station.
-        given: Arguments of `configure`: algorithm, preset, episodes, seed, step_log and imports.
-        settings: Settings of the learner by name.
+        given: Arguments of `configure`: the choices of a run, and imports.
         resume: Continue a run from its last checkpoint; the address of the robot may differ.
         assume_yes: Skip the confirmation of the checks; resuming after a stop is always confirmed.
         log: Function that shows a message.
@@ -78,8 +82,8 @@ def train_on_robot(
     options = connection.environment_options(str(environment["station"]))
     if resume:
         unchanged = {name: value for name, value in environment.items() if name != "robot_url"}
-        choices = {name: value for name, value in given.items() if name != "imports"}
-        config = resumed_config(folder, task, unchanged, choices, settings)
+        choices: Any = {name: value for name, value in given.items() if name != "imports"}
+        config = resumed_config(folder, task, unchanged, choices)
         if config.simulated_driver not in (None, connection.sim):
             hint = "a simulated driver: give --sim" if config.simulated_driver else "a robot: leave --sim out"
             raise InputError(f"the run in {out} was trained with {hint}, or train again in another folder")
@@ -88,7 +92,7 @@ def train_on_robot(
         raise InputError("training needs a task: name a task, such as guiderail train-on-robot BncConnector --out RUN")
     else:
         folder.refuse_existing()
-        config = configure(task, {**environment, **options}, **with_defaults(task, {**given, "settings": settings}))
+        config = configure(task, {**environment, **options}, **given)
         warn_of_unfinished_source(config)
     if config.learner.demonstration_episodes:
         raise InputError("there are no demonstration episodes on a robot: leave the setting demonstration_episodes out")
@@ -113,6 +117,58 @@ def train_on_robot(
     return {"run": str(out), **summary(pd.DataFrame(rows), SUMMARY), "not_learned_from": num_excluded}
 
 
+class RobotEpisodes(Episodes):
+    """Episodes on a robot, whose arm must not wait longer than the command timeout while they are saved."""
+
+    is_real_time = True
+
+    def __init__(self, config: RunConfig, env: RobotEnv, folder: RunFolder, learner: PipelinedLearner):
+        """Construct the episodes; the training process of `learner` writes their step log into `folder`."""
+        super().__init__(config, env)
+        self._robot, self._folder, self._pipelined = env, folder, learner
+        self._learned_before = 0  # number of episodes used for training before the run was resumed
+        self._index = 0
+
+    def restore(self, rows: list[dict[str, Any]], arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Count the episodes before the run was resumed."""
+        self._learned_before = sum(row["learned_from"] for row in rows[:-1])
+
+    def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
+        """Run one episode and return its row, with the columns of a robot."""
+        self._index, pipelined = index, self._pipelined
+        row = super().run(learner, *callbacks, index=index)
+        row |= {"learned_from": int(row["termination"] not in EXCLUDED_TERMINATIONS)}
+        row |= {"episodes_known": self._learned_before + pipelined.known, "late": pipelined.late}
+        return row | {"fault": self._robot.fault.name}
+
+    def saving_steps(
+        self, checkpoint: Callable[[], None], table: Callable[[], None], submit: Callable[[], None]
+    ) -> list[Callable[[], None]]:
+        """Return the steps of saving; the checkpoint does not wait for the training process."""
+        return [self.wait_until_learned, checkpoint, submit, self._write_step_log, table]
+
+    def wait_until_learned(self) -> None:
+        """Hold the arm until all submitted episodes are learned."""
+        while not self._pipelined.receive_learned():
+            self.idle()
+
+    def _write_step_log(self) -> None:
+        if self.config.step_log:
+            self._pipelined.write(step_log_file(self._folder.steps, self._index), table(self._robot.trace, self._index))
+
+    def idle(self) -> None:
+        """Hold the arm for a control step."""
+        self._robot.idle()
+
+    def end_episode(self) -> None:
+        """Bring the arm to rest if the operator requested a pause."""
+        self._robot.pause()
+
+    def end(self) -> None:
+        """Bring the arm to rest."""
+        self._robot.rest()
+
+
 def _train(
     folder: RunFolder,
     config: RunConfig,
@@ -133,53 +189,17 @@ def _train(
         niceness=NICENESS,
         imports=config.imports,
     )
-    rows: list[dict[str, Any]] = []
-    due: list[Callable[[], None]] = []  # remaining work of the last episode
-    learned_before = 0  # number of episodes used for training before the run was resumed
-
-    def wait_until_learned() -> None:
-        while not learner.receive_learned():
-            env.idle()
-
-    def write_step_log() -> None:
-        if config.step_log:
-            learner.write(step_log_file(folder.steps, rows[-1]["episode"]), table(env.trace, rows[-1]["episode"]))
-
-    def save_policy() -> None:
-        learned_policy(config, acting, env).save(folder.path, write=write_atomically)
+    episodes = RobotEpisodes(config, env, folder, learner)
+    loop = TrainingLoop(folder, learner, episodes, report)
 
     def save_learned() -> None:
         if learner.known:
-            save_policy()
+            loop.save_policy()
 
     try:
         learner.warm_up()
         gymnasium.Env.reset(env, seed=config.seed)
-        if resume:
-            rows += restore_checkpoint(folder, config, learner, env)[0]
-            learned_before = sum(row["learned_from"] for row in rows[:-1])
-        while len(rows) < config.episodes:
-            started = time.perf_counter()
-            row = rollout(env, learner.act, learner, index=len(rows))
-            row |= {"learned_from": int(row["termination"] not in EXCLUDED_TERMINATIONS)}
-            row |= {"episodes_known": learned_before + learner.known, "late": learner.late}
-            row |= {"fault": env.fault.name, "wall_time": time.perf_counter() - started}
-            rows.append(row)
-            due = [
-                wait_until_learned,
-                partial(write_checkpoint, folder, config, rows, learner, env),
-                learner.submit_episode,
-                write_step_log,
-                partial(folder.write_episodes, rows),
-            ]
-            while due:
-                due[0]()
-                due.pop(0)
-                env.idle()
-            report(row)
-            env.pause()
-        env.rest()
-        learner.finish()
+        return loop.run(resume=resume)
     except BaseException:
         with closing(learner):
             try:
@@ -188,10 +208,8 @@ def _train(
                 # An error in one step must not skip the others: the disk or the training process may have failed. The
                 # current policy is saved before and after the training process finishes. Only `wait_until_learned` is
                 # skipped, because it would resume the arm; the checkpoint waits for the weights without the arm.
-                remaining = (save for save in due if save is not wait_until_learned)
+                remaining = [save for save in loop.remaining if save != episodes.wait_until_learned]
                 for save in (*remaining, save_learned, learner.finish, save_learned):
                     with suppress(Exception):
                         save()
         raise
-    save_policy()
-    return rows

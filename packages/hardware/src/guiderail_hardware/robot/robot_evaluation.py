@@ -15,10 +15,11 @@ from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import summary
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically, write_record
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
+from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection

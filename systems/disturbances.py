@@ -1,4 +1,4 @@
-"""Sensor with scale error, bias, drift, noise, delay and resolution."""
+"""Disturbances of measurements and commands: errors of a sensor, and a channel that delays and loses commands."""
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
@@ -6,7 +6,7 @@ from pydrake.systems.framework import BasicVector, Context, DiscreteValues, Leaf
 from guiderail.models.common.arrays import as_numbers, is_whole
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 DRIFT_TIME = 10.0
 """Time after which a drift has its specified standard deviation [s]."""
@@ -22,15 +22,6 @@ class SensorDisturbance(LeafSystem):
     configuration at initialization. s, b, C, k and the seed of noise and drift are parameters of the context, which a
     reset sets. An initialization restarts noise and drift and fills the delay line with zeros.
 
-    .. pydrake_system::
-
-        name: SensorDisturbance
-        input_ports:
-        - measurement
-        - configuration (if its size is not 0)
-        output_ports:
-        - disturbed_measurement
-
     ``measurement`` and ``disturbed_measurement`` are (n,), in the units of the sensor. ``configuration`` is (m,).
 
     Args:
@@ -40,9 +31,6 @@ class SensorDisturbance(LeafSystem):
         drift: Standard deviations of d after `DRIFT_TIME`, (n,), not negative; none by default.
         resolution: Resolution of the output, (n,), not negative; 0, the default, disables rounding.
         configuration_size: Size m of the configuration; 0 if the error does not depend on a configuration.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(
@@ -57,16 +45,9 @@ class SensorDisturbance(LeafSystem):
     ):
         super().__init__()
         self._noise = as_numbers(noise, "noise")
-        if self._noise.ndim != 1 or not _are_magnitudes(self._noise, self._noise.shape):
-            raise InputError(f"a sensor's noise must be a vector of finite numbers, none negative, not {noise}")
-        delay = as_count(delay, "the delay of a sensor", 0)
-        configuration_size = as_count(configuration_size, "configuration_size", 0)
         size, self._delay = len(self._noise), delay
         self._drift = np.zeros(size) if drift is None else as_numbers(drift, "drift")
         self._resolution = np.zeros(size) if resolution is None else as_numbers(resolution, "resolution")
-        for name, values in (("drift", self._drift), ("resolution", self._resolution)):
-            if not _are_magnitudes(values, (size,)):
-                raise InputError(f"a sensor's {name} must be {size} finite numbers, none negative, not {values}")
         self._has_noise, self._has_drift = bool(self._noise.any()), bool(self._drift.any())
         self._is_rounded = self._resolution > 0.0
         self._rounds_any, self._unit = bool(self._is_rounded.any()), np.where(self._is_rounded, self._resolution, 1.0)
@@ -101,11 +82,8 @@ class SensorDisturbance(LeafSystem):
         """Set scale s (n,), bias b (n,) in the units of the sensor, and the seed of noise and drift.
 
         `context` is this system's.
-
-        Raises:
-            InputError: If the seed is not a whole number of at least 0.
         """
-        parameters = ((self._scale, scale), (self._bias, bias), (self._seed, declare.seed_parameter(seed)))
+        parameters = ((self._scale, scale), (self._bias, bias), (self._seed, [seed]))
         for index, values in parameters:
             context.get_mutable_numeric_parameter(index).SetFromVector(np.array(values, dtype=float))
 
@@ -165,5 +143,79 @@ class SensorDisturbance(LeafSystem):
         return disturbed
 
 
-def _are_magnitudes(values: np.ndarray, shape: tuple[int, ...]) -> bool:
-    return values.shape == shape and bool((np.isfinite(values) & (values >= 0.0)).all())
+class CommandDisturbance(LeafSystem):
+    """Delay commands and lose some at random; a lost command is replaced by the last delivered command.
+
+        y_t = y_{t−1} with probability p, otherwise u_{t−k},  t = 0, 1, …
+
+    u_t is the command of period t, and y_t is the delivered command. y_{−1} and u_{−1}, …, u_{−k} are the measured pose
+    at initialization. Every command, including the first, is therefore delayed by k periods.
+
+    All ports have size n. ``pose`` is the measured pose, read at initialization only.
+
+    Args:
+        size: Size n of a command, at least 1.
+        period: Period of the commands [s], positive.
+        loss_probability: Probability p that a command is lost, from 0 to less than 1.
+        delay: Delay k of a command, in periods, at least 0.
+
+    Raises:
+        InputError: If the probability is out of range; at initialization, if the measured pose is not finite.
+    """
+
+    def __init__(self, size: int, period: float, loss_probability: float = 0.0, delay: int = 0):
+        super().__init__()
+        if not 0.0 <= loss_probability < 1.0:
+            raise InputError(f"the probability that a command is lost is from 0 to less than 1, not {loss_probability}")
+        self._loss_probability, self._delay = loss_probability, delay
+        self._seed = self.DeclareNumericParameter(BasicVector(np.zeros(1)))
+        self._count = self.DeclareDiscreteState(1)
+        self._is_lost = self.DeclareDiscreteState(1)
+        self._last_delivered = declare.unset_state(self, size)
+        self._delay_line = declare.unset_state(self, delay * size) if delay else None  # oldest command first
+        self._command_port = self.DeclareVectorInputPort("command", size)
+        self._pose_port = self.DeclareVectorInputPort("pose", size)
+        source = self._command_port if self._delay_line is None else self._delay_line
+        declare.output(self, "delivered_command", size, self._delivered, [self._is_lost, self._last_delivered, source])
+        declare.update(self, period, self._update, self._reset)
+        self._start = declare.start_time(self)
+
+    get_command_input_port = input_getter("command", "command, (n,)")
+    get_pose_input_port = input_getter("pose", "measured pose, (n,)")
+    get_delivered_command_output_port = output_getter("delivered_command", "delivered command, (n,)")
+
+    def set_seed(self, context: Context, seed: int) -> None:
+        """Set the seed of the random losses; `context` is this system's."""
+        context.get_mutable_numeric_parameter(self._seed).SetFromVector([seed])
+
+    def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
+        pose = declare.start_pose(self._pose_port.Eval(context))
+        discrete_state.set_value(self._count, [0.0])
+        discrete_state.set_value(self._is_lost, [0.0])
+        discrete_state.set_value(self._last_delivered, pose)
+        if self._delay_line is not None:
+            discrete_state.set_value(self._delay_line, np.tile(pose, self._delay))
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        count = context.get_discrete_state().value(self._count).item() + 1.0
+        discrete_state.set_value(self._count, [count])
+        # At initialization no period has ended, and the value at the port is not a command.
+        has_ended = declare.has_started(context, self._start)
+        if has_ended:
+            discrete_state.set_value(self._last_delivered, self._delivered(context))
+        if has_ended and self._delay_line is not None:
+            command = self._command_port.Eval(context)
+            line = context.get_discrete_state().value(self._delay_line)
+            discrete_state.set_value(self._delay_line, np.concatenate([line[len(command) :], command]))
+        if self._loss_probability > 0.0:
+            seed = context.get_numeric_parameter(self._seed).value().item()
+            sample = np.random.default_rng([int(seed), int(count)]).uniform()
+            discrete_state.set_value(self._is_lost, [float(sample < self._loss_probability)])
+
+    def _delivered(self, context: Context) -> np.ndarray:
+        last = declare.initialized(self, context, self._last_delivered)
+        if context.get_discrete_state().value(self._is_lost).item():
+            return last
+        if self._delay_line is None:
+            return self._command_port.Eval(context)
+        return context.get_discrete_state().value(self._delay_line)[: len(last)]
