@@ -79,6 +79,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "parts": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
     "repair": {"pytetwild": "pytetwild", "pyvista": "PyVista"},
     "bags": {"rosbags": "rosbags"},
+    "minari": {"minari": "Minari"},
     "fci": {"franky": "franky"},
     "rtde": {"rtde_control": "ur-rtde", "rtde_receive": "ur-rtde", "dashboard_client": "ur-rtde"},
     "ros2": {"cyclonedds": "Cyclone DDS"},
