@@ -215,27 +215,15 @@ def systems() -> str:
 
 
 def ports(system: type) -> list[tuple[str, str, str]]:
-    """Return kind, name and description of each port in a system's docstring."""
-    block = DIAGRAM.search((inspect.getdoc(system) or "") + "\n")
+    """Return kind, name and description of each port of a system, by its getters."""
     rows = []
     for kind in ("input", "output"):
-        lines = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block[0] if block else "")
-        for line in re.findall(r"- (.*)", lines[1]) if lines else []:
-            name, _, more = line.partition(" (")
-            own = vars(system).get(f"get_{name}_{kind}_port") or vars(system).get(f"get_{kind}_port")
-            words = inspect.getdoc(own) if own else more.rstrip(")")
-            text, result = sections(words or "")
-            is_name = name.isidentifier()
-            rows.append(
-                (
-                    kind,
-                    code(name) if is_name else cell(name),
-                    cell(
-                        text.removeprefix("Return the port of the ")
-                        or " ".join(words for rows_of in result.values() for _, words in rows_of)
-                    ),
-                )
-            )
+        for getter in vars(system):
+            if found := re.fullmatch(rf"get_(\w+)_{kind}_port", getter):
+                text, _ = sections(inspect.getdoc(getattr(system, getter)) or "")
+                has_many = "name" in inspect.signature(getattr(system, getter)).parameters
+                name = f"one per {found[1]}" if has_many else code(found[1])
+                rows.append((kind, name, cell(text.removeprefix("Return the port of the "))))
     return rows
 
 
@@ -599,7 +587,7 @@ def files() -> str:
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
     from guiderail.tools.evaluation.step_log import MEANINGS
-    from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
+    from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (

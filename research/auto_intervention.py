@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import OffPolicyConfig
 from guiderail.tools.learning.learner import Positive, register_learner
+from guiderail.tools.learning.learner_config import OffPolicyConfig
 from guiderail.tools.learning.off_policy import TqcLearner
 
 

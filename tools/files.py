@@ -98,9 +98,6 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `out` at the end, or removed after an error.
 
     Partial folders that killed processes left for the same path are removed first.
-
-    Raises:
-        InputError: If the folder cannot be written. An OSError about another file is raised unchanged.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
     for partial_folder in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
@@ -125,11 +122,7 @@ def write_error(path: Path, error: OSError) -> InputError:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if a path is an existing file or folder.
-
-    Raises:
-        InputError: If the file system refuses the path, for example because a name is too long.
-    """
+    """Return True if a path is an existing file or folder."""
     try:
         return path.exists()
     except OSError as error:
@@ -157,9 +150,6 @@ def write_record(path: Path, write: Callable[[Path], object]) -> tuple[Path, str
 
     Returns:
         The path of the written file, and a sentence on the failure, empty if there was none.
-
-    Raises:
-        InputError: If the record cannot be written to any of these folders.
     """
     try:
         write(path)
@@ -188,9 +178,6 @@ def load_demonstrations(path: Path) -> Demonstrations:
 
     Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts only folders of
     .csv files.
-
-    Raises:
-        InputError: If there are no demonstrations, a file is invalid, or files have different outputs.
     """
     if path_exists(path) and path.is_dir():
         files = visible_files(path, ENDINGS)

@@ -36,10 +36,6 @@ def read_table(path: Path) -> pd.DataFrame:
 
     A column of only numbers and empty cells is numeric; its empty cells are NaN. A column of only True and False is
     boolean. All other columns are text; their empty cells are "".
-
-    Raises:
-        InputError: If the file is missing, larger than `MAX_FILE_SIZE` or not CSV in UTF-8, a row is not as long as the
-            header, or column names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
@@ -55,11 +51,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 
 def read_columns(path: Path) -> list[str]:
-    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
+    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
             return next(csv.reader([file.readline(_MAX_HEADER)], strict=True), [])
@@ -81,12 +73,7 @@ def _parse_column(cells: Sequence[str]) -> pd.Series:
 
 
 def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
-    """Check the numbers of rows in the footers of Parquet files, before memory is allocated for the rows.
-
-    Raises:
-        InputError: If a file is not a readable Parquet file, or all files together have more than `max_rows` rows. Long
-            lists count as several rows.
-    """
+    """Check the numbers of rows in the footers of Parquet files, before memory is allocated for the rows."""
     import pyarrow as arrow
     import pyarrow.parquet as parquet
 

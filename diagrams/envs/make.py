@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import multiprocessing
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial, update_wrapper
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AsyncVectorEnv
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from guiderail.diagrams.envs.assemble import (
@@ -167,6 +169,25 @@ def make_env(
     except BaseException:  # for example if the browser view finds no free port
         release()
         raise
+
+
+def make_vector_env(num_envs: int = 1, **arguments: Any) -> AsyncVectorEnv:
+    """Build the environment that `gymnasium.make_vec("guiderail/<Task>-v0", num_envs=..., ...)` returns.
+
+    Each environment runs in a process of its own, which is forked from a new process: forks of this process would copy
+    locks that its threads hold. The script that calls it therefore needs `if __name__ == "__main__":`.
+
+    Args:
+        num_envs: Number of environments.
+        arguments: Arguments of `make_env`.
+
+    Raises:
+        InputError: As `make_env`, or if `num_envs` is not a positive whole number.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise InputError(f"num_envs must be a whole number of environments, at least 1, not {brief(num_envs)}")
+    multiprocessing.set_forkserver_preload([__name__])  # imports the module once, not in each process
+    return AsyncVectorEnv([partial(make_env, **arguments)] * num_envs, context="forkserver")
 
 
 def make_skill(

@@ -26,10 +26,9 @@ from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel,
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot
+from guiderail.systems.body_poses import MeasuredPose, RelativePoses
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_detector import ContactDetector
-from guiderail.systems.measured_pose import MeasuredPose
-from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.

@@ -314,6 +314,11 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared | config), builder)
 
 
+def plant_period(workcell: Workcell, longest: float = PLANT_PERIOD) -> float:
+    """Return the default time step of a plant with a workcell, at most that of the station [s]."""
+    return min(getattr(workcell, "time_step", None) or PLANT_PERIOD, longest)
+
+
 def add_workcell_plant(
     builder: DiagramBuilder, workcell: Workcell, time_step: float, add_robot: Callable[[MultibodyPlant], Robot]
 ) -> tuple[MultibodyPlant, SceneGraph, Robot]:

@@ -32,10 +32,10 @@ from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.center_of_pressure import CenterOfPressure
+from guiderail.systems.body_poses import RelativePoses
 from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.reward_system import RewardTerm
+from guiderail.systems.wrench_signals import CenterOfPressure
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 

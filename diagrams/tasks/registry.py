@@ -157,5 +157,8 @@ def register_envs() -> None:
 def _register_env(name: str) -> None:
     if environment_id(name) not in gymnasium.registry:
         gymnasium.register(
-            id=environment_id(name), entry_point="guiderail.diagrams.envs.make:make_env", kwargs={"task": name}
+            id=environment_id(name),
+            entry_point="guiderail.diagrams.envs.make:make_env",
+            vector_entry_point="guiderail.diagrams.envs.make:make_vector_env",
+            kwargs={"task": name},
         )

@@ -205,13 +205,11 @@ def linearize(
         linear: Further constraints; none by default.
 
     Raises:
-        InputError: If a shape has more dimensions than the path, or the constraints of a step contradict each other.
+        InputError: If the constraints of a step contradict each other.
     """
     steps, outputs = path.shape
     rows = [] if linear is None else [linear.window(np.arange(steps))]
     for shape in shapes:
-        if shape.num_dims > outputs:
-            raise InputError(f"a shape in {shape.num_dims} dimensions cannot constrain {outputs} outputs")
         G, c = np.zeros((steps, 1, outputs)), np.zeros((steps, 1))
         for n, point in enumerate(path[:, : shape.num_dims]):
             G[n, 0, : shape.num_dims], c[n, 0] = shape.half_space(point)

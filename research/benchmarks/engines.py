@@ -21,7 +21,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.systems.recorder import Recording
-from guiderail.tools.visualization.style import legend, new_figure, save_figure
+from guiderail.tools.visualization.figures import legend, new_figure, save_figure
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 

@@ -10,14 +10,14 @@ from guiderail.diagrams.envs.options import option_fields
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail.tools.learning.run_folder import configure
 from guiderail_lerobot.base_policy import BASE_POLICIES
 from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
 
 
 def differences_of(task, environment=None, **given):
     """Return the described differences of a configuration from the thesis."""
-    return describe_differences(configure(task, environment or {}, **with_defaults(task, given)))
+    return describe_differences(configure(task, environment or {}, **given))
 
 
 def test_thesis_options_exist_and_accept_the_thesis_values():

@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 import scipy  # `scipy.stats` is imported on first use
 
-from guiderail.diagrams.envs.trace import EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import QUASI_STATIC_TIME, EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import TOLERANCE as TOLERANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole, find_streak
 from guiderail.models.common.errors import InputError
@@ -30,7 +31,6 @@ MAX_ENUMERATED = 6  # largest number of seeds for which all resamples are enumer
 TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 REPORTS_SUCCESS = "reports_success"  # column of another package's environment: 1 if `info` has a success flag
-TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
 
 
 def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -193,6 +193,12 @@ COLUMNS = (
         "largest contact force of any control step, low-pass filtered (10 ms)",
         _statistic("peak_contact_force"),
     ),
+    Metric(
+        "quasi_static_force",
+        "N",
+        f"largest contact force that lasts {QUASI_STATIC_TIME:g} s",
+        _statistic("quasi_static_force"),
+    ),
     Metric("mean_force", "N", "force as in peak_force, mean over control steps", _statistic("mean_force")),
     Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
     *(
@@ -203,6 +209,7 @@ COLUMNS = (
     *_violations(_statistic),
     Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
+    Metric("cost", STEPS, "control steps with a violated constraint or in collision", _count("cost")),
     Metric("saturated_steps", STEPS, "control steps with the controller at a limit", _count("saturated_steps")),
     Metric(
         "fallback_steps",
@@ -228,9 +235,6 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     `peak_contact_force`; without an impedance, `peak_force` is the largest `contact_force`. `steps` is the last
     `control_steps`, which `GuidedEnv` counts, or the number of actions if `info` does not have it. `is_terminated` is
     False if the episode was truncated.
-
-    Raises:
-        InputError: If `control_steps` is no whole number.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -265,16 +269,11 @@ def reports_success(rows: pd.DataFrame) -> bool:
 # Columns of text; `fault` exists on hardware only, and `environment` in runs over a set of environments.
 WORDS = ("termination", "fault", "environment")
 # Columns of whole numbers.
-COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
+COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost", "saturated_steps", "fallback_steps")
 
 
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
-    """Return a table of episodes unchanged; `source` is its file, for the message.
-
-    Raises:
-        InputError: If a column other than `WORDS` has text, a column of `COUNTS` has a number that is not whole, or
-            `success` has a number other than 0 and 1.
-    """
+    """Return a table of episodes unchanged; `source` is its file, for the message."""
     text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
     wrong = [*(text if len(rows) else ()), *fractional]
@@ -402,9 +401,6 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
     """Return statistics of episodes by name, with a prefix; each is None if there are no episodes.
 
     With a task, its own statistics may be named too.
-
-    Raises:
-        InputError: If a statistic is unknown, or the episodes lack a column that a statistic is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
     statistics: dict[str, Any] = {}

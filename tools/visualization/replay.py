@@ -201,9 +201,6 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         html: File of the page, .html or .htm.
         episode: First episode; the others have the following seeds.
         episodes: Number of episodes, at least 1; None for `EPISODES`.
-
-    Raises:
-        InputError: If the task has no animation, or an argument is invalid.
     """
     if environment_id(episode.task) == episode.task:
         raise InputError(f"{episode.task} is an environment of another package, which has no animation of guiderail")

@@ -23,7 +23,7 @@ from guiderail.diagrams.tasks.options import (
 )
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
+from guiderail.models.objects.bnc_connector.sdf import FRICTION
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
@@ -109,12 +109,6 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         description="clearance between barrel and bore on each side [m]",
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
-    contact_margin: Number = Field(
-        MARGIN, ge=0, le=0.5 * MM, description="distance at which contact with the jack begins in Drake [m]"
-    )
-    equal_area: bool = Field(
-        False, description="give the polygons of barrel and bore in Drake the areas of their circles"
-    )
     demonstrations: str = Field(
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )

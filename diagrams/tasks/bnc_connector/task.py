@@ -45,7 +45,7 @@ from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
 from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN, folder_of, jack_surfaces, plug_surfaces
+from guiderail.models.objects.bnc_connector.sdf import FRICTION, TOUCHING, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
@@ -72,19 +72,12 @@ class BncWorkcell(MovableWorkcell):
 
     fixture: ClassVar[str] = "jack"
     workpiece: ClassVar[str] = "plug"
+    time_step = CONTROL_PERIOD / 4
     # Pairs of surfaces that cannot touch in a connector of these dimensions, or whose contact another pair models.
-    filtered_pairs = (
-        (("lug_0", "lug_1", "pad"), ("bore",)),
-        (("barrel", "pad"), ("slots",)),
-        (("lug_0", "lug_1", "barrel"), ("seat",)),
-    )
+    filtered_pairs = tuple(((name,), tuple({*TOUCHING.values()} - {touched})) for name, touched in TOUCHING.items())
     dimensions: BncDimensions = field(default_factory=BncDimensions)  # dimensions of the connector
     p_WJ: tuple[float, float, float] = (0.55, 0.0, 0.15)  # position of the jack, (3,) [m]
     friction: float = FRICTION  # friction coefficient of the connector's metal
-    margin: float = MARGIN  # distance at which contact with the jack begins in Drake [m]; not used in MuJoCo
-    # True if the polygons of barrel and bore in Drake have the areas of their circles. Otherwise the barrel's polygon
-    # lies inside its circle and the bore's outside, and the plug drops in at larger offsets.
-    equal_area: bool = False
 
     @property
     def X_WF(self) -> RigidTransform:
@@ -101,7 +94,7 @@ class BncWorkcell(MovableWorkcell):
     def sdf(self, body: str) -> Path:
         """Return the path of the SDF file of jack or plug."""
         name = JACK_SDF.name if body == self.fixture else PLUG_SDF.name
-        return folder_of(self.dimensions, self.friction, self.margin, self.equal_area) / name
+        return folder_of(self.dimensions, self.friction) / name
 
     def add_fixture(self, plant: MultibodyPlant) -> None:
         """Add the jack, and a board under it without collision geometry."""
@@ -251,7 +244,7 @@ class BncConnector(DemonstratedInsertion):
         self.collision = Threshold("impedance_force", o.largest_force_limit)
         dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
         dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer)
-        self._workcell = BncWorkcell(dimensions, friction=o.friction, margin=o.contact_margin, equal_area=o.equal_area)
+        self._workcell = BncWorkcell(dimensions, friction=o.friction)
         if o.demonstrations in DEMONSTRATIONS:
             # The duration of the shipped demonstrations is known without a fit, which would take seconds.
             self.num_steps = round(NUM_STEPS * CONTROL_PERIOD / self.control_period)

@@ -20,9 +20,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.learning.train import train
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts import trial
 from guiderail_parts.contact import rank
@@ -156,7 +155,7 @@ def test_created_task_can_be_trained_and_evaluated(folder, tmp_path, capsys):
 def test_created_task_has_its_own_learner_and_symmetry(folder):
     name, _ = task_named(str(folder))
     recommended = yaml.safe_load((folder / "task.yaml").read_text())["recommended"]
-    config = configure(name, {}, **with_defaults(name, {"settings": {"batch_size": 32}}))
+    config = configure(name, {}, **{"settings": {"batch_size": 32}})
     for key, value in recommended["environment"].items():
         assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
     assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
@@ -620,7 +619,7 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     changed = (other / "task.yaml").read_text().replace("force_limit: 35.0", "force_limit: 30.0", 1)
     (other / "task.yaml").write_text(changed)
     with pytest.raises(InputError, match="the files of parts/other are not those that the run"):
-        start_or_resume(None, tmp_path / "run", environment={}, episodes=3, resume=True)
+        train(out=tmp_path / "run", episodes=3, resume=True)
 
 
 def shared(folder, **options):

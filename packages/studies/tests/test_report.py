@@ -20,12 +20,10 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, read_step_log
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
-from guiderail.tools.visualization.curves import plot_run
-from guiderail.tools.visualization.style import new_figure
+from guiderail.tools.visualization.figures import new_figure, plot_run
 from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, write_report
 from guiderail_studies.report_data import command, gather
 

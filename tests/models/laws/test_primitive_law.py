@@ -15,7 +15,7 @@ from guiderail.models.primitives import (
     ReferenceTrajectory,
     UnsolvableError,
 )
-from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 PERIOD, STEPS = 0.02, 40

@@ -10,7 +10,7 @@ import yaml
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
-from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
+from guiderail.models.templates.active_constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.drawing import state_lines
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, TRANSITION_DISTANCES, register
 from guiderail.models.templates.transitions import TransitionDistance

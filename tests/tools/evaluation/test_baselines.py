@@ -19,8 +19,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import find_scripted_policy, scripted_policies
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.visualization import replay
 
 

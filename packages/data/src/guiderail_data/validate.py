@@ -105,7 +105,7 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
 
 
 def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> None:
-    from guiderail.tools.visualization.style import new_figure, save_figure
+    from guiderail.tools.visualization.figures import new_figure, save_figure
 
     common = demonstrations.resampled()
     at = np.linspace(0.0, 1.0, len(common.times[0]))
@@ -265,7 +265,7 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     Raises:
         InputError: If the picture cannot be written.
     """
-    from guiderail.tools.visualization.style import new_figure, save_figure
+    from guiderail.tools.visualization.figures import new_figure, save_figure
 
     outputs, reference = np.stack(common.outputs), _fit_reference(common, None)
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))

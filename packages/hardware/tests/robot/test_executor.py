@@ -18,8 +18,7 @@ from guiderail.diagrams.stations.station import max_wrench
 from guiderail.models.common.errors import InputError
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.cli.main import main
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.models.joint_status import Fault, StatusLimits
 from guiderail_hardware.robot import executor as executing
 from guiderail_hardware.robot import preflight

@@ -23,20 +23,19 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.pipelined import PipelinedLearner
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.processes import PipelinedLearner
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.models.joint_status import Fault, JointStatus
 from guiderail_hardware.robot import preflight
 from guiderail_hardware.robot.connection import RobotConnection
-from guiderail_hardware.robot.evaluate import evaluate_on_robot
 from guiderail_hardware.robot.operator import OperatorKeys
 from guiderail_hardware.robot.preflight import SPEED
 from guiderail_hardware.robot.robot_env import RobotEnv
+from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
+from guiderail_hardware.robot.robot_training import _train, train_on_robot
 from guiderail_hardware.robot.session import robot_session
 from guiderail_hardware.robot.sim_driver import START
-from guiderail_hardware.robot.train import _train, train_on_robot
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", "reward": "shaped", "action_repeat": 5}
@@ -114,7 +113,7 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
         yield env, dict
 
-    monkeypatch.setattr("guiderail_hardware.robot.evaluate.robot_session", fake_session)
+    monkeypatch.setattr("guiderail_hardware.robot.robot_evaluation.robot_session", fake_session)
     trained_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", trained_on, seed=0, episodes=1))
     env.keys.is_pause_requested = True

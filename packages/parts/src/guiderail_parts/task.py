@@ -50,8 +50,8 @@ from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.history_buffer import HistoryBuffer
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.systems.history import HistoryBuffer
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
 from guiderail_parts.task_file import (

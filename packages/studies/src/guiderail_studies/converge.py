@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD, exact_periods
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, exact_periods, plant_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
@@ -145,7 +145,7 @@ def converge(
         row |= _measure_contact(config.task, condition)
     coarsest = coarsest_step(rows)
     table = write_table(out / "converge", rows).with_suffix(".csv")
-    trained = 1e3 * (config.environment.get("time_step") or PLANT_PERIOD)
+    trained = 1e3 * _trained_step(config.task, config.environment)
     warning = None
     if coarsest is not None and trained > coarsest * (1.0 + 1e-9):
         warning = (
@@ -167,6 +167,14 @@ def coarsest_step(rows: Sequence[Mapping[str, Any]]) -> float | None:
             break
         coarsest = float(row["step_ms"])
     return coarsest
+
+
+def _trained_step(task: str, environment: Mapping[str, Any]) -> float:
+    """Return the plant step of an environment [s]."""
+    from guiderail.diagrams.envs.config import EnvConfig
+
+    config = EnvConfig.resolve(task, dict(environment))
+    return float(environment.get("time_step") or plant_period(config.make_task().workcell()))
 
 
 def _statistics(rows: pd.DataFrame) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from guiderail.tools.evaluation.metrics import (
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
-from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
+from guiderail.tools.visualization.figures import WINDOW, draw_runs, legend_above, new_figure
 from guiderail_studies.report_data import LEARNED, ReportData, Run, command, flat, gather
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(

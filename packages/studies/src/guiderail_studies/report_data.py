@@ -26,10 +26,10 @@ from guiderail.tools.evaluation.evaluate import evaluate_once, evaluate_trained
 from guiderail.tools.evaluation.evaluation import BASELINES_FOLDER, POLICY, stored_episodes
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.config import PRESETS
+from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import read_columns, read_table
-from guiderail.tools.visualization.style import color, label
+from guiderail.tools.visualization.figures import color, label
 from guiderail_studies.declaration import source_file
 
 LEARNED = "learned"
