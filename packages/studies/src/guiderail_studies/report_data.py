@@ -142,7 +142,8 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
     A run is evaluated on `episodes` held-out episodes, together with baseline policies, if its own folder is given or
-    if the given folder has runs but no study's table. If `episodes` is 0, only stored evaluations are read.
+    if the given folder has runs but no study's table. If `episodes` is 0, only stored evaluations are read, and no code
+    that the runs name is imported.
 
     Raises:
         InputError: If no folder is given, a folder contains neither a run nor a study's table, no run has a finished
@@ -167,7 +168,8 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
         held_out += study_tables
         has_tables = has_tables or bool(study_tables)
     run_folders = {folder.resolve(): RunFolder(folder) for folder in folders}
-    runs = [Run(folder.path, folder.config(), _episodes(folder)) for folder in run_folders.values()]
+    runs_code = episodes > 0
+    runs = [Run(folder.path, folder.config(runs_code=runs_code), _episodes(folder)) for folder in run_folders.values()]
     runs = [run for run in runs if len(run.episodes)]
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
