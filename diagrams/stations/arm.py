@@ -24,6 +24,7 @@ from guiderail.diagrams.stations.station import (
     add_workcell_plant,
     exact_periods,
     export_simulation_ports,
+    plant_period,
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
@@ -190,8 +191,8 @@ class ArmStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of plant and controller [s]; `PLANT_PERIOD` by default, half of it with a gripper,
-                whose fingers would otherwise penetrate the workpiece.
+            time_step: Time step of plant and controller [s]; that of the workcell, or `PLANT_PERIOD` by default, at
+                most half of it with a gripper, whose fingers would otherwise penetrate the workpiece.
             wrench_time_constant: Time constant of the wrench sensor's low-pass filter [s].
             robot: The arm, or its name: see `robot_names()`.
             end_effector: The tool, or its name: see `end_effector_names()`.
@@ -207,7 +208,7 @@ class ArmStation(Station):
         builder = DiagramBuilder()
         end_effector = find_end_effector(end_effector)
         if time_step is None:
-            time_step = PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD
+            time_step = plant_period(workcell, PLANT_PERIOD / 2 if end_effector.opening else PLANT_PERIOD)
         control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
         self._controller_plant = ArmControllerPlant(workcell, robot, end_effector)

@@ -33,6 +33,7 @@ from guiderail.diagrams.stations.station import (
     check_pose,
     exact_periods,
     export_simulation_ports,
+    plant_period,
     set_at_rest,
 )
 from guiderail.diagrams.stations.workcell import Workcell
@@ -91,7 +92,8 @@ class GantryStation(Station):
         Args:
             workcell: Fixture in the world and held workpiece.
             impedance: Impedance at the tool center.
-            time_step: Time step of the plant [s]; default: half of `CONTROL_PERIOD`, a quarter for "cartesian".
+            time_step: Time step of the plant [s]; default: that of the workcell, or half of `CONTROL_PERIOD`, a quarter
+                for "cartesian".
             wrench_time_constant: Time constant of the wrench's low-pass filter [s]; 0 disables it.
             impedance_control: "joint" or "cartesian", see `GantryStation`.
             control_period: Time between commands [s], a whole multiple of the time step.
@@ -108,7 +110,7 @@ class GantryStation(Station):
             )
         is_joint = impedance_control == "joint"
         if time_step is None:
-            time_step = PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD
+            time_step = plant_period(workcell, PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD)
         control_period, time_step = exact_periods(control_period, time_step)
         self.control_period = control_period
         if not is_joint:

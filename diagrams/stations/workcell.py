@@ -65,6 +65,8 @@ class MovableWorkcell(ABC):
     # bounds it by the present force, but lifts a sliding contact by friction × speed × time step: by 40 µm at
     # 20 mm/s and 10 ms. `guiderail.diagrams.tasks.contact_probe` measures the drag.
     contact_approximation: ClassVar[str] = "lagged"
+    # Time step of the plant at which the contact has converged [s]; None: that of the station.
+    time_step: ClassVar[float | None] = None
 
     @property
     @abstractmethod

@@ -15,15 +15,14 @@ from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
-    OBSERVATIONS,
-    REWARDS,
+    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
     PriorOptions,
 )
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, MARGIN
+from guiderail.models.objects.bnc_connector.sdf import FRICTION
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {
@@ -87,10 +86,8 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
 
 
-class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
+class BncOptions(DemonstratedOptions, FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
-
-    rewards, observations = REWARDS, OBSERVATIONS
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"
@@ -109,12 +106,6 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
         description="clearance between barrel and bore on each side [m]",
     )
     friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
-    contact_margin: Number = Field(
-        MARGIN, ge=0, le=0.5 * MM, description="distance at which contact with the jack begins in Drake [m]"
-    )
-    equal_area: bool = Field(
-        False, description="give the polygons of barrel and bore in Drake the areas of their circles"
-    )
     demonstrations: str = Field(
         "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
     )

@@ -5,10 +5,11 @@ end, and x through the lugs. The origin of the plug frame P is the center of the
 to the cable, and x through the entries of the slots. The plug slides on with X_JP = (0, 0, z), is turned about z by
 minus `detent_angle`, and is locked at X_JP = (Rz(-detent_angle), (0, 0, `locked_height`)).
 
-Contact. The ring has two open rigid surfaces: a bore that collides only with the barrel, and a pair of slots that
-collide only with the lugs. These surfaces have a third of the triangles of a closed ring, and their contact is computed
-five times faster. The jack's barrel and lugs are compliant primitives. A soft pad on the barrel models the gasket,
-which pushes the lugs into their detents.
+Contact. The ring has three open rigid surfaces: the mouth's flat face, and its chamfer with the bore, which collide
+only with the barrel, and a pair of slots that collide only with the lugs. These surfaces have a third of the triangles
+of a closed ring, and their contact is computed five times faster. The corner between face and chamfer is a lip, a
+shallow cone, so that a plug that slides over the rim is not caught. The jack's barrel and lugs are compliant
+primitives. A soft pad on the barrel models the gasket, which pushes the lugs into their detents.
 
 `python -m research.generate connector-objects` writes the SDF and OBJ files in this folder.
 """
@@ -26,6 +27,7 @@ FOLDER = Path(__file__).parent
 JACK_SDF = FOLDER / "bnc_jack.sdf"
 PLUG_SDF = FOLDER / "bnc_plug.sdf"
 BORE_SIDES = 24  # sides of the polygon that approximates the bore
+LIP_WIDTH, LIP_RISE = 0.1 * MM, 0.015 * MM  # size of the lip at the mouth's inner corner [m]
 
 
 @dataclass(frozen=True)
@@ -185,20 +187,26 @@ def slot_mesh(dimensions: BncDimensions) -> TriangleMesh:
     return TriangleMesh.from_quads(_both_halves(np.concatenate([walls, face])))
 
 
-def bore_mesh(dimensions: BncDimensions, equal_area: bool = False) -> TriangleMesh:
-    """Return the mesh that collides with the barrel: the mouth's face, its chamfer and the bore.
+def face_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the mouth's flat face, from the outer edge of the ring to the lip."""
+    return _lathe([(dimensions.ring_radius, 0.0), _lip_edge(dimensions)])
 
-    The bore is a polygon around the true circle, or with `equal_area` a polygon of the same area.
-    """
+
+def bore_mesh(dimensions: BncDimensions) -> TriangleMesh:
+    """Return the lip at the mouth's face, the chamfer and the wall of the bore."""
     d = dimensions
-    corner = equal_area_radius(1.0, BORE_SIDES) if equal_area else 1.0 / float(np.cos(np.pi / BORE_SIDES))
-    profile = [
-        (d.ring_radius, 0.0),
-        ((d.bore_radius + d.mouth_chamfer) * corner, 0.0),
-        (d.bore_radius * corner, d.mouth_chamfer),
-        (d.bore_radius * corner, d.ring_length),
-    ]
-    return lathe(profile, BORE_SIDES)
+    corner = (d.bore_radius + d.mouth_chamfer - LIP_RISE, LIP_RISE)
+    return _lathe([_lip_edge(d), corner, (d.bore_radius, d.mouth_chamfer), (d.bore_radius, d.ring_length)])
+
+
+def _lip_edge(d: BncDimensions) -> tuple[float, float]:
+    return d.bore_radius + d.mouth_chamfer + LIP_WIDTH, 0.0
+
+
+def _lathe(profile: list[tuple[float, float]]) -> TriangleMesh:
+    """Return a surface of revolution whose polygons have the areas of the circles."""
+    scale = equal_area_radius(1.0, BORE_SIDES)
+    return lathe([(radius * scale, height) for radius, height in profile], BORE_SIDES)
 
 
 def ring_mesh(dimensions: BncDimensions) -> TriangleMesh:

@@ -12,6 +12,7 @@ from guiderail.models.objects.bnc_connector.geometry import (
     FOLDER,
     BncDimensions,
     bore_mesh,
+    face_mesh,
     ring_mesh,
     slot_columns,
     slot_mesh,
@@ -34,19 +35,26 @@ from guiderail.models.objects.surfaces import BELOW, SHOULDER, Box, Cylinder, Hu
 BRASS, NICKEL, RUBBER = "0.85 0.65 0.25 1", "0.62 0.64 0.68 1", "0.75 0.20 0.20 1"
 
 FRICTION = 0.2  # friction coefficient of metal on metal
-# Distance at which contact with the jack begins [m]. Without a margin the plug moves into the jack for a whole step of
-# 10 ms, and the next step ejects it. With a margin, fast sliding is decelerated by more than friction, depending on the
-# time step (`python -m research.benchmarks engines`).
+# Distance at which contact with the mouth's face and the slots begins [m]. Without a margin the plug moves into the
+# jack for a whole time step, and the next step ejects it. A discrete plant extrapolates the pressure along the normal
+# of each contact polygon, so a surface within its margin holds back a plug that would slide past it: a chamfer does,
+# with a force that depends on the time step. Chamfer and bore therefore touch a barrel without a margin, and the
+# mouth's face, whose normal is the axis, another one.
 MARGIN = 0.1 * MM
 # Stiffness of brass. A softer barrel distributes the load along the rim, and the torque on a misaligned plug is larger
 # than with metal parts (docs/experiments.md, "Center of pressure on the rim").
-BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM, margin=MARGIN)
+BARREL = ContactMaterial(friction=FRICTION, modulus=1e11, resolution=1.5 * MM)
 LUG = ContactMaterial(friction=FRICTION, modulus=5e9, resolution=0.8 * MM, margin=MARGIN)
 PAD = ContactMaterial(friction=0.05, modulus=1e7, resolution=6.0 * MM)  # models the gasket as a soft spring
 RING = ContactMaterial(friction=FRICTION)
 SEAT = ContactMaterial(friction=0.05)
 
 PLUG_MASS = 0.03  # [kg]
+
+TOUCHING: dict[str, str] = {
+    "barrel": "bore", "barrel_end": "face", "lug_0": "slots", "lug_1": "slots", "pad": "seat",
+}  # fmt: skip
+"""Surface of the plug that each surface of the jack can touch."""
 
 
 def barrel_sides(dimensions: BncDimensions) -> int:
@@ -55,22 +63,21 @@ def barrel_sides(dimensions: BncDimensions) -> int:
     return int(np.ceil(2.0 * np.pi * dimensions.barrel_radius / BARREL.resolution))
 
 
-def jack_sdf(
-    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
-) -> str:
-    """Return the jack's model: link `jack` is frame J, with geometry `barrel`, `pad`, `lug_0` and `lug_1`.
+def jack_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
+    """Return the jack's model: link `jack` is frame J, with the surfaces of `TOUCHING`.
 
-    `friction` and `margin` [m] apply to barrel and lugs. The collision geometry of the barrel is an inscribed
-    polygon, or with `equal_area` a polygon of the same area.
+    `friction` applies to barrel and lugs. The collision geometry of the barrel is a polygon with the area of its
+    circle.
     """
     d = dimensions
-    barrel_material, lug_material = (replace(metal, friction=friction, margin=margin) for metal in (BARREL, LUG))
+    barrel_material, lug_material = (replace(metal, friction=friction) for metal in (BARREL, LUG))
     center = at(z=d.barrel_height / 2)
-    radius = equal_area_radius(d.barrel_radius, barrel_sides(d)) if equal_area else d.barrel_radius
+    barrel = cylinder(equal_area_radius(d.barrel_radius, barrel_sides(d)), d.barrel_height)
     pad = (at(z=d.barrel_height + d.pad_height - d.pad_thickness / 2), cylinder(d.pad_radius, d.pad_thickness))
     lug_length = d.lug_tip_radius - d.lug_root_radius
     lug_center = 0.5 * (d.lug_tip_radius + d.lug_root_radius)
-    contents = collision("barrel", center, cylinder(radius, d.barrel_height), barrel_material)
+    contents = collision("barrel", center, barrel, barrel_material)
+    contents += collision("barrel_end", center, barrel, replace(barrel_material, margin=MARGIN))
     contents += visual("barrel_visual", center, cylinder(d.barrel_radius, d.barrel_height), NICKEL)
     contents += collision("pad", *pad, PAD) + visual("pad_visual", *pad, RUBBER)
     for number, side in enumerate((1.0, -1.0)):
@@ -80,44 +87,37 @@ def jack_sdf(
 
 
 def plug_sdf(dimensions: BncDimensions, friction: float = FRICTION) -> str:
-    """Return the plug's model: link `plug` is frame P, with geometry `bore`, `slots` and `seat`.
+    """Return the plug's model: link `plug` is frame P, with the surfaces of `TOUCHING`.
 
-    `friction` applies to bore and slots.
+    `friction` applies to all of them but the seat.
     """
     d, ring = dimensions, replace(RING, friction=friction)
     seat = (at(z=d.seat_height + d.seat_thickness / 2), box(d.seat_width, d.seat_width, d.seat_thickness))
     shell = (at(z=d.ring_length + d.shell_length / 2), cylinder(d.shell_radius, d.shell_length))
-    contents = collision("bore", at(), mesh("bnc_bore.obj"), ring)
-    contents += collision("slots", at(), mesh("bnc_slots.obj"), ring)
+    contents = "".join(collision(name, at(), mesh(f"bnc_{name}.obj"), ring) for name in ("face", "bore", "slots"))
     contents += collision("seat", *seat, SEAT)
     contents += visual("ring_visual", at(), mesh("bnc_ring.obj"), NICKEL)
     contents += visual("shell_visual", *shell, BRASS)
     return model("plug", PLUG_MASS, (0.0, 0.0, d.ring_length), 8.0 * MM, contents)
 
 
-def files(
-    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
-) -> dict[str, str]:
-    """Return the content of each file by name; see `jack_sdf` for the arguments."""
+def files(dimensions: BncDimensions, friction: float = FRICTION) -> dict[str, str]:
+    """Return the content of each file by name; `friction` applies to the metal."""
     return {
-        "bnc_bore.obj": bore_mesh(dimensions, equal_area=equal_area).to_obj(),
+        "bnc_face.obj": face_mesh(dimensions).to_obj(),
+        "bnc_bore.obj": bore_mesh(dimensions).to_obj(),
         "bnc_slots.obj": slot_mesh(dimensions).to_obj(),
         "bnc_ring.obj": ring_mesh(dimensions).to_obj(),
-        "bnc_jack.sdf": jack_sdf(dimensions, friction, margin, equal_area),
+        "bnc_jack.sdf": jack_sdf(dimensions, friction),
         "bnc_plug.sdf": plug_sdf(dimensions, friction),
     }
 
 
-def folder_of(
-    dimensions: BncDimensions, friction: float = FRICTION, margin: float = MARGIN, equal_area: bool = False
-) -> Path:
-    """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments.
-
-    See `jack_sdf` for the arguments; default dimensions are `BncDimensions()`.
-    """
-    if (dimensions, friction, margin, equal_area) == (BncDimensions(), FRICTION, MARGIN, False):
+def folder_of(dimensions: BncDimensions, friction: float = FRICTION) -> Path:
+    """Return the folder with a connector's files: a temporary folder, or this module's for the default arguments."""
+    if (dimensions, friction) == (BncDimensions(), FRICTION):
         return FOLDER
-    return generate_assets(files, dimensions, friction, margin, equal_area)
+    return generate_assets(files, dimensions, friction)
 
 
 MAX_ANGLE = np.deg2rad(6.0)  # largest angle of a prism between the slots; its face is then 7 µm inside the circle

@@ -1,4 +1,4 @@
-"""Contact physics of the hard connector, at the study's contact settings and at finer settings."""
+"""Contact physics of the hard connector at its default time step and at half of it."""
 
 import numpy as np
 import pytest
@@ -6,25 +6,22 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.station import PLANT_PERIOD, Impedance
+from guiderail.diagrams.stations.station import Impedance
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 
-FINE = {"time_step": 0.0025, "contact_margin": 0.0, "equal_area": True}
-HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
 # Height of the plug's mouth on top of the lugs, relative to the locked pose [m].
 LUG_TOP = WORKCELL.dimensions.lug_height + WORKCELL.dimensions.lug_radius - WORKCELL.dimensions.locked_height
 
 
-@pytest.fixture(scope="module", params=[{}, FINE], ids=["study", "fine"])
+@pytest.fixture(scope="module", params=[None, WORKCELL.time_step / 2], ids=["default", "half"])
 def build(request):
-    """Return a function that builds a gantry station at one of the contact settings."""
-    options = {"difficulty": "hard", **request.param}
-    workcell = EnvConfig.resolve("BncConnector", options).make_task().workcell()
-    return lambda: GantryStation(workcell, time_step=options.get("time_step", PLANT_PERIOD))
+    """Return a function that builds a gantry station with one of the time steps."""
+    return lambda: GantryStation(WORKCELL, time_step=request.param)
 
 
 @pytest.fixture(scope="module")

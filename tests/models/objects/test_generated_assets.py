@@ -9,12 +9,12 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import sdf as bnc_sdf
-from guiderail.models.objects.bnc_connector.geometry import FOLDER, BncDimensions
+from guiderail.models.objects.bnc_connector.geometry import BORE_SIDES, FOLDER, LIP_RISE, LIP_WIDTH, BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.models.objects.grid_clamp import sdf as grid_clamp_sdf
 from guiderail.models.objects.grid_clamp.geometry import FOLDER as GRID_CLAMP_FOLDER
 from guiderail.models.objects.grid_clamp.geometry import NUM_SIDES, GridClampDimensions
-from guiderail.models.objects.sdf import TriangleMesh
+from guiderail.models.objects.sdf import TriangleMesh, equal_area_radius
 
 
 def read_vertices(path):
@@ -38,13 +38,15 @@ def test_generated_connector_has_the_given_dimensions():
     dimensions = dataclasses.replace(BncDimensions().with_bore_clearance(0.07 * MM), mouth_chamfer=0.25 * MM)
     folder = bnc_sdf.folder_of(dimensions, 0.35)
     assert bnc_sdf.folder_of(dimensions, 0.35) == folder != FOLDER
-    bore = read_vertices(folder / "bnc_bore.obj")
-    inner = np.hypot(*bore[bore[:, 2] > 1.0 * MM, :2].T) * np.cos(np.pi / 24)
-    np.testing.assert_allclose(inner, 4.825 * MM + 0.07 * MM, atol=1e-8)
-    # The chamfer is as wide as it is deep.
+    bore, corner = read_vertices(folder / "bnc_bore.obj"), equal_area_radius(1.0, BORE_SIDES)
+    radii = np.hypot(*bore[:, :2].T) / corner
+    np.testing.assert_allclose(radii[bore[:, 2] > 1.0 * MM], 4.825 * MM + 0.07 * MM, atol=1e-8)
+    # The chamfer is as wide as it is deep, up to the lip.
     assert np.isclose(bore[:, 2], 0.25 * MM).any()
-    mouth = np.hypot(*bore[bore[:, 2] < 1e-9, :2].T).min() * np.cos(np.pi / 24)
-    assert mouth == pytest.approx(4.825 * MM + 0.07 * MM + 0.25 * MM, abs=1e-8)
+    np.testing.assert_allclose(radii[np.isclose(bore[:, 2], LIP_RISE)] + LIP_RISE, 5.145 * MM, atol=1e-8)
+    np.testing.assert_allclose(radii[bore[:, 2] < 1e-9], 5.145 * MM + LIP_WIDTH, atol=1e-8)
+    face = read_vertices(folder / "bnc_face.obj")
+    assert np.hypot(*face[:, :2].T).min() == pytest.approx(corner * (5.145 * MM + LIP_WIDTH), abs=1e-8)
     for name in ("bnc_jack.sdf", "bnc_plug.sdf"):
         frictions = re.findall(r"<drake:mu_static>([\d.]+)<", (folder / name).read_text())
         assert set(frictions) == {"0.35", "0.05"}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD, exact_periods
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, exact_periods, plant_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
@@ -145,7 +145,7 @@ def converge(
         row |= _measure_contact(config.task, condition)
     coarsest = coarsest_step(rows)
     table = write_table(out / "converge", rows).with_suffix(".csv")
-    trained = 1e3 * (config.environment.get("time_step") or PLANT_PERIOD)
+    trained = 1e3 * _trained_step(config.task, config.environment)
     warning = None
     if coarsest is not None and trained > coarsest * (1.0 + 1e-9):
         warning = (
@@ -169,6 +169,14 @@ def coarsest_step(rows: Sequence[Mapping[str, Any]]) -> float | None:
     return coarsest
 
 
+def _trained_step(task: str, environment: Mapping[str, Any]) -> float:
+    """Return the plant step of an environment [s]."""
+    from guiderail.diagrams.envs.config import EnvConfig
+
+    config = EnvConfig.resolve(task, dict(environment))
+    return float(environment.get("time_step") or plant_period(config.declared.workcell()))
+
+
 def _statistics(rows: pd.DataFrame) -> dict[str, Any]:
     successes = int(rows["success"].sum())
     low, high = wilson(successes, len(rows))
@@ -187,7 +195,7 @@ def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.diagrams.tasks.contact_probe import probe_contact
 
-    made = EnvConfig.resolve(task, dict(condition.environment)).make_task()
+    made = EnvConfig.resolve(task, dict(condition.environment)).declared
     names = ("drag_20", "drag_40", "lever_mm", "capture_mm", "cost")
     if getattr(made, "rim_contact", lambda: None)() is None:
         return dict.fromkeys(names)

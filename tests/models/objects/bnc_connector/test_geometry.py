@@ -17,8 +17,10 @@ from pydrake.math import RigidTransform
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import (
     FOLDER,
+    LIP_RISE,
     BncDimensions,
     bore_mesh,
+    face_mesh,
     ring_mesh,
     slot_columns,
     slot_mesh,
@@ -51,23 +53,27 @@ def test_files_change_with_the_dimensions():
     assert files(wider)["bnc_bore.obj"] == files(DIMENSIONS)["bnc_bore.obj"]
 
 
-def test_polygon_of_the_bore_encloses_its_circle():
-    """The faces of the polygon are at least the bore's radius from the axis and point at it."""
-    mesh = bore_mesh(DIMENSIONS)
-    wall = triangle_centers(mesh)[:, 2] > DIMENSIONS.mouth_chamfer
-    outward = triangle_centers(mesh)[wall] * [1, 1, 0]
-    distance_of_planes = np.abs(np.einsum("ij,ij->i", mesh.normals()[wall], mesh.vertices[mesh.triangles[wall, 0]]))
-    assert distance_of_planes.min() >= DIMENSIONS.bore_radius - 1e-8
-    assert (np.einsum("ij,ij->i", mesh.normals()[wall], outward) < 0).all()
+def test_bore_points_at_its_axis_and_the_face_away_from_the_plug():
+    mesh, face = bore_mesh(DIMENSIONS), face_mesh(DIMENSIONS)
+    outward = triangle_centers(mesh) * [1, 1, 0]
+    steep = triangle_centers(mesh)[:, 2] > LIP_RISE
+    assert (np.einsum("ij,ij->i", mesh.normals()[steep], outward[steep]) < 0).all()
+    np.testing.assert_allclose(face.normals(), [[0, 0, -1]] * len(face.normals()), atol=1e-9)
 
 
-def test_equal_area_polygons_have_the_area_of_their_circles():
-    bore = bore_mesh(DIMENSIONS, equal_area=True)
+def test_face_and_lip_meet_at_the_same_corners():
+    edges = [mesh.vertices[mesh.vertices[:, 2] == 0.0] for mesh in (bore_mesh(DIMENSIONS), face_mesh(DIMENSIONS))]
+    inner = edges[1][np.hypot(*edges[1][:, :2].T) < DIMENSIONS.ring_radius - 0.1 * MM]
+    assert {tuple(corner) for corner in edges[0]} == {tuple(corner) for corner in inner}
+
+
+def test_polygons_have_the_area_of_their_circles():
+    bore = bore_mesh(DIMENSIONS)
     corners = bore.vertices[bore.vertices[:, 2] > DIMENSIONS.mouth_chamfer + 1e-9, :2]
     area = 0.5 * len(corners) * np.hypot(*corners.T).max() ** 2 * np.sin(2 * np.pi / len(corners))
     assert area == pytest.approx(np.pi * DIMENSIONS.bore_radius**2, rel=1e-6)
 
-    radius = float(re.findall(r"<radius>([\d.]+)<", jack_sdf(DIMENSIONS, equal_area=True))[0])
+    radius = float(re.findall(r"<radius>([\d.]+)<", jack_sdf(DIMENSIONS))[0])
     sides = len(barrel_polygon(radius))
     assert sides == barrel_sides(DIMENSIONS)
     area = 0.5 * sides * radius**2 * np.sin(2 * np.pi / sides)
