@@ -114,7 +114,8 @@ def _state_progress(config: EnvConfig, period: float) -> StateProgress | None:
     options = config.parts["primitive"]
     if not isinstance(options, PrimitiveOptions) or options.progress == "clock":
         return None
-    return StateProgress(options.progress_tolerance, round(options.max_lag / period))
+    position, angle = options.progress_tolerance
+    return StateProgress((position, angle), round(options.max_lag / period))
 
 
 def _num_steps(config: EnvConfig, period: float) -> int:
@@ -521,7 +522,8 @@ def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagr
     The returned function raises an `InputError` if a reset option is invalid, or if the task's `reset` does not return
     values by name or returns a value with a reserved name.
     """
-    task, run = config.declared, {}
+    task = config.declared
+    run: dict[str, Any] = {}
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         given = validate_options(task.Reset, options, f"a reset of {task.name}")

@@ -30,7 +30,6 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     MIN_CONTACT_FORCE,
-    DemonstratedOptions,
     ForceOptions,
 )
 from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, terminal_reward
@@ -302,7 +301,7 @@ def sides_of_the_rim(
 WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]
 
 
-class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
+class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
@@ -313,7 +312,8 @@ class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
     This distance is privileged: it is computed from simulation state that the policy does not observe. Depth gained and
     distance gained are differences of potentials.
 
-    The name of the workpiece must be "plug". A subclass has the option `start_offset_max` [m].
+    The name of the workpiece must be "plug". A subclass has the option `start_offset_max` [m] and
+    declares the names of rewards and observations.
     """
 
     start_offset_max: Number

@@ -51,15 +51,6 @@ ForceRange = Annotated[
 ]
 
 
-class DemonstratedOptions(TaskOptions):
-    """Options of `DemonstratedInsertion`."""
-
-    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
-    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
-        "state", description="name of the observation"
-    )
-
-
 class FixtureOffsetOptions(TaskOptions):
     """Options of a task whose fixture is offset from its nominal position."""
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -15,7 +15,6 @@ from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
-    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
     PriorOptions,
@@ -86,8 +85,13 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
 
 
-class BncOptions(DemonstratedOptions, FixtureOffsetOptions, PriorOptions, ForceOptions):
+class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
+        "state", description="name of the observation"
+    )
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"

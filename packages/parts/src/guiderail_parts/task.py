@@ -37,7 +37,6 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
 )
@@ -152,9 +151,10 @@ COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale 
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
-class PartOptions(DemonstratedOptions, FixtureOffsetOptions, ForceOptions):
+class PartOptions(FixtureOffsetOptions, ForceOptions):
     """Options of a task of two meshes."""
 
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
     observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
         "state", description="name of the observation"
     )
