@@ -34,7 +34,7 @@ PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses 
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
 NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 CONTACTS = {  # station and time step [s]
-    "Drake, 10 ms": ("gantry", PLANT_PERIOD),
+    "Drake, 5 ms": ("gantry", PLANT_PERIOD / 2),  # the default of the connector
     "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4),
     "MuJoCo": ("mujoco", PLANT_PERIOD),
 }

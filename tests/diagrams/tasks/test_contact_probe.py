@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.stations.station import PLANT_PERIOD
-from guiderail.diagrams.tasks.contact_probe import ContactProbe, drag, probe_contact
+from guiderail.diagrams.tasks.contact_probe import MAX_DRAG_ERROR, ContactProbe, drag, probe_contact
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import sdf
@@ -30,7 +30,7 @@ def test_contact_of_the_connector_has_converged_at_the_default_step(probes):
         assert probe.friction == sdf.FRICTION
         assert probe.capture == pytest.approx(size.bore_clearance + size.mouth_chamfer, rel=0.5)
     for probe in finer:
-        assert probe.drags == pytest.approx(default.drags, rel=0.1)
+        assert probe.drags == pytest.approx(default.drags, rel=MAX_DRAG_ERROR)
         assert probe.lever == pytest.approx(default.lever, rel=0.02)
         assert probe.capture == pytest.approx(default.capture, abs=0.03 * MM)
 

@@ -27,7 +27,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
-from guiderail.tools.files import check_room, check_writable, write_atomically, write_record
+from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail_hardware.drivers.clock import Clock, garbage_collection_disabled, set_realtime_priority
@@ -53,6 +53,7 @@ from guiderail_hardware.robot.preflight import (
     slow_approach,
     start_simulator,
 )
+from guiderail_hardware.robot.records import check_room, write_record
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 

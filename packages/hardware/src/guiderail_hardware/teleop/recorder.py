@@ -34,7 +34,8 @@ from guiderail.systems.support.drake_multibody import transform_to_vector
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn, Transition
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.files import check_new, check_room, write_record
+from guiderail.tools.files import check_new
+from guiderail_hardware.robot.records import check_room, write_record
 from guiderail_hardware.systems.meshcat_device import MeshcatDevice
 from guiderail_hardware.teleop.teleoperator import (
     GAMEPAD_AXES,
