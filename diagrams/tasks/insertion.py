@@ -25,12 +25,13 @@ from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.contact_probe import RimContact
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     MIN_CONTACT_FORCE,
     ForceOptions,
+    HiddenOffsets,
+    in_ring,
 )
 from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, terminal_reward
 from guiderail.diagrams.wiring import add_system

@@ -10,14 +10,15 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Integer, Number
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
     FixtureOffsetOptions,
     ForceOptions,
+    HiddenOffsets,
     PriorOptions,
+    in_ring,
 )
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions

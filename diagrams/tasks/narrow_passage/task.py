@@ -20,7 +20,7 @@ from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
-from guiderail.diagrams.tasks.offsets import episode_stream
+from guiderail.diagrams.tasks.options import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import (
     Condition,

@@ -117,13 +117,6 @@ def test_time_step_is_refused_when_it_does_not_divide_the_period(time_step, mess
         make_env("GridClamp", guidance="sct", time_step=time_step)
 
 
-@pytest.mark.parametrize("invalid", [0.0, -0.01, np.nan, np.inf])
-def test_whole_multiple_is_refused_when_not_positive(invalid):
-    for period, unit in ((invalid, 0.01), (0.02, invalid)):
-        with pytest.raises(InputError, match="whole multiple"):
-            whole_multiple(period, unit)
-
-
 class Lane(Task):
     """Straight motion in a plane."""
 
