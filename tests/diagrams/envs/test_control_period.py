@@ -58,8 +58,8 @@ def test_step_and_reference_have_the_given_control_period():
         ("NarrowPassage", {"control_period": 0.011}, "whole multiple of 0.002 s"),
         ("BncConnector", {"control_period": 0.004}, "at least 0.005"),
         ("BncConnector", {"control_period": 0.6}, "at most 0.5"),
-        ("BncConnector", {"control_period": 0.015, "station": "gantry"}, "whole multiple of 0.01 s"),
-        ("BncConnector", {"control_period": 0.015, "station": "arm"}, "whole multiple of 0.01 s"),
+        ("GridClamp", {"control_period": 0.015, "station": "gantry"}, "whole multiple of 0.01 s"),
+        ("GridClamp", {"control_period": 0.015, "station": "arm"}, "whole multiple of 0.01 s"),
     ],
 )
 def test_control_period_is_refused_when_out_of_range(task, options, message):
