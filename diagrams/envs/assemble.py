@@ -1,4 +1,4 @@
-"""Builders of the task diagram and the skill diagram from a task, its station and its guidance."""
+"""Builders of the task diagram and the skill diagram from a task, its station and its guidance, with their checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Gymnasium environment of every task."""
+"""The Gymnasium environment of every task, saved states of its episodes, and a reset for Drake's own environment."""
 
 import math
 import re

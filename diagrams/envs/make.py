@@ -1,4 +1,4 @@
-"""Builders of environments and of learned skills, from a configuration or from a task's name and options."""
+"""Builders of environments and of learned skills, and the pool of their diagrams."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Station whose measured pose has no jumps of its angles."""
+"""Stations around an inner station: with continuous angles, or with ports of rigid transforms and spatial forces."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""Options that several tasks have; nothing here imports Drake."""
+"""Options that several tasks have, hidden offsets and references fitted to files; nothing here imports Drake."""
 
 from __future__ import annotations
 
