@@ -343,7 +343,7 @@ class DemonstratedInsertion(InsertionTask):
         return Prior(
             reference=self.reference,
             constraints=constraints,
-            keep_out=KeepOut(nothing, nothing, constraints, margin=0.0),
+            keep_out=KeepOut(nothing, nothing, constraints, margin=0.0) if constraints.num_steps is None else None,
             isotropic_groups=((0, 1, 2), (3, 4, 5)),
             start_within=self.start_offset_max,
         )
