@@ -439,7 +439,9 @@ def test_pushes_of_a_hold_test_are_within_the_bounds(x, clearance, pushes, tmp_p
     for test in tests:
         assert test.displacement[2] == 0.0
         assert np.linalg.norm(test.displacement) > test.max_motion  # a plug next to the socket moves farther
-        assert task.constraints().violation(pose + [*test.displacement, 0.0, 0.0, 0.0], task.reference().num_steps) <= 1e-9
+        assert (
+            task.constraints().violation(pose + [*test.displacement, 0.0, 0.0, 0.0], task.reference().num_steps) <= 1e-9
+        )
 
 
 def test_turned_plug_is_pulled_by_the_hold_test(tmp_path):
