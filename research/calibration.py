@@ -100,7 +100,7 @@ def main() -> None:
     parameters, _ = select_parameters(config.task, base)
     size, processes = len(parameters), given.processes
     recorded = Simulator(config.task, {**base, **probe_options(probe)}, parameters)
-    num_steps = EnvConfig.resolve(config.task, dict(recorded.environment)).make_task().num_steps
+    num_steps = EnvConfig.resolve(config.task, dict(recorded.environment)).num_steps
     prior = simulate_all(recorded, given.out / "prior", draw_prior(given.draws, size), processes=processes)
     rows, covered, p_values, errors = [], [], [], []
     tail = 0.5 * (1.0 - LEVEL)
@@ -162,7 +162,8 @@ def predictions(
         )  # fmt: skip
         predicted, rate = predict(simulated), float(truth.success.mean())
         print(
-            f"{engine} {index}: predicted {predicted.success:.2f} [{predicted.low:.2f}, {predicted.high:.2f}], measured {rate:.2f}"
+            f"{engine} {index}: predicted {predicted.success:.2f} [{predicted.low:.2f}, {predicted.high:.2f}], "
+            f"measured {rate:.2f}"
         )
         inside.append(predicted.low <= rate <= predicted.high)
         close.append(abs(predicted.success - rate) <= 0.07)

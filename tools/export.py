@@ -51,6 +51,7 @@ class TrainedSkill:
         config: Configuration of the run.
         policy: Deterministic policy.
         task: Task.
+        num_steps: Control steps of an episode.
         prior: Prior knowledge of the task.
         description: Meaning of observation and action, and settings of the guidance, as written to `skill.json`.
     """
@@ -58,6 +59,7 @@ class TrainedSkill:
     config: RunConfig
     policy: Policy
     task: Task
+    num_steps: int
     prior: PriorKnowledge
     description: dict[str, Any]
 
@@ -102,7 +104,7 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     description["action"] = [
         {"name": name, "low": low[index], "high": high[index]} for index, name in enumerate(names)
     ]  # fmt: skip
-    return TrainedSkill(config, policy, task, prior, description)
+    return TrainedSkill(config, policy, task, resolved.num_steps, prior, description)
 
 
 @dataclass(frozen=True)

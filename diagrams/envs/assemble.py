@@ -1,4 +1,4 @@
-"""Builders of the task diagram and the skill diagram from a task, its station and its guidance."""
+"""Builders of the task diagram and the skill diagram from a task, its station and its guidance, with their checks."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from guiderail.diagrams.envs.scene import (
     contact_results_of,
     scene_of,
 )
-from guiderail.diagrams.envs.task_checks import check_functions, check_terms, refuse_half_turns
 from guiderail.diagrams.envs.task_diagram import Symmetry, TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
 from guiderail.diagrams.guidance.prior import PlacedTemplate, PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
+from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.task import Condition, Threshold, World, signals_of
 from guiderail.diagrams.wiring import add_system
@@ -114,7 +114,8 @@ def _state_progress(config: EnvConfig, period: float) -> StateProgress | None:
     options = config.parts["primitive"]
     if not isinstance(options, PrimitiveOptions) or options.progress == "clock":
         return None
-    return StateProgress(options.progress_tolerance, round(options.max_lag / period))
+    position, angle = options.progress_tolerance
+    return StateProgress((position, angle), round(options.max_lag / period))
 
 
 def _num_steps(config: EnvConfig, period: float) -> int:
@@ -521,7 +522,8 @@ def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagr
     The returned function raises an `InputError` if a reset option is invalid, or if the task's `reset` does not return
     values by name or returns a value with a reserved name.
     """
-    task, run = config.declared, {}
+    task = config.declared
+    run: dict[str, Any] = {}
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
         given = validate_options(task.Reset, options, f"a reset of {task.name}")
@@ -548,3 +550,58 @@ def _push(station: Station) -> Any:
         station.set_pose(context, pose + displacement)
 
     return push
+
+
+# Smallest distance of demonstrated angles from ±180° [rad], because actions and contact turn the tool further.
+HALF_TURN_MARGIN = 0.1
+
+
+# Attributes that a workcell must have, by its kind; workcells of other kinds are not checked.
+_WORKCELL_ATTRIBUTES = {
+    "insertion": ("X_WT", "add_fixture", "add_workpiece", "filter_contacts"),
+    "plane": ("robot_radius", "walls", "goal", "goal_radius", "zone_x", "obstacle", "obstacles", "obstacles_move"),
+    "pouring": ("X_WT", "mug", "ball", "num_balls", "plant_period", "control_period"),
+}
+
+
+def check_workcell(workcell: Any, kind: StationKind, task: str) -> None:
+    """Check that the workcell of a task has the attributes that stations of a `kind` need.
+
+    Raises:
+        InputError: If there is no workcell, or it lacks an attribute.
+    """
+    if workcell is None:
+        raise InputError(f"workcell() of {task} returns nothing: let it return what station={kind.name!r} works on")
+    missing = [name for name in _WORKCELL_ATTRIBUTES.get(kind.workcell_kind, ()) if not hasattr(workcell, name)]
+    if missing:
+        raise InputError(
+            f"workcell() of {task} returns {brief(workcell)}, which has no {missing[0]}: let it return what "
+            f"station={kind.name!r} works on"
+        )
+
+
+def check_terms(terms: Any, task: str) -> None:
+    """Raise an `InputError` unless the observation of a task is a list of `ObservationTerm`."""
+    if not isinstance(terms, list | tuple) or not all(isinstance(term, ObservationTerm) for term in terms):
+        raise InputError(f"observe() of {task} must return Observed or a list of ObservationTerm, not {brief(terms)}")
+
+
+def check_functions(functions: Any, method: str, task: str) -> None:
+    """Raise an `InputError` unless a `method` of a task returns functions by name."""
+    if not isinstance(functions, Mapping):
+        raise InputError(f"{method}() of {task} must return functions of signals by name, not {brief(functions)}")
+
+
+def turns_near_half(means: np.ndarray) -> bool:
+    """Return True if angles of a motion (N, 6) come near ±180°."""
+    return bool(np.abs(means[:, 3:]).max(initial=0.0) > np.pi - HALF_TURN_MARGIN)
+
+
+def refuse_half_turns(means: np.ndarray) -> None:
+    """Raise an `InputError` if angles of a motion (N, 6) come near ±180°, where the station's angles jump."""
+    if turns_near_half(means):
+        furthest = np.abs(means[:, 3:]).max()
+        raise InputError(
+            f"the demonstrations turn to {np.rad2deg(furthest):.0f}°, and this station's angles jump by a full turn at "
+            f"180°: rotate the target's frame, so that they stay {np.rad2deg(HALF_TURN_MARGIN):.0f}° away"
+        )

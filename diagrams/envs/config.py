@@ -167,7 +167,7 @@ def stations_of(task: type[Task]) -> list[str]:
 
 def prior_of(task: type[Task]) -> Prior:
     """Return the prior knowledge that a task declares with its default options."""
-    return task().prior()
+    return task.model_validate({}).prior()
 
 
 def option_models(

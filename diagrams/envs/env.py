@@ -1,4 +1,4 @@
-"""The Gymnasium environment of every task."""
+"""The Gymnasium environment of every task, saved states of its episodes, and a reset for Drake's own environment."""
 
 import math
 import re
@@ -6,7 +6,7 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gymnasium
@@ -16,7 +16,6 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.analysis import InitializeParams, Simulator
 from pydrake.systems.framework import Context, Diagram, PortDataType
 
-from guiderail.diagrams.envs.episode_state import EpisodeState
 from guiderail.diagrams.envs.scene import View
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.envs.trace import EpisodeTrace
@@ -71,6 +70,22 @@ _SIMULATION_FAILURE = re.compile(
 # A simulation has failed if a coordinate of the robot's position [m] or a joint speed [m/s], [rad/s] exceeds its limit.
 # A ball that falls for the longest episode reaches a third of the speed limit.
 MAX_POSITION, MAX_JOINT_SPEED = 10.0, 1e3
+
+
+@dataclass(frozen=True)
+class EpisodeState:
+    """Everything on which the rest of an episode and the next resets depend; `DiagramEnv.restore` does not change it.
+
+    It holds a context of the environment's diagram, so it exists in this process only and fits environments that run
+    this diagram.
+    """
+
+    diagram: Diagram  # diagram that the context belongs to
+    context: Context  # time, state and parameters
+    action: np.ndarray  # last action, (A,)
+    rng: Mapping[str, Any]  # state of the random generator that resets draw from
+    trace: EpisodeTrace  # copy of the trace
+    fields: Mapping[str, Any]  # attributes of the environment by name
 
 
 class DiagramEnv(DrakeGymEnv):
@@ -518,3 +533,25 @@ def _check_view(task: TaskDiagram, render_mode: str | None) -> None:
         raise InputError("this environment has no scene for Meshcat to show: leave render_mode out")
     if render_mode == "rgb_array" and not task.diagram.HasOutputPort("rgb_image"):
         raise InputError("the diagram of this environment has no camera: build it with render_mode='rgb_array'")
+
+
+def drake_gym_reset(
+    set_start: Callable[[Simulator, Context, int | None], object] | None = None,
+) -> Callable[[Simulator, Context, int | None], None]:
+    """Return a `reset_handler` of `pydrake.gym.DrakeGymEnv` for diagrams with systems of this package.
+
+    Drake initializes the simulator and then replaces the context by its defaults or by random values. The commands of
+    these systems begin at the measured pose of an initialization, and without one they are refused. The handler
+    therefore initializes again after the start is set.
+
+    Args:
+        set_start: Function of simulator, root context and seed that sets the start, such as joint positions; None: the
+            defaults of the diagram.
+    """
+
+    def reset(simulator: Simulator, context: Context, seed: int | None) -> None:
+        if set_start is not None:
+            set_start(simulator, context, seed)
+        simulator.Initialize()
+
+    return reset

@@ -14,12 +14,12 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
-    Field,
     ValidationError,
     ValidationInfo,
     create_model,
     field_validator,
 )
+from pydantic import Field as Field
 from pydantic.fields import FieldInfo
 
 from guiderail.models.common.errors import InputError, brief

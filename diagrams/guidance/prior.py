@@ -12,7 +12,6 @@ from pydrake.math import RigidTransform
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
-from guiderail.models.laws.primitive import HISTORY_SOURCES
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON, get_shared_primitive
@@ -96,14 +95,8 @@ class PrimitiveConfig:
     wrench_size: int = 6
 
     def __post_init__(self) -> None:
-        if self.history_source not in HISTORY_SOURCES:
-            raise InputError(f"history_source must be {' or '.join(HISTORY_SOURCES)}, not '{self.history_source}'")
-        if not (np.isfinite(self.action_scale) and self.action_scale > 0):
-            raise InputError(f"action_scale must be positive, not {self.action_scale}")
         if self.progress is not None and self.constraints.num_steps is not None:
             raise InputError("constraints that differ from step to step need progress=clock")
-        if self.history < 1:
-            raise InputError(f"history must be at least 1 past output, not {self.history}")
         if self.action_dims is not None and not self.action_dims:
             raise InputError("a policy must move at least one output: name it in action_dims")
         if len(set(self.action_dims or ())) < len(self.action_dims or ()):

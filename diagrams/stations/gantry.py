@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import get_args
-
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import (
@@ -38,7 +36,7 @@ from guiderail.diagrams.stations.station import (
 )
 from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.systems.wrench_signals import PoseWrench
 
@@ -104,10 +102,6 @@ class GantryStation(Station):
         """
         super().__init__()
         builder = DiagramBuilder()
-        if impedance_control not in get_args(ImpedanceControl):
-            raise InputError(
-                f"impedance_control must be {' or '.join(get_args(ImpedanceControl))}, not {brief(impedance_control)}"
-            )
         is_joint = impedance_control == "joint"
         if time_step is None:
             time_step = plant_period(workcell, PLANT_PERIOD if is_joint else CARTESIAN_PLANT_PERIOD)

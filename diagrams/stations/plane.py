@@ -23,8 +23,7 @@ from guiderail.diagrams.stations.station import (
     whole_multiple,
 )
 from guiderail.diagrams.wiring import add_system
-from guiderail.models.common.arrays import as_numbers, round_period
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.arrays import round_period
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.wrench_signals import MeanForce
@@ -156,16 +155,7 @@ class PlaneStation(Station):
         set_at_rest(self.plant, self._robot, context, check_pose(pose, 2))
 
     def set_obstacles(self, context: Context, obstacles: np.ndarray) -> None:
-        """Put the n moving obstacles of the workcell at `obstacles`, (n, 2) [m]; `context` is the root context.
-
-        Raises:
-            InputError: If `obstacles` is not n finite points.
-        """
-        obstacles = as_numbers(obstacles, "obstacles")
-        if obstacles.shape != (len(self._obstacle_frames), 2) or not np.isfinite(obstacles).all():
-            raise InputError(
-                f"obstacles must be {len(self._obstacle_frames)} finite points (x, y), not {brief(obstacles)}"
-            )
+        """Put the n moving obstacles of the workcell at `obstacles`, (n, 2) [m]; `context` is the root context."""
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         for frame, (x, y) in zip(self._obstacle_frames, obstacles, strict=True):
             frame.SetPoseInParentFrame(plant_context, RigidTransform([x, y, OBSTACLE_Z]))

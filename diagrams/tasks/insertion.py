@@ -25,13 +25,13 @@ from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.contact_probe import RimContact
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     MIN_CONTACT_FORCE,
-    DemonstratedOptions,
     ForceOptions,
+    HiddenOffsets,
+    in_ring,
 )
 from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, terminal_reward
 from guiderail.diagrams.wiring import add_system
@@ -302,7 +302,7 @@ def sides_of_the_rim(
 WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]
 
 
-class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
+class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
@@ -313,7 +313,8 @@ class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
     This distance is privileged: it is computed from simulation state that the policy does not observe. Depth gained and
     distance gained are differences of potentials.
 
-    The name of the workpiece must be "plug". A subclass has the option `start_offset_max` [m].
+    The name of the workpiece must be "plug". A subclass has the option `start_offset_max` [m] and
+    declares the names of rewards and observations.
     """
 
     start_offset_max: Number
@@ -342,7 +343,7 @@ class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
         return Prior(
             reference=self.reference,
             constraints=constraints,
-            keep_out=KeepOut(nothing, nothing, constraints, margin=0.0),
+            keep_out=KeepOut(nothing, nothing, constraints, margin=0.0) if constraints.num_steps is None else None,
             isotropic_groups=((0, 1, 2), (3, 4, 5)),
             start_within=self.start_offset_max,
         )

@@ -1,7 +1,7 @@
 from .diagrams.envs.assemble import build_skill_diagram as build_skill_diagram
 from .diagrams.envs.assemble import build_task_diagram as build_task_diagram
-from .diagrams.envs.drake_gym import drake_gym_reset as drake_gym_reset
 from .diagrams.envs.env import DiagramEnv as DiagramEnv
+from .diagrams.envs.env import drake_gym_reset as drake_gym_reset
 from .diagrams.envs.make import make_env as make_env
 from .diagrams.envs.make import make_skill as make_skill
 from .diagrams.envs.observation import Observation as Observation
@@ -14,8 +14,8 @@ from .diagrams.envs.task_diagram import TaskDiagram as TaskDiagram
 from .diagrams.guidance.guidance import Guidance as Guidance
 from .diagrams.guidance.guidance import LawGuidance as LawGuidance
 from .diagrams.guidance.prior import PlacedTemplate as PlacedTemplate
-from .diagrams.guidance.prior import Prior as Prior
 from .diagrams.guidance.prior import PrimitiveConfig as PrimitiveConfig
+from .diagrams.guidance.prior import Prior as Prior
 from .diagrams.guidance.prior import PriorKnowledge as PriorKnowledge
 from .diagrams.guidance.prior import ScriptedApproach as ScriptedApproach
 from .diagrams.guidance.registry import register_guidance as register_guidance

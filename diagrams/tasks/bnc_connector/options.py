@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, field_validator
 
 from guiderail.diagrams.envs.options import Integer, Number
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
-    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
+    HiddenOffsets,
     PriorOptions,
+    in_ring,
 )
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
@@ -86,8 +86,13 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
 
 
-class BncOptions(DemonstratedOptions, FixtureOffsetOptions, PriorOptions, ForceOptions):
+class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
+        "state", description="name of the observation"
+    )
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"

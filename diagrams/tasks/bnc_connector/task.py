@@ -30,12 +30,12 @@ from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import HARD, NOMINAL, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
-from guiderail.diagrams.tasks.offsets import reference_of_file
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
     REPEATABILITY_STD,
+    reference_of_file,
 )
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy

@@ -20,7 +20,7 @@ from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, GridClampOptions
 from guiderail.diagrams.tasks.insertion import PRIVILEGED, InsertionTask
-from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
+from guiderail.diagrams.tasks.options import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy, terminal_reward
 from guiderail.models.common.termination import Termination

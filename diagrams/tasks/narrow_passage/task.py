@@ -20,7 +20,7 @@ from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
-from guiderail.diagrams.tasks.offsets import episode_stream
+from guiderail.diagrams.tasks.options import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import (
     Condition,
@@ -206,8 +206,10 @@ class NarrowPassage(NarrowPassageOptions, Task):
             progress=lambda pose, contact_force, fallback: pose[1],
             min_progress=BLOCKED_PROGRESS,
         )
-        collision = {Termination.COLLISION: is_touching} if self.obstacles_end else {}
-        return {**collision, Termination.SUCCESS: geometry.at_goal, Termination.BLOCKED: blocked}
+        conditions: dict[str, Callable[..., bool] | Condition] = {}
+        if self.obstacles_end:
+            conditions[Termination.COLLISION] = is_touching
+        return conditions | {Termination.SUCCESS: geometry.at_goal, Termination.BLOCKED: blocked}
 
     def reset(self, world: World, rng: np.random.Generator, given: Any) -> dict[str, Any]:
         """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles on sampled sides.

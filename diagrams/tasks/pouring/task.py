@@ -18,7 +18,7 @@ from guiderail.diagrams.guidance.guidance import Guidance
 from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, make_mug
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.offsets import episode_stream, in_ring
+from guiderail.diagrams.tasks.options import episode_stream, in_ring
 from guiderail.diagrams.tasks.pouring.options import (
     HARD,
     MAX_MUG_ERROR,

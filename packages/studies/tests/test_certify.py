@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -161,7 +162,8 @@ def test_history_begins_within_the_declared_offset(options):
 
 
 def test_declared_start_refuses_the_wrong_number_of_outputs(monkeypatch, tmp_path):
-    monkeypatch.setattr(NarrowPassage, "start_within", lambda self: [0.1, 0.1, 0.1])
+    prior = NarrowPassage.prior
+    monkeypatch.setattr(NarrowPassage, "prior", lambda self: replace(prior(self), start_within=[0.1, 0.1, 0.1]))
     with pytest.raises(InputError, match="start_within of NarrowPassage must return a number or 2 numbers"):
         certify_skill("NarrowPassage", {"guidance": "kgrl"}, out=tmp_path)
 

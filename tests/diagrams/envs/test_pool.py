@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import threadpoolctl
 
-from guiderail.diagrams.envs.pool import DiagramPool
+from guiderail.diagrams.envs.make import DiagramPool
 
 
 def built(path="::diagram"):

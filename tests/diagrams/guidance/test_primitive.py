@@ -232,10 +232,6 @@ def test_safe_residual_is_refused_without_walls(skill):
 @pytest.mark.parametrize(
     "change",
     [
-        {"history_source": "unknown"},
-        {"action_scale": 0.0},
-        {"action_scale": np.nan},
-        {"history": 0},
         {"action_dims": ()},
         {"action_dims": (2,)},
         {"action_dims": (0, 0)},

@@ -106,8 +106,3 @@ def test_environment_selects_the_impedance_control():
         make_env("BncConnector", impedance_control="cartesian", time_step=0.02)
     with pytest.raises(InputError, match="it is an option of station='gantry'"):
         make_env("BncConnector", station="arm", impedance_control="cartesian")
-
-
-def test_station_raises_when_impedance_control_is_unknown():
-    with pytest.raises(InputError, match="impedance_control must be joint or cartesian, not 'force'"):
-        GantryStation(WORKCELL, impedance_control="force")

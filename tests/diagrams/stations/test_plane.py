@@ -7,7 +7,6 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.diagrams.stations.plane import PlaneConfig, PlaneStation
-from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 WORLD, CONFIG = PassageGeometry(), PlaneConfig()
@@ -140,10 +139,3 @@ def test_sampled_pose_equals_the_pose_at_the_control_instant():
         np.testing.assert_array_equal(
             robot.sample.get_output_port().Eval(robot.sample.GetMyContextFromRoot(robot.context)), expected
         )
-
-
-@pytest.mark.parametrize("obstacles", [np.zeros((2, 2)), [[0.0, np.nan]], "text"])
-def test_invalid_obstacles_are_refused(obstacles):
-    station = PlaneStation(PassageGeometry(obstacles_move=True), CONFIG)
-    with pytest.raises(InputError, match="obstacles"):
-        station.set_obstacles(station.CreateDefaultContext(), obstacles)

@@ -1,15 +1,11 @@
 """Abstract ports of a station: equal motion, transforms and forces."""
 
 import numpy as np
-import pytest
 from pydrake.systems.analysis import Simulator
 
+from guiderail.diagrams.stations.continuous_station import TransformStation
 from guiderail.diagrams.stations.gantry import GantryStation
-from guiderail.diagrams.stations.plane import PlaneStation
-from guiderail.diagrams.stations.transform_station import TransformStation
 from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
-from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
 START, GOAL = np.array([0.0, 0.0, 0.05, 0.0, 0.0, 0.0]), np.array([0.01, 0.0, 0.04, 0.2, 0.1, -0.1])
@@ -36,8 +32,3 @@ def test_station_with_abstract_ports_moves_equally():
     force = wrapped.get_spatial_force_output_port().Eval(context)
     np.testing.assert_allclose(np.r_[force.translational(), force.rotational()], wrench, atol=1e-9)
     assert not wrapped.HasInputPort("desired_pose")
-
-
-def test_station_in_the_plane_is_refused():
-    with pytest.raises(InputError, match="6 coordinates, and poses of this station have 2"):
-        TransformStation(PlaneStation(PassageGeometry()))

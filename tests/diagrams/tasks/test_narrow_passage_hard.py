@@ -39,7 +39,7 @@ def test_commands_satisfy_the_constraints_under_any_action(env, name):
 
 
 def test_obstacles_are_on_opposite_sides_and_observed(env):
-    nominal, sides = NarrowPassageOptions(**HARD).workcell().obstacles, []
+    nominal, sides = NarrowPassageOptions(**HARD).geometry.obstacles, []
     starts = []
     for seed in range(8):
         observation, info = env.reset(seed=seed)
@@ -70,7 +70,7 @@ def test_plant_has_the_obstacles_at_their_sampled_positions(env):
 
 
 def test_standard_has_the_default_geometry_and_start():
-    assert NarrowPassageOptions().workcell() == PassageGeometry()
+    assert NarrowPassageOptions().geometry == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
     _, info = standard.reset(seed=3)

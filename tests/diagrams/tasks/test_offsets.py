@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from guiderail.diagrams.tasks.offsets import episode_stream
+from guiderail.diagrams.tasks.options import episode_stream
 
 
 def test_held_out_samples_differ_from_training_and_repeat():

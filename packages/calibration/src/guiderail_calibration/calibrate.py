@@ -143,9 +143,9 @@ def calibrate(
     selected, left_out = select_parameters(config.task, base, parameters)
     policy = Simulator(config.task, base, selected, subject.make_policy, str(subject.digest))
     recorded = policy if probe is None else Simulator(config.task, {**base, **probe_options(probe)}, selected)
-    task = EnvConfig.resolve(config.task, dict(recorded.environment)).make_task()
-    num_steps = int(task.num_steps)
-    episodes = load_recordings(recordings, None if probe is None else task.reference().means)
+    resolved = EnvConfig.resolve(config.task, dict(recorded.environment))
+    num_steps, reference = resolved.num_steps, None if probe is None else resolved.reference()
+    episodes = load_recordings(recordings, None if reference is None else reference.means)
     prior = simulate_all(
         recorded, out / f"prior-{recorded.key()}", draw_prior(draws, len(selected)), processes=processes, label="prior"
     )

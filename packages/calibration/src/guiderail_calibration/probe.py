@@ -54,7 +54,7 @@ def write_probe(task: str, environment: Mapping[str, Any], path: Path) -> Path:
     Raises:
         InputError: If the task has no rim, or the file cannot be written.
     """
-    made = EnvConfig.resolve(task, dict(environment)).make_task()
+    made = EnvConfig.resolve(task, dict(environment)).declared
     contact = made.rim_contact() if hasattr(made, "rim_contact") else None
     if contact is None:
         raise InputError(f"{task} has no rim to probe: calibrate from episodes of the policy, without --probe")

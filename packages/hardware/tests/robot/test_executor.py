@@ -241,7 +241,7 @@ def test_outcome_counts_the_step_in_which_the_operator_stops(make_executor, tmp_
 def test_execution_ends_above_the_force_limit_of_the_task(make_executor):
     """The limit of 0.01 N is below the force of the impedance during the approach."""
     executor, _ = make_executor()
-    executor._task.collision = type(executor._task.collision)("impedance_force", 0.01)
+    executor._task = executor._task.model_copy(update={"force_limit": 0.01})
     outcome = executor.run(print)
     assert (outcome.fault, outcome.exit_code) == (Fault.FORCE_LIMIT, 1)
     assert "more than the task's" in outcome.description

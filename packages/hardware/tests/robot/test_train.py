@@ -48,14 +48,13 @@ def make_robot_env(patch, start, **options):
     Its additional attributes are `clock` and `keys`, `questions` (the reasons of all confirmations that it requested)
     and `begin` (the start pose of the episodes).
     """
-    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options)
-    patch.setattr(declaration, "num_steps", 10)
+    lcm, config = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options)
     with patch.context() as bus:
         bus.setattr("guiderail_hardware.drivers.lcm.open_bus", lambda url: lcm)
-        station = make_station(declaration)
-    task = build_task_diagram(declaration, station, make_guidance(declaration, station))
-    clock, keys, questions = SteppedRobotClock(declaration.workcell(), lcm, start), OperatorKeys(), []
-    begin = declaration.start_pose(np.random.default_rng(0))
+        station = make_station(config)
+    task = replace(build_task_diagram(config, station, make_guidance(config, station)), num_steps=10)
+    clock, keys, questions = SteppedRobotClock(config.declared.workcell(), lcm, start), OperatorKeys(), []
+    begin = config.declared.start_pose(np.random.default_rng(0))
     env = RobotEnv(
         task,
         station,
@@ -307,7 +306,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
 @pytest.fixture
 def session(monkeypatch):
     """Return clock of an arm at rest, list of requested confirmations, and function that starts a `robot_session`."""
-    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS)
+    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).declared
     clock, questions = SteppedRobotClock(declaration.workcell(), lcm, START), []
 
     @contextmanager

@@ -37,7 +37,6 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
 )
@@ -152,9 +151,10 @@ COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale 
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
-class PartOptions(DemonstratedOptions, FixtureOffsetOptions, ForceOptions):
+class PartOptions(FixtureOffsetOptions, ForceOptions):
     """Options of a task of two meshes."""
 
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
     observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
         "state", description="name of the observation"
     )
@@ -337,19 +337,16 @@ class PartInsertion(PartOptions, DemonstratedInsertion):
         return self._bounds().constraints(num_steps or self.reference().num_steps)
 
     def prior(self) -> Prior:
-        """Return the demonstrations and the bounds, without walls if the bounds change between phases."""
-        prior = replace(super().prior(), constraints=self.constraints)
-        return prior if self.file.bounds.phases is None else replace(prior, keep_out=None)
+        """Return the demonstrations and the bounds, which may change between phases."""
+        return replace(super().prior(), constraints=self.constraints)
 
     def _bounds(self) -> Bounds:
         bounds, limit = self.file.bounds, self.bound
         if limit is None:
             return bounds
         if bounds.phases is not None:
-            difficulty = next((name for name, preset in self.presets.items() if preset.get("bound") == limit), "")
-            remedy = (
-                f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if difficulty else "leave it out"
-            )
+            is_set = any(preset.get("bound") == limit for preset in self.presets.values())
+            remedy = "give bound=None (--env bound=null) with this difficulty" if is_set else "leave it out"
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
         return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]), phases=None)
 

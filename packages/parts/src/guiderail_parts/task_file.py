@@ -14,8 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from guiderail.diagrams.envs.options import Number, Numbers, Options, validate_options
 from guiderail.diagrams.stations.options import CONTROL_PERIOD, ContactOptions
-from guiderail.diagrams.tasks.offsets import reference_of_file
-from guiderail.diagrams.tasks.options import COLLISION_FORCE, REPEATABILITY_STD, PriorOptions
+from guiderail.diagrams.tasks.options import COLLISION_FORCE, REPEATABILITY_STD, PriorOptions, reference_of_file
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.registry import did_you_mean

@@ -17,8 +17,7 @@ from guiderail.diagrams.envs.meshcat_page import MeshcatPage
 from guiderail.diagrams.envs.recording import DrivenStation, drive_along, linear_motion
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.offsets import control_steps
-from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE, control_steps
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.plugins import MissingSiblingError, load_plugin, require_sibling
 from guiderail.models.common.transforms import DEGREE, POSE_NAMES

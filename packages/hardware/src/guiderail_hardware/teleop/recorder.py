@@ -24,7 +24,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint, add_meshcat
 from guiderail.diagrams.tasks.insertion import InsertionTask
-from guiderail.diagrams.tasks.task import Condition, signals_of
+from guiderail.diagrams.tasks.task import Condition, Threshold, signals_of
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
@@ -210,7 +210,7 @@ class DemonstrationRecorder:
         self._is_slow = False
         self._written: tuple[int, int] | None = None  # version of the file that this session has written
         view = set_camera(meshcat, self.task)
-        self._gauge = None if view is None else ForceGauge(meshcat, view, self.task.collision.above)
+        self._gauge = None if view is None else ForceGauge(meshcat, view, self.force_limit)
         self.panel = MeshcatPanel(meshcat, SLIDERS, BUTTONS)
 
     def reset(self) -> None:
@@ -311,6 +311,11 @@ class DemonstrationRecorder:
         duration = (self.steps - 1) * self._period
         lasts = f"{duration:.1f} s, {self.demonstrations[-1][0][-1]:.1f} s after rests were shortened"
         return f"kept demonstration {len(self.demonstrations)}: {lasts}{end}; {failure or f'{self.out}{note}'}"
+
+    @property
+    def force_limit(self) -> float:
+        """Force above which an episode of the task ends as a collision [N]."""
+        return (self.task.collision or Threshold()).above
 
     def is_success(self) -> bool | None:
         """Return True if the workpiece is at its target; None if the task does not define success by its pose."""
@@ -433,7 +438,7 @@ def record_demonstrations(
         InputError: As `DemonstrationRecorder`, or if no demonstration was kept.
     """
     recorder = DemonstrationRecorder(task, environment, out)
-    meshcat, limit = recorder.panel.meshcat, recorder.task.collision.above
+    meshcat, limit = recorder.panel.meshcat, recorder.force_limit
     log(f"Demonstrate at {page_address(meshcat)}.")
     keys = ", ".join(
         f"{slider.keys[0][-1]} and {slider.keys[1][-1]} {name.split()[0]}" for name, slider in SLIDERS.items()
