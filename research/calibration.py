@@ -161,9 +161,8 @@ def predictions(
             processes=processes, label=f"predicted {index}",
         )  # fmt: skip
         predicted, rate = predict(simulated), float(truth.success.mean())
-        print(
-            f"{engine} {index}: predicted {predicted.success:.2f} [{predicted.low:.2f}, {predicted.high:.2f}], measured {rate:.2f}"
-        )
+        interval = f"{predicted.low:.2f} to {predicted.high:.2f}"
+        print(f"{engine} {index}: predicted {predicted.success:.2f}, {interval}, measured {rate:.2f}", flush=True)
         inside.append(predicted.low <= rate <= predicted.high)
         close.append(abs(predicted.success - rate) <= 0.07)
     return [
