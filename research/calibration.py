@@ -110,8 +110,11 @@ def main() -> None:
         for index in robots:
             observed = summarize(prior[index].episodes, num_steps)
             draws = posterior.sample(observed, 500)
-            low, high = (np.quantile(draws, p, axis=0) for p in (tail, 1.0 - tail))
-            covered.append((low <= prior[index].quantiles) & (prior[index].quantiles <= high))
+            low, high, truth = (
+                np.array([parameter.value(q) for parameter, q in zip(parameters, quantiles, strict=True)])
+                for quantiles in (*np.quantile(draws, (tail, 1.0 - tail), axis=0), prior[index].quantiles)
+            )
+            covered.append((low <= truth) & (truth <= high))
             errors.append(np.abs(np.median(draws, axis=0) - prior[index].quantiles))
             p_values.append(posterior.explains(observed)[1])
     for i, parameter in enumerate(parameters):

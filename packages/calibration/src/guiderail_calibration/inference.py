@@ -117,7 +117,11 @@ class Posterior:
         self._check = ModelCheck(summaries, left_out[:, self.identifiable])
         self._flow = None
         if self.identifiable.any():
-            self._flow = _fit_flow(z[:, self.identifiable], left_out[:, self.identifiable], seed)
+            known, estimates = z[:, self.identifiable], left_out[:, self.identifiable]
+            # The flow only has to learn the residuals of a linear regression, which few draws suffice for.
+            design = np.column_stack([np.ones(len(estimates)), estimates])
+            self._linear, *_ = np.linalg.lstsq(design, known, rcond=None)
+            self._flow = _fit_flow(known - design @ self._linear, estimates, seed)
 
     def estimates(self, summaries: np.ndarray) -> np.ndarray:
         """Return the compressed summaries (m, d) of summaries (m, p)."""
@@ -136,7 +140,7 @@ class Posterior:
                 draws = self._flow.sample(
                     (number,), x=torch.tensor(observed, dtype=torch.float32), show_progress_bars=False
                 )
-            normal[:, self.identifiable] = draws.numpy()
+            normal[:, self.identifiable] = draws.numpy() + np.append(1.0, observed) @ self._linear
         return to_quantiles(normal)
 
     def explains(self, summaries: np.ndarray) -> tuple[bool, float]:
@@ -211,19 +215,22 @@ def _distances(fitted: Any, x: np.ndarray, estimates: np.ndarray) -> np.ndarray:
     return np.stack([np.einsum("ij,jk,ik->i", residuals, precision, residuals), (outside**2).sum(axis=1)], axis=1)
 
 
-def _fit_flow(z: np.ndarray, estimates: np.ndarray, seed: int) -> Any:
-    """Return the neural posterior of standard normal parameters (n, k) for estimates (n, k)."""
+def _fit_flow(residuals: np.ndarray, estimates: np.ndarray, seed: int) -> Any:
+    """Return the neural posterior of residuals (n, k) for estimates (n, k)."""
     import torch
     from sbi.inference import NPE
     from sbi.neural_nets import posterior_nn
 
     with torch.random.fork_rng(), _quiet():
         torch.manual_seed(seed)
-        dimensions = z.shape[1]
+        dimensions = residuals.shape[1]
+        # The loss of a single round of NPE does not contain the prior; it only defines the support, which is unbounded.
         prior = torch.distributions.MultivariateNormal(torch.zeros(dimensions), torch.eye(dimensions))
-        network = posterior_nn("maf", hidden_features=24, num_transforms=3)
+        network = posterior_nn("maf", hidden_features=16, num_transforms=2)
         inference = NPE(prior=prior, density_estimator=network, tracker=_NoTracker(), show_progress_bars=False)
-        inference.append_simulations(torch.tensor(z, dtype=torch.float32), torch.tensor(estimates, dtype=torch.float32))
+        inference.append_simulations(
+            torch.tensor(residuals, dtype=torch.float32), torch.tensor(estimates, dtype=torch.float32)
+        )
         inference.train(training_batch_size=64, learning_rate=2e-3, validation_fraction=0.15, max_num_epochs=300)
         return inference.build_posterior()
 
