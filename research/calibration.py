@@ -110,8 +110,11 @@ def main() -> None:
         for index in robots:
             observed = summarize(prior[index].episodes, num_steps)
             draws = posterior.sample(observed, 500)
-            low, high = (np.quantile(draws, p, axis=0) for p in (tail, 1.0 - tail))
-            covered.append((low <= prior[index].quantiles) & (prior[index].quantiles <= high))
+            low, high, truth = (
+                np.array([parameter.value(q) for parameter, q in zip(parameters, quantiles, strict=True)])
+                for quantiles in (*np.quantile(draws, (tail, 1.0 - tail), axis=0), prior[index].quantiles)
+            )
+            covered.append((low <= truth) & (truth <= high))
             errors.append(np.abs(np.median(draws, axis=0) - prior[index].quantiles))
             p_values.append(posterior.explains(observed)[1])
     for i, parameter in enumerate(parameters):
@@ -161,10 +164,8 @@ def predictions(
             processes=processes, label=f"predicted {index}",
         )  # fmt: skip
         predicted, rate = predict(simulated), float(truth.success.mean())
-        print(
-            f"{engine} {index}: predicted {predicted.success:.2f} [{predicted.low:.2f}, {predicted.high:.2f}], "
-            f"measured {rate:.2f}"
-        )
+        interval = f"{predicted.low:.2f} to {predicted.high:.2f}"
+        print(f"{engine} {index}: predicted {predicted.success:.2f}, {interval}, measured {rate:.2f}", flush=True)
         inside.append(predicted.low <= rate <= predicted.high)
         close.append(abs(predicted.success - rate) <= 0.07)
     return [

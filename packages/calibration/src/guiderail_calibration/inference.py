@@ -3,7 +3,7 @@
 The summaries are compressed to one number for each parameter: the prediction of the parameter by kernel ridge
 regression (semi-automatic summary statistics, Fearnhead and Prangle 2012). Predictions of the training draws leave out
 the draw itself. A parameter whose predictions explain little of its variance cannot be identified, and its posterior is
-its prior. The posterior of the others is a normalizing flow (neural posterior estimation, package `sbi`).
+its prior. The posterior of the others is an ensemble of normalizing flows (neural posterior estimation, package `sbi`).
 
 All parameters are standard normal here: z = Φ⁻¹(q), with the quantile q of the prior.
 """
@@ -20,6 +20,7 @@ import numpy as np
 from scipy.stats import norm
 
 IDENTIFIABLE = 0.2  # smallest fraction of a parameter's variance that the summaries of an identifiable one explain
+MEMBERS = 3  # flows of the ensemble; a single flow is too certain if it was fitted to few draws
 FALSE_ALARMS = 0.04  # fraction of robots inside the model that are reported as not explained by it
 COMPONENTS = 30  # largest number of principal components of the summaries that are checked
 _RIDGES = np.logspace(-3, 3, 13)
@@ -115,9 +116,15 @@ class Posterior:
         self.identifiable = self.sensitivities >= IDENTIFIABLE
         left_out = np.stack([regression.left_out for regression in self._regressions], axis=1)
         self._check = ModelCheck(summaries, left_out[:, self.identifiable])
-        self._flow = None
+        self._flows: list[Any] = []
         if self.identifiable.any():
-            self._flow = _fit_flow(z[:, self.identifiable], left_out[:, self.identifiable], seed)
+            known, estimates = z[:, self.identifiable], left_out[:, self.identifiable]
+            # The flow only has to learn the residuals of a linear regression, which few draws suffice for.
+            design = np.column_stack([np.ones(len(estimates)), estimates])
+            self._linear, *_ = np.linalg.lstsq(design, known, rcond=None)
+            self._flows = [
+                _fit_flow(known - design @ self._linear, estimates, seed + member) for member in range(MEMBERS)
+            ]
 
     def estimates(self, summaries: np.ndarray) -> np.ndarray:
         """Return the compressed summaries (m, d) of summaries (m, p)."""
@@ -129,14 +136,16 @@ class Posterior:
         import torch
 
         normal = np.random.default_rng(seed).standard_normal((number, len(self.identifiable)))
-        if self._flow is not None:
+        if self._flows:
             observed = self.estimates(summaries)[0, self.identifiable]
+            condition = torch.tensor(observed, dtype=torch.float32)
             with torch.random.fork_rng(), torch.no_grad(), _quiet():
                 torch.manual_seed(seed)
-                draws = self._flow.sample(
-                    (number,), x=torch.tensor(observed, dtype=torch.float32), show_progress_bars=False
-                )
-            normal[:, self.identifiable] = draws.numpy()
+                count = -(-number // MEMBERS)
+                parts = [flow.sample((count,), x=condition, show_progress_bars=False).numpy() for flow in self._flows]
+            # Draws alternate between the flows, so that the first few are draws of the ensemble, too.
+            draws = np.stack(parts, axis=1).reshape(-1, len(observed))[:number]
+            normal[:, self.identifiable] = draws + np.append(1.0, observed) @ self._linear
         return to_quantiles(normal)
 
     def explains(self, summaries: np.ndarray) -> tuple[bool, float]:
@@ -211,19 +220,22 @@ def _distances(fitted: Any, x: np.ndarray, estimates: np.ndarray) -> np.ndarray:
     return np.stack([np.einsum("ij,jk,ik->i", residuals, precision, residuals), (outside**2).sum(axis=1)], axis=1)
 
 
-def _fit_flow(z: np.ndarray, estimates: np.ndarray, seed: int) -> Any:
-    """Return the neural posterior of standard normal parameters (n, k) for estimates (n, k)."""
+def _fit_flow(residuals: np.ndarray, estimates: np.ndarray, seed: int) -> Any:
+    """Return the neural posterior of residuals (n, k) for estimates (n, k)."""
     import torch
     from sbi.inference import NPE
     from sbi.neural_nets import posterior_nn
 
     with torch.random.fork_rng(), _quiet():
         torch.manual_seed(seed)
-        dimensions = z.shape[1]
+        dimensions = residuals.shape[1]
+        # The loss of a single round of NPE does not contain the prior; it only defines the support, which is unbounded.
         prior = torch.distributions.MultivariateNormal(torch.zeros(dimensions), torch.eye(dimensions))
-        network = posterior_nn("maf", hidden_features=24, num_transforms=3)
+        network = posterior_nn("maf", hidden_features=16, num_transforms=2)
         inference = NPE(prior=prior, density_estimator=network, tracker=_NoTracker(), show_progress_bars=False)
-        inference.append_simulations(torch.tensor(z, dtype=torch.float32), torch.tensor(estimates, dtype=torch.float32))
+        inference.append_simulations(
+            torch.tensor(residuals, dtype=torch.float32), torch.tensor(estimates, dtype=torch.float32)
+        )
         inference.train(training_batch_size=64, learning_rate=2e-3, validation_fraction=0.15, max_num_epochs=300)
         return inference.build_posterior()
 

@@ -40,22 +40,22 @@ class Parameter:
 
 _AXES = {axis.name: axis for axis in AXES}
 PARAMETERS = tuple(
-    Parameter(_AXES[name], *prior)
-    for name, prior in {
-        "friction": (0.4, 2.5, "log"),
-        "modulus": (0.1, 10.0, "log"),
-        "stiffness": (0.5, 2.0, "log"),
-        "clearance": (0.5, 2.0, "log"),
-        "offsets": (0.6, 1.3),
-        "wrench_scale": (0.5, 2.0, "log"),
-        "wrench_bias": (0.0, 4.0),
-        "wrench_noise": (0.02, 1.0, "log"),
-        "wrench_delay": (1, 8, "integer"),
-        "pose_bias": (0.0, 1.0),
-        "lost": (0.0, 0.4),
-        "late": (0, 6, "integer"),
-        "payload": (0.0, 1.0),
-    }.items()
+    Parameter(_AXES[name], low, high, scale)
+    for name, low, high, scale in (
+        ("friction", 0.4, 2.5, "log"),
+        ("modulus", 0.1, 10.0, "log"),
+        ("stiffness", 0.5, 2.0, "log"),
+        ("clearance", 0.5, 2.0, "log"),
+        ("offsets", 0.6, 1.3, "linear"),
+        ("wrench_scale", 0.5, 2.0, "log"),
+        ("wrench_bias", 0.0, 4.0, "linear"),
+        ("wrench_noise", 0.02, 1.0, "log"),
+        ("wrench_delay", 1, 8, "integer"),
+        ("pose_bias", 0.0, 1.0, "linear"),
+        ("lost", 0.0, 0.4, "linear"),
+        ("late", 0, 6, "integer"),
+        ("payload", 0.0, 1.0, "linear"),
+    )
 )
 NOT_OFFERED = {
     "joint_friction": "no simulated station has joint friction",

@@ -34,7 +34,7 @@ def predict(simulated: Sequence[Simulated]) -> Prediction:
     rates, probability = rate_distribution(successes, numbers)
     cumulative = np.cumsum(probability)
     tail = 0.5 * (1.0 - LEVEL)
-    low, high = (float(rates[min(np.searchsorted(cumulative, p), len(rates) - 1)]) for p in (tail, 1.0 - tail))
+    low, high = (float(rates[min(int(np.searchsorted(cumulative, p)), len(rates) - 1)]) for p in (tail, 1.0 - tail))
     forces = np.concatenate([draw.peak_force for draw in simulated])
     force_low, force, force_high = (float(np.quantile(forces, p)) for p in (tail, 0.5, 1.0 - tail))
     total = int(numbers.sum())
