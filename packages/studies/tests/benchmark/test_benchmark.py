@@ -180,7 +180,7 @@ def test_submission_is_refused_when_its_episodes_are_forged(submission):
     rows["return"] += 1.0  # no column of the table depends on it
     (folder / "evaluated.csv").write_text(table_text(rows))
     write_digests(submission)
-    with pytest.raises(InputError, match="has return .*: the submission is refused"):
+    with pytest.raises(InputError, match=r"has return .*: the submission is refused"):
         verify(submission, episodes=1, log=str)
 
 
@@ -206,7 +206,7 @@ def test_submission_is_refused_with_another_policy(submission):
 def test_submission_is_refused_with_links_or_further_files(submission, tmp_path):
     extra = submission / "setup.py"
     extra.write_text("raise SystemExit")
-    with pytest.raises(InputError, match="a file too many or too few, 'setup.py'"):
+    with pytest.raises(InputError, match=r"a file too many or too few, 'setup.py'"):
         verify(submission, log=str)
     extra.unlink()
     extra.symlink_to(tmp_path)
