@@ -87,10 +87,11 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "ray": {"ray": "Ray"},
     "onnx": {"onnxruntime": "ONNX Runtime"},
     "wandb": {"wandb": "Weights & Biases"},
-    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot")},
+    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot", "calibration")},
 }
 _SOFTWARE["mujoco"]["guiderail_mujoco"] = "guiderail-mujoco"
 _SOFTWARE["parts"]["guiderail_parts"] = "guiderail-parts"
+_SOFTWARE["calibration"]["sbi"] = "sbi"
 EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for module, name in modules.items()}
 """Software and the name of the extra that installs it, by the name of a module."""
 

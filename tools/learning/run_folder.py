@@ -11,7 +11,7 @@ import logging
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, field, replace
+from dataclasses import asdict, field, make_dataclass, replace
 from functools import cache, cached_property
 from importlib import metadata
 from pathlib import Path
@@ -38,8 +38,8 @@ from guiderail.tools.files import (
     write_atomically,
     write_error,
 )
-from guiderail.tools.imports import import_stored
-from guiderail.tools.learning.learner import LearnerConfig
+from guiderail.tools.imports import import_stored, is_trusted
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig
 from guiderail.tools.learning.learner_config import (
     MAX_EPISODES,
     check_episodes,
@@ -223,8 +223,13 @@ class RunFolder:
             del values["members"]
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
-    def config(self) -> RunConfig:
-        """Read the configuration of the run, and import the modules that register its task and learner."""
+    def config(self, *, runs_code: bool = True) -> RunConfig:
+        """Read the configuration of the run, and import the modules that register its task and learner.
+
+        Args:
+            runs_code: False if the configuration is only shown: code that is not trusted is then not imported, and the
+                settings of an unknown learner are not checked.
+        """
         file = self.path / "config.yaml"
         refuse_links(self.path)
         try:
@@ -242,8 +247,12 @@ class RunFolder:
                 member["environment"] = as_arguments(member["environment"])
             settings = dict(values["learner"])
             config = RunConfig(**values)
-            import_stored(config.imports, file)
-            return replace(config, learner=make_config(settings.pop("algorithm"), settings))
+            algorithm = settings.pop("algorithm")
+            if runs_code or is_trusted():
+                import_stored(config.imports, file)
+            elif config.imports and algorithm not in LEARNERS.names():
+                return replace(config, learner=_shown_settings(algorithm, settings))
+            return replace(config, learner=make_config(algorithm, settings))
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -273,6 +282,16 @@ class RunFolder:
     def episodes(self) -> pd.DataFrame:
         """Read `episodes.csv`; raise an InputError if it is missing or not a table of episodes."""
         return check_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
+
+
+def _shown_settings(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
+    """Return the stored settings of a learner whose code is not imported."""
+    base = {name: settings.pop(name) for name in LearnerConfig.__dataclass_fields__ if name in settings}
+    kind = make_dataclass(
+        "ShownConfig", [(name, Any) for name in settings], bases=(LearnerConfig,), frozen=True, kw_only=True
+    )
+    shown: LearnerConfig = kind(algorithm=algorithm, **base, **settings)
+    return shown
 
 
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:

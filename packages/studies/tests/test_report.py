@@ -50,6 +50,18 @@ def text_of(page):
     return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
 
 
+def test_report_executes_no_code_that_a_run_names(study_folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(study_folder / "skgrl-1", run)
+    (tmp_path / "mine.py").write_text("raise SystemExit('the code of the run was executed')")
+    text = (run / "config.yaml").read_text().replace("imports: []", f"imports: [{tmp_path / 'mine.py'}]")
+    (run / "config.yaml").write_text(re.sub("algorithm: .*", "algorithm: my_learner\n  my_setting: 0.123", text))
+    page = write_report([run], tmp_path / "report.html").read_text()
+    assert "my_learner" in page
+    with pytest.raises(InputError, match="which would execute code"):
+        write_report([run], tmp_path / "again.html", episodes=1)
+
+
 def test_report_of_a_study_is_one_self_contained_page(study_folder, tmp_path):
     page = write_report([study_folder], tmp_path / "report.html").read_text()
     assert page.count("<svg") >= 4

@@ -53,7 +53,7 @@ from injections.kinds import FIELDS, KINDS, NEXT, PERIOD, UNDETECTED, Kind
 
 RADIUS, ROTATION, FREQUENCY = 0.01, 0.15, 1.0  # amplitudes and frequency of the motion [m], [rad], [Hz]
 BANDWIDTH = 60.0  # natural frequency of the critically damped arm [rad/s]
-SETTLED = 0.02  # largest difference of the joint speed from that of the undisturbed motion [rad/s]
+SETTLING = 0.4  # time from the start of a motion until the arm follows it [s]
 SUBSTEPS = 5  # integration steps of the arm in a period
 PATIENCE = 20.0  # longest wait for a message or an answer [s]
 HOLD, CONTROLLER, FOREIGN = "hold", "cartesian_controller", "second program"
@@ -417,8 +417,8 @@ class Campaign:
         """True if the station is stopping the arm."""
         return self.has_controller and (self.arm_state in (ArmState.DAMPING, ArmState.OFF) or self.fault != Fault.NONE)
 
-    def run_until_following(self, seconds: float) -> None:
-        """Advance until the arm follows its command, and then for `seconds` [s]."""
+    def run_until_following(self) -> None:
+        """Advance until the arm follows its command, and resume it when it is stopped."""
         for _ in range(round(8.0 / PERIOD)):  # a drift of a position is forgotten in seconds
             if self.arm_state == ArmState.RUNNING and self.fault == Fault.NONE:
                 break
@@ -428,28 +428,22 @@ class Campaign:
             self.step_once()
         else:
             raise AssertionError(f"does not resume: {self.arm_state.name}, {self.fault.name}")
-        for _ in range(round(seconds / PERIOD)):
-            self.step_once()
 
-    def run_until_settled(self, speeds: np.ndarray, seconds: float) -> None:
-        """Advance until the arm moves as in the undisturbed motion, and then for `seconds` [s]."""
-        self.run_until_following(0.0)
-        number = 0
-        for _ in range(round(5.0 / PERIOD)):
-            self.step_once()
-            is_equal = abs(self.speed - speeds[self.step % len(speeds)]) < SETTLED
-            number = number + 1 if is_equal else 0
-            if number * PERIOD > seconds:
-                return
-        raise AssertionError("does not return to its motion")
+    def run_undisturbed(self, seconds: float) -> np.ndarray:
+        """Advance until the arm has followed its command for `SETTLING` and a period of the motion, and for `seconds`.
 
-    def undisturbed_speeds(self) -> np.ndarray:
-        """Return the speed of the fastest joint in each step of a period of the motion [rad/s]."""
+        Returns:
+            Speed of the fastest joint in each step of a period [rad/s]. It depends on the posture of the arm, which has
+            more joints than its task needs, and which a fault changes.
+        """
         steps = round(1.0 / FREQUENCY / PERIOD)
-        speeds = np.zeros(steps)
-        self.run_until_following(0.5)
-        for _ in range(steps):
+        speeds, number = np.zeros(steps), 0
+        while number < steps + round((SETTLING + seconds) / PERIOD):
+            if self.is_detected:
+                number = 0
+                self.run_until_following()
             self.step_once()
+            number += 1
             speeds[self.step % steps] = self.speed
         return speeds
 
@@ -523,7 +517,7 @@ def main() -> int:
     use_loopback()
     started, domains = time.monotonic(), itertools.cycle(range(20 + os.getpid() % 100, 230))
     campaign = Campaign(next(domains))
-    speeds = campaign.undisturbed_speeds()
+    speeds = campaign.run_undisturbed(0.0)
     kinds = [kind for kind in CAMPAIGN if not arguments.kinds or kind.name in arguments.kinds]
     results: dict[str, list[Result]] = {kind.name: [] for kind in kinds}
     for instant in range(arguments.instants):
@@ -536,12 +530,12 @@ def main() -> int:
             if campaign.arm.poll() is not None:  # killed; its connections stay known for a while
                 campaign = Campaign(next(domains))
             try:
-                campaign.run_until_settled(speeds, wait)
+                speeds = campaign.run_undisturbed(wait)
             except AssertionError as error:
                 result.failures.append(str(error))
                 campaign.close()
                 campaign = Campaign(next(domains))
-                campaign.run_until_settled(speeds, wait)
+                speeds = campaign.run_undisturbed(wait)
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
             for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)

@@ -14,7 +14,7 @@ POSE = "x,y,z,rx,ry,rz"
 @command("dataset import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import", dataset)
 def import_(
     source: Annotated[
-        Path, argument("LeRobot v3 dataset, ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
+        Path, argument("LeRobot v3 dataset, ROS bag, .mcap or .csv file, or a folder of them.", "SOURCE")
     ],
     out: Annotated[Path, option("File of demonstrations to write, .npz or .csv.")],
     signal: Annotated[
