@@ -79,3 +79,24 @@ def test_mean_jerk_is_exact_for_a_cubic():
     times = 0.1 * np.arange(9)
     assert mean_jerk(np.column_stack([times**3, 0 * times]), 0.1) == pytest.approx(6.0, rel=1e-9)
     assert mean_jerk(np.zeros((3, 2)), 0.1) == 0.0
+
+
+def test_unsafe_steps_violate_a_constraint_or_are_in_collision():
+    steps = [
+        {},
+        {"commanded_violation": 1e-10},
+        {"commanded_violation": 1e-8},
+        {"measured_violation": 1e-3, "collision": 1.0},
+        {"collision": 1.0},
+        {"measured_violation": np.nan},
+    ]
+    trace = trace_of(steps)
+    assert trace.unsafe().tolist() == [False, False, True, True, True, True]
+    assert trace.unsafe(3).tolist() == [True, True, True]
+    assert trace.statistics()["cost"] == 4
+
+
+def test_quasi_static_force_lasts_half_a_second():
+    forces = [0.0, 9.0, *[4.0, 5.0, 6.0, 5.0, 4.5], 0.0, 0.0, 8.0, 8.0, 8.0, 8.0, 0.0]
+    assert trace_of({"force": force} for force in forces).statistics()["quasi_static_force"] == 4.0
+    assert trace_of({"force": 9.0} for _ in range(4)).statistics()["quasi_static_force"] == 0.0

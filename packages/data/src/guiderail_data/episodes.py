@@ -153,7 +153,9 @@ def _write_minari(
         ) from error
     if exists:
         raise InputError(f"Minari has a data set {out}: give another identifier, or minari delete {out}")
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in options.items()}
+    plain: dict[str, Any] = {
+        name: list(value) if isinstance(value, tuple) else value for name, value in options.items()
+    }
     with closing(gymnasium.make(environment_id(task), **plain)) as env:
         buffers = _Buffers(env, minari.data_collector.EpisodeBuffer)
         rows = list(_run(env, subject.config, subject, episodes, seed, buffers))

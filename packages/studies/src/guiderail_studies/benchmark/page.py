@@ -21,6 +21,7 @@ from guiderail_studies.statistics import bootstrap_interval, interquartile_mean,
 
 TITLE = "Safe learning of contact tasks"
 MISSING = "–"
+MIN_SEEDS = 3  # smallest number of seeds of a task for an interval
 RESAMPLES = 5_000  # number of bootstrap resamples of an interval
 SHOWN = (
     ("over_limit_events", "over-limit events in training, per run", "{:.3g}"),
@@ -135,9 +136,9 @@ def _overall(protocol: Protocol, entries: Sequence[Entry]) -> Block:
 
 
 def _interval(scores: Sequence[np.ndarray]) -> str:
-    """Return the interquartile mean of success rates in percent, with its interval if a task has several seeds."""
+    """Return the interquartile mean of success rates in percent, with its interval if every task has enough seeds."""
     mean = 100 * float(interquartile_mean(scores))
-    if max(map(len, scores)) < 2:
+    if min(map(len, scores)) < MIN_SEEDS:
         return f"{mean:.0f}"
     low, high = (100 * end for end in bootstrap_interval(interquartile_mean, scores, resamples=RESAMPLES))
     return f"{mean:.0f} ({low:.0f} to {high:.0f})"
@@ -149,6 +150,8 @@ def _improvement(entry: Entry, reference: Entry | None, tasks: Sequence[str]) ->
         return MISSING
     pairs = [[each.scores(name) for name in shared] for each in (entry, reference)]
     value = float(probability_of_improvement(*pairs))
+    if min(len(scores) for method in pairs for scores in method) < MIN_SEEDS:
+        return f"{value:.2f}"
     low, high = bootstrap_interval(probability_of_improvement, *pairs, resamples=RESAMPLES)
     return f"{value:.2f} ({low:.2f} to {high:.2f})"
 

@@ -186,7 +186,7 @@ def run_method(
 
 def _write_method(protocol: Protocol, method: BenchmarkMethod, tasks: Sequence[str], out: Path) -> None:
     """Write the method into the folder of its runs, or raise an InputError if it has runs of another one."""
-    digests = {}
+    digests: dict[str, str] = {}
     if (out / METHOD_FILE).exists():
         stored_protocol, stored, digests = stored_method(out)
         if stored_protocol.version != protocol.version or stored != method:
