@@ -151,8 +151,10 @@ class SafetyMonitor:
         return self._is_stopping and self._can_hold and self.fault in STATUS_FAULTS
 
     def _is_effective(self, estimate: Estimate, now: float) -> bool:
-        speed, elapsed = float(np.abs(estimate.state.velocity).max()), now - self._entered_at
-        return not is_hold_ineffective(speed, self._initial_speed, elapsed, estimate.age, period=self._driver.period)
+        # The reported velocities: the prediction is wrong if the driver repeats its last torque.
+        velocities, elapsed = np.split(estimate.state.last_values, 3)[1], now - self._entered_at
+        speed, age = float(np.abs(velocities).max()), now - estimate.state.receipt_time
+        return not is_hold_ineffective(speed, self._initial_speed, elapsed, age, period=self._driver.period)
 
     def _on_command(self, torque: np.ndarray, command_time: float) -> None:
         if torque.shape != self._torque_limits.shape:

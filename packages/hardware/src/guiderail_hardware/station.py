@@ -355,6 +355,11 @@ class HardwareStation(Station):
         self._limiter.resume(self._limiter.GetMyMutableContextFromRoot(context))
         self._refill_tank(context)
 
+    def describe_round_trip(self) -> str:
+        """Return the round trip of the last commands in words; empty if it is unknown."""
+        seconds, longest = self.driver.guard.round_trip.seconds, self.status_limits.max_round_trip
+        return "" if np.isnan(seconds) else f"round trip {1e3 * seconds:.1f} ms, at most {1e3 * longest:.1f} ms"
+
     def read_max_wrench(self, context: Context) -> np.ndarray | None:
         """Return the value of the input ``max_wrench``, (8,), or None without one; `context` is this station's own."""
         port = self.GetInputPort("max_wrench") if self.HasInputPort("max_wrench") else None

@@ -35,6 +35,7 @@ class DriverGuard:
         self._driver = driver
         self.num_failed_commands = 0
         self.round_trip = RoundTrip()
+        self._heartbeats: tuple[Heartbeat, ...] = ()  # heartbeats of the last check
         self._now = 0.0  # local time of the station's last check [s]
         self.forget_errors()
 
@@ -102,7 +103,9 @@ class DriverGuard:
         The heartbeats are the newest ones. Without a `clock` [s], the check counts as one period after the last one.
         """
         self._now = self._now + self._driver.period if clock is None else clock
-        self.round_trip.update([heartbeat.command for heartbeat in heartbeats], self._now)
+        if heartbeats != self._heartbeats:  # otherwise the monitor is silent, which is another fault
+            self.round_trip.update([heartbeat.command for heartbeat in heartbeats], self._now)
+        self._heartbeats = heartbeats
         return self.round_trip.seconds
 
     def configure(self, impedance: RobotImpedance) -> None:
