@@ -56,6 +56,7 @@ class Bus:
         on_sensor: Function from a status to the messages that the driver sends to station and safety monitor.
         on_status: Function from a message of the driver to the messages that arrive at the station.
         on_command: Function from a command to the messages that arrive at the robot.
+        on_heartbeat: Function from a heartbeat of the monitor to the messages that arrive at the station.
         has_robot: True while the robot is stepped.
         has_controller: True while the station is stepped.
         has_safety_monitor: True while the monitor checks statuses and its heartbeats are relayed.
@@ -71,7 +72,7 @@ class Bus:
         self.limits = np.array(limits.torque)
         self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
         self._stop_limits = limits
-        self.on_sensor = self.on_status = self.on_command = relay_unchanged
+        self.on_sensor = self.on_status = self.on_command = self.on_heartbeat = relay_unchanged
         self.has_robot = self.has_controller = self.has_safety_monitor = True
         self.torques: list[np.ndarray] = []
         self.step = 0
@@ -204,7 +205,8 @@ class Bus:
             self._send(self.near_station, IiwaDriver.status_channel, self.on_status(message), deliver)
         # Heartbeats are relayed like the statuses, and are lost with them.
         if self.has_safety_monitor and self.on_status(b""):
-            self._send(self.near_station, HEARTBEAT_CHANNEL, heartbeats[-1:], deliver)
+            relayed = [message for heartbeat in heartbeats[-1:] for message in self.on_heartbeat(heartbeat)]
+            self._send(self.near_station, HEARTBEAT_CHANNEL, relayed, deliver)
 
     def _send(self, lcm: DrakeLcm, channel: str, messages: list[bytes], deliver: bool = True) -> None:
         for message in messages:

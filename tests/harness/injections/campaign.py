@@ -108,6 +108,9 @@ def begin(bus: Bus, kind: Kind, rng: np.random.Generator, effects: list[int]) ->
             return relayed
 
         setattr(bus, where, relay)
+        if kind.delays_heartbeats and kind.where == "network":
+            late = kind.make(rng)
+            bus.on_heartbeat = lambda message: late(message, (bus.step - start) * PERIOD)
         return
     name = {"robot": "has_robot", "controller": "has_controller", "monitor": "has_safety_monitor"}[kind.action[1]]
     setattr(bus, name, False)

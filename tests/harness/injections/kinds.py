@@ -33,6 +33,7 @@ class Kind:
         where: Place of the fault: "sensor" (before station and safety monitor), "network" (before the station only),
             "command" (before the robot) or "program".
         action: For a fault of a program, "kill" or "stop", and the name of the program.
+        delays_heartbeats: True if the fault also affects the monitor's heartbeats, as a late network does.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Kind:
     make: Callable[[np.random.Generator], Fault] | None = None
     where: str = "sensor"
     action: tuple[str, str] = ("", "")
+    delays_heartbeats: bool = False
 
     @property
     def is_detectable(self) -> bool:
@@ -249,6 +251,64 @@ def _second_robot(delay: float, offset: float) -> Callable[[np.random.Generator]
     return make
 
 
+def _reversed_groups(size: int) -> Callable[[np.random.Generator], Fault]:
+    def make(rng: np.random.Generator) -> Fault:
+        pending: list[bytes] = []
+
+        def relay(message: bytes, elapsed: float) -> list[bytes]:
+            pending.append(message)
+            if len(pending) < size:
+                return []
+            group, pending[:] = pending[::-1], []
+            return group
+
+        return relay
+
+    return make
+
+
+def _moving_robot(order: str, delay: float) -> Callable[[np.random.Generator], Fault]:
+    """Return a fault by a second robot in the same posture that oscillates with 0.5 rad/s.
+
+    Args:
+        order: Senders of the statuses that arrive in a period, in turn: "1" or "2", or both, such as "21".
+        delay: Difference between the clocks of the two robots [s].
+    """
+
+    def make(rng: np.random.Generator) -> Fault:
+        first: list[lcmt_iiwa_status] = []
+        number = [0]
+
+        def relay(message: bytes, elapsed: float) -> list[bytes]:
+            second = lcmt_iiwa_status.decode(message)
+            if not first:
+                first.append(lcmt_iiwa_status.decode(message))
+            phase = 2.0 * np.pi * elapsed
+            second.utime += round(1e6 * delay)
+            second.joint_velocity_estimated = [0.5 * np.cos(phase)] * 7
+            start = first[0].joint_position_measured
+            second.joint_position_measured = [q + 0.5 / (2.0 * np.pi) * np.sin(phase) for q in start]
+            senders = order.split(",")[number[0] % len(order.split(","))]
+            number[0] += 1
+            return [message if sender == "1" else second.encode() for sender in senders]
+
+        return relay
+
+    return make
+
+
+def _scaled_torques(scale: float) -> Callable[[np.random.Generator], Fault]:
+    def make(rng: np.random.Generator) -> Fault:
+        def relay(message: bytes, elapsed: float) -> list[bytes]:
+            command = lcmt_iiwa_command.decode(message)
+            command.joint_torque = [scale * torque for torque in command.joint_torque]
+            return [command.encode()]
+
+        return relay
+
+    return make
+
+
 def _replaced(make_message: Callable[[bytes, np.random.Generator], bytes]) -> Callable[[np.random.Generator], Fault]:
     return lambda rng: lambda message, elapsed: [make_message(message, rng)]
 
@@ -353,6 +413,25 @@ KINDS = (
     Kind("second program, torque negated", FEW, _second_program(lambda torque: -torque, 0.0), "command"),
     Kind("second program, another clock", FEW, _second_program(lambda torque: -torque, 40.0), "command"),
     Kind("second program, clock + 1 ms", SLOW, _second_program(lambda torque: 0.5 * torque, 1e-3), "command"),
+    *(
+        Kind(f"{name} {milliseconds} ms late for ever", bound, _delayed(1e-3 * milliseconds), where, ("", ""), True)
+        for name, where in (("commands", "command"), ("statuses", "network"))
+        for milliseconds, bound in (
+            (5, UNDETECTED),
+            (10, 10 * PERIOD),
+            (15, 11 * PERIOD),
+            (20, 12 * PERIOD),
+            (30, 14 * PERIOD),
+            (45, HEARTBEAT),
+        )
+    ),
+    Kind("statuses reversed, groups of 8", 10 * PERIOD, _reversed_groups(8), "network"),
+    *(
+        Kind(f"moving robot {order}, clock + {delay:g} s", bound, _moving_robot(order, delay))
+        for order, bound in (("2", TIMEOUT), ("21", NEXT), ("1,2", FEW), ("1,1,2", FEW), ("1,1,2,2", FEW))
+        for delay in (0.0, 1e-3, 7.0)
+    ),
+    *(Kind(f"torques times {scale:g}", UNDETECTED, _scaled_torques(scale), "command") for scale in (0.5, 1.5, 2, 3, 5)),
     Kind("controller killed", TIMEOUT, None, "program", ("kill", "controller")),
     Kind("controller stopped", TIMEOUT, None, "program", ("stop", "controller")),
     Kind("robot killed", TIMEOUT, None, "program", ("kill", "robot")),

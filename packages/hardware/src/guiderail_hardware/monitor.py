@@ -13,8 +13,16 @@ from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail_hardware.drivers.driver import Driver, status_limits, torque_tolerance
-from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, STATUS_FAULTS, Fault, Heartbeat, damping_torque
+from guiderail_hardware.models.joint_status import (
+    MAX_MISSED_MESSAGES,
+    STATUS_FAULTS,
+    Fault,
+    Heartbeat,
+    damping_torque,
+    is_hold_ineffective,
+)
 from guiderail_hardware.models.message_sequence import CommandSequence
+from guiderail_hardware.models.round_trip import to_microseconds
 from guiderail_hardware.models.state_estimator import Estimate, EstimatorState, StateEstimator
 from guiderail_hardware.systems.torque_safety_limiter import ZERO_TORQUE_TIME, SafetyLimits
 
@@ -40,7 +48,8 @@ class SafetyMonitor:
     A driver without a command timeout repeats the last torque if the commanding program is killed or its commands are
     lost. The monitor therefore runs on the driver's machine, in a separate process. It checks statuses with the same
     `StateEstimator` as the station, but with its own clock. It sends a heartbeat with every check, so that a commanding
-    program stops if the monitor stops the arm or has exited. Commands of two programs are a fault as well
+    program stops if the monitor stops the arm or has exited. The heartbeat reports the newest command, from which the
+    commanding program measures the round trip. Commands of two programs are a fault as well
     (`CommandSequence`): the arm is damped, and then has zero torque until only one program sends commands. During a
     stop the monitor sends torques even if no status arrives, so that the driver never repeats an old torque. If the
     status is wrong and the driver can hold the arm, the monitor calls `Driver.hold` instead. An exception of the driver
@@ -85,6 +94,8 @@ class SafetyMonitor:
         self._commanded_at = self._entered_at = self._checked_at = -np.inf
         self._sender = secrets.randbits(48)
         self._num_heartbeats = self._num_repeats = 0  # heartbeats sent; repetitions of the torque since the last check
+        self._can_hold, self._initial_speed = driver.can_hold, 0.0  # largest joint speed when the stop began [rad/s]
+        self._command_stamp = -1  # time stamp of the newest command [µs], reported in heartbeats
         driver.add_listener(self._on_command)
 
     def receive(self, timeout: float = 0.0) -> None:
@@ -114,8 +125,14 @@ class SafetyMonitor:
         is_stopping, is_failing = self._is_stopping, False
         # The heartbeat precedes the torque, so that the commanding program attributes the torque to this monitor.
         self._num_heartbeats += 1
-        self._guard.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender))
-        if is_stopping and not (self._is_holding and self._guard.hold()):
+        self._guard.write_heartbeat(Heartbeat(self._num_heartbeats, is_stopping, self._sender, self._command_stamp))
+        is_held = self._is_holding and self._guard.hold()
+        if self._is_holding and not (is_held and self._is_effective(estimate, now)):
+            is_held = self._can_hold = False
+            self.state, self._entered_at = MonitorState.DAMPING, now
+        if is_held:
+            self._command = np.zeros(len(M))
+        elif is_stopping:
             self._command = self._torque(estimate, M)
             if not self._guard.write(self._command, now):
                 is_failing = True
@@ -131,12 +148,18 @@ class SafetyMonitor:
 
     @property
     def _is_holding(self) -> bool:
-        return self._is_stopping and self._driver.can_hold and self.fault in STATUS_FAULTS
+        return self._is_stopping and self._can_hold and self.fault in STATUS_FAULTS
+
+    def _is_effective(self, estimate: Estimate, now: float) -> bool:
+        # The reported velocities: the prediction is wrong if the driver repeats its last torque.
+        velocities, elapsed = np.split(estimate.state.last_values, 3)[1], now - self._entered_at
+        speed, age = float(np.abs(velocities).max()), now - estimate.state.receipt_time
+        return not is_hold_ineffective(speed, self._initial_speed, elapsed, age, period=self._driver.period)
 
     def _on_command(self, torque: np.ndarray, command_time: float) -> None:
         if torque.shape != self._torque_limits.shape:
             return
-        self._commanded_at = self._clock()
+        self._commanded_at, self._command_stamp = self._clock(), to_microseconds(command_time)
         heartbeats = self._guard.read_heartbeats()
         # While another monitor stops the arm, the command may be a command of that monitor.
         if not any(heartbeat.is_stopping and heartbeat.sender != self._sender for heartbeat in heartbeats):
@@ -159,6 +182,8 @@ class SafetyMonitor:
             has_torque = self._command is not None and bool(np.any(self._command))
             if has_torque or self.fault == Fault.SECOND_COMMANDER:
                 self.state, self._entered_at = MonitorState.DAMPING, now
+                self._can_hold = self._driver.can_hold
+                self._initial_speed = float(np.abs(self._estimated.velocity).max())
             elif is_silent:
                 self.state = MonitorState.IDLE
         if self.state == MonitorState.DAMPING and now - self._entered_at >= self._limits.damping_time:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from pydrake.common.value import Value
@@ -49,6 +50,7 @@ from guiderail_hardware.drivers.driver import (
 from guiderail_hardware.drivers.driver import status_limits as default_status_limits
 from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, Fault, StatusLimits
 from guiderail_hardware.models.robot_impedance import RobotImpedance
+from guiderail_hardware.models.round_trip import max_round_trip
 from guiderail_hardware.systems.heartbeat_monitor import HeartbeatMonitor
 from guiderail_hardware.systems.pose_publisher import PosePublisher
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
@@ -159,6 +161,11 @@ class HardwareStation(Station):
                 f"long, not {self.status_limits.settling_time:g} s"
             )
         self.impedance, self._end_effector = impedance, end_effector
+        if not isinstance(driver, PoseDriver):  # otherwise the impedance runs on the robot
+            frequencies = impedance_frequencies(self.controller_plant, impedance)
+            longest = max_round_trip(frequencies, impedance.damping_ratio, self.limits.decay_time, period=period)
+            longest = min(longest, self.status_limits.max_round_trip)
+            self.status_limits = replace(self.status_limits, max_round_trip=longest)
         self._robot_timeout, self._wrench_time_constant, self._tare = robot_timeout, wrench_time_constant, tare
         self._build()
 
@@ -315,12 +322,17 @@ class HardwareStation(Station):
         guard = self.driver.guard
         guard.receive()
         heartbeats = guard.read_heartbeats()
+        newest, round_trip = guard.read(), guard.measure_round_trip(heartbeats, clock)
+        if newest is not None:
+            newest = replace(newest, round_trip=round_trip)
         status, heartbeat = (system.GetMyMutableContextFromRoot(context) for system in (self._status, self._heartbeat))
-        self._status.get_status_input_port().FixValue(status, Value[object](guard.read()))
+        self._status.get_status_input_port().FixValue(status, Value[object](newest))
         self._heartbeat.get_heartbeats_input_port().FixValue(heartbeat, Value[object](heartbeats))
         if clock is not None:
             self._status.get_clock_input_port().FixValue(status, [clock])
         limiter = self._limiter.GetMyMutableContextFromRoot(context)
+        if guard.take_refusal():
+            self._limiter.refuse_hold(limiter)
         if guard.take_failure():
             self._status.forget_torque(status)
             self._limiter.stop(limiter, Fault.COMMAND_FAILED)
@@ -342,6 +354,11 @@ class HardwareStation(Station):
         """
         self._limiter.resume(self._limiter.GetMyMutableContextFromRoot(context))
         self._refill_tank(context)
+
+    def describe_round_trip(self) -> str:
+        """Return the round trip of the last commands in words; empty if it is unknown."""
+        seconds, longest = self.driver.guard.round_trip.seconds, self.status_limits.max_round_trip
+        return "" if np.isnan(seconds) else f"round trip {1e3 * seconds:.1f} ms, at most {1e3 * longest:.1f} ms"
 
     def read_max_wrench(self, context: Context) -> np.ndarray | None:
         """Return the value of the input ``max_wrench``, (8,), or None without one; `context` is this station's own."""
@@ -414,6 +431,16 @@ def tool_jacobian(model: ControllerPlant, positions: np.ndarray, frame: Frame) -
     return model.plant.CalcJacobianSpatialVelocity(
         context, JacobianWrtVariable.kV, model.tool_center, np.zeros(3), frame, frame
     )
+
+
+def impedance_frequencies(model: ControllerPlant, impedance: Impedance) -> np.ndarray:
+    """Return the natural frequencies of the impedance's modes in the nominal posture, (6,) [rad/s]."""
+    context = model.plant.CreateDefaultContext()
+    model.plant.SetPositions(context, model.posture)
+    J = tool_jacobian(model, model.posture, model.target)[[3, 4, 5, 0, 1, 2]]
+    Lambda_inverse = J @ np.linalg.solve(model.plant.CalcMassMatrix(context), J.T)
+    K = np.diag(to_wrench_order(impedance.stiffness))
+    return np.sqrt(np.maximum(np.linalg.eigvals(Lambda_inverse @ K).real, 0.0))
 
 
 def make_rate_limiter(driver: Driver, period: float) -> PoseRateLimiter:

@@ -239,6 +239,21 @@ def test_arm_is_not_damped_when_hold_succeeds():
     assert (len(holds), arm.torques) == (5, [])
 
 
+@pytest.mark.parametrize("answer", [True, None])
+def test_arm_is_damped_when_hold_has_no_effect(answer):
+    arm = MovingArm(HoldingDriver())
+    arm.driver.hold = lambda: answer
+    read = arm.driver.read
+    arm.driver.read = lambda: MALFORMED_STATUS
+    arm.advance()
+    arm.driver.read = read
+    arm.advance(round(0.1 / PERIOD) - 1)
+    assert (arm.fault, arm.arm_state) == (Fault.MALFORMED, ArmState.DAMPING)
+    assert arm.speed < 0.15
+    arm.advance(DAMPING_STEPS)
+    assert (arm.arm_state, arm.speed < 0.05) == (ArmState.OFF, True)
+
+
 @pytest.mark.parametrize("method", ["read", "receive"])
 def test_take_over_does_not_wait_when_a_read_fails(method):
     """`start` would wait for the robot, or raise an error, while the arm moves."""

@@ -135,7 +135,7 @@ def test_heartbeats_of_two_monitors_do_not_displace_each_other():
 def test_older_heartbeat_does_not_replace_a_newer_heartbeat():
     programs = TwoPrograms()
     for number, sequence in ((1, 5), (0, 4)):
-        programs.second.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7))
+        programs.second.lcm.Publish(IiwaDriver.heartbeat_channel(number), HEARTBEAT_FORMAT.pack(sequence, True, 7, -1))
         programs.read()
     assert programs.driver.read_heartbeats() == (Heartbeat(5, True, 7),)
 

@@ -14,7 +14,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support.drake_multibody import JointDynamics
 from guiderail_hardware.drivers.driver import safety_limits, torque_tolerance
 from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver
-from guiderail_hardware.models.joint_status import MAX_MISSED_MESSAGES, Fault, JointStatus, damping_torque
+from guiderail_hardware.models.joint_status import HOLD_TIME, MAX_MISSED_MESSAGES, Fault, JointStatus, damping_torque
 from guiderail_hardware.monitor import MAX_REPEATS, MonitorState, SafetyMonitor
 from guiderail_hardware.systems.torque_safety_limiter import ZERO_TORQUE_TIME
 
@@ -287,7 +287,7 @@ def test_heartbeats_have_sequence_and_sender_numbers(arm):
     first.advance(3)
     second.advance(1)
     sent = [HEARTBEAT_FORMAT.unpack(message) for message in first.heartbeats]
-    assert [sequence for sequence, _, _ in sent] == [1, 2, 3]
+    assert [sequence for sequence, *_ in sent] == [1, 2, 3]
     assert len({sender for _, _, sender in sent}) == 1
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
 
@@ -466,6 +466,56 @@ def test_monitor_calls_hold_after_a_status_fault(arm):
     bus.commands.clear()
     bus.advance(MAX_MISSED_MESSAGES + 2)  # a missing command is no status fault, so the arm is damped
     assert (len(holds) <= 3 + round(0.5 / PERIOD), len(bus.commands)) == (True, 2)
+
+
+def test_arm_is_damped_when_hold_has_no_effect(arm):
+    class DeafDriver(IiwaDriver):
+        can_hold = True
+
+        def hold(self):
+            return True
+
+    bus = Bus(arm, velocity=1.2 * VELOCITY)
+    bus.monitor = SafetyMonitor(DeafDriver(bus.lcm), bus.plant, bus.limits, clock=lambda: bus.now)
+    bus.start_watching()
+    bus.torque = np.zeros(7)
+    initial_speed = bus.speed
+    bus.advance(1, status=b"noise")
+    bus.advance(round(HOLD_TIME / PERIOD) - 3)
+    assert (bus.commands, bus.monitor.state) == ([], MonitorState.DAMPING)
+    bus.advance(round(0.05 / PERIOD) + 3)
+    assert bus.commands
+    assert bus.speed < 0.15 < initial_speed
+
+
+def test_second_robot_is_not_adopted_while_the_commander_pauses(arm):
+    """Damping its velocity would accelerate the arm at rest."""
+    bus = Bus(arm, velocity=np.zeros(7))
+    bus.advance(100)
+    bus.advance(20, command=True)
+    bus.advance(100)
+    assert (bus.monitor.state, bus.monitor.fault) == (MonitorState.IDLE, Fault.NONE)
+    speed = 1.0
+    for step in range(round(0.6 / PERIOD)):
+        positions = (bus.positions + speed * step * PERIOD).tolist()
+        other = {"joint_position_measured": positions, "joint_velocity_estimated": [speed] * 7}
+        bus.advance(1, utime=round((500.0 + step * PERIOD) * 1e6), **other)
+    bus.commands.clear()
+    bus.velocities = np.zeros(7)
+    for step in range(round(0.6 / PERIOD), round(0.9 / PERIOD)):
+        positions = (bus.positions + speed * step * PERIOD).tolist()
+        other = {"joint_position_measured": positions, "joint_velocity_estimated": [speed] * 7}
+        bus.advance(1, command=step % 20 == 0, utime=round((500.0 + step * PERIOD) * 1e6), **other)
+    assert bus.monitor.fault != Fault.NONE
+    sent = [torque for torque in bus.commands if not np.allclose(torque, PUSH)]
+    assert sent
+    np.testing.assert_allclose(sent, 0.0, atol=1e-9)
+
+
+def test_heartbeat_reports_the_newest_command(arm):
+    bus = Bus(arm).start_watching()
+    bus.advance(1)
+    assert HEARTBEAT_FORMAT.unpack(bus.heartbeats[-1])[3] == round(1e6 * (bus.now - PERIOD))
 
 
 def test_monitor_raises_when_the_driver_is_not_usable(arm):

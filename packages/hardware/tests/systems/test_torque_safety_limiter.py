@@ -514,7 +514,7 @@ def test_zero_torque_is_sent_for_the_zero_torque_time(plant, steps, is_sending):
 def test_sending_ends_just_after_the_zero_torque_time(plant, seconds, is_sending):
     rig = Rig(plant)
     rig.set(status_fault=[Fault.STALE])
-    rig.context.SetDiscreteState(np.array([ArmState.OFF, Fault.STALE, seconds, 0.0]))
+    rig.context.SetDiscreteState(np.array([ArmState.OFF, Fault.STALE, seconds, 0.0, 0.0, 0.0]))
     assert rig["is_sending"][0] == is_sending
 
 
@@ -527,6 +527,7 @@ def test_driver_holds_the_arm_after_a_status_fault(plant, fault):
     rig.advance(PERIOD)
     rig.set(status_fault=[0.0])
     assert (rig["is_holding"][0], rig.arm_state) == (1.0, ArmState.DAMPING)
+    rig.set(velocity=np.zeros(len(LIMITS.velocity)))
     rig.advance(LIMITS.damping_time + 2 * PERIOD)
     assert (rig["is_holding"][0], rig.arm_state) == (1.0, ArmState.OFF)
     rig.system.resume(rig.context)

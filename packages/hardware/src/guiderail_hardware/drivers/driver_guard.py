@@ -11,6 +11,7 @@ from pydrake.math import RigidTransform
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.models.joint_status import MALFORMED_STATUS, Fault, Heartbeat, JointStatus, parse_status
 from guiderail_hardware.models.robot_impedance import RobotImpedance
+from guiderail_hardware.models.round_trip import RoundTrip
 
 ERRORS = (Exception, SystemExit)  # exceptions of a driver that must not end the control of an arm
 
@@ -27,11 +28,15 @@ class DriverGuard:
         read_error: Newest exception of receiving or reading, in words; empty if there was none.
         command_error: Newest exception of a command, in words; empty if there was none.
         num_failed_commands: Number of commands that raised an exception.
+        round_trip: Round trip of the torques that stations send.
     """
 
     def __init__(self, driver: Any):
         self._driver = driver
         self.num_failed_commands = 0
+        self.round_trip = RoundTrip()
+        self._heartbeats: tuple[Heartbeat, ...] = ()  # heartbeats of the last check
+        self._now = 0.0  # local time of the station's last check [s]
         self.forget_errors()
 
     def forget_errors(self) -> None:
@@ -41,6 +46,7 @@ class DriverGuard:
         self._is_failing = False  # the last command failed
         self._has_recovered = False  # a command succeeded after a failed one
         self._answer: object = None  # result of the last command
+        self._has_refused_hold = False
 
     @property
     def error(self) -> str:
@@ -91,12 +97,24 @@ class DriverGuard:
             return ()
         return heartbeats
 
+    def measure_round_trip(self, heartbeats: tuple[Heartbeat, ...], clock: float | None) -> float:
+        """Return the round trip at a station's check [s]; NaN if it is unknown.
+
+        The heartbeats are the newest ones. Without a `clock` [s], the check counts as one period after the last one.
+        """
+        self._now = self._now + self._driver.period if clock is None else clock
+        if heartbeats != self._heartbeats:  # otherwise the monitor is silent, which is another fault
+            self.round_trip.update([heartbeat.command for heartbeat in heartbeats], self._now)
+        self._heartbeats = heartbeats
+        return self.round_trip.seconds
+
     def configure(self, impedance: RobotImpedance) -> None:
         """Call `PoseDriver.configure`; an exception counts as a failed command."""
         self._command("configure", impedance)
 
     def write(self, torque: np.ndarray, time: float) -> bool:
         """Send torques (n,) [Nm] with their time [s]; return False if the driver raises an exception."""
+        self.round_trip.add_command(time, self._now)
         return self._command("write", torque, time)
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
@@ -115,9 +133,16 @@ class DriverGuard:
         """Hold the arm; return False if the driver returns False or raises an exception, so that torques are sent."""
         has_failed = self._has_failed_command, self._is_failing
         if self._command("hold"):
-            return self._answer is not False
-        self._has_failed_command, self._is_failing = has_failed  # only failed torques count
-        return False
+            self._has_refused_hold = self._answer is False
+        else:
+            self._has_failed_command, self._is_failing = has_failed  # only failed torques count
+            self._has_refused_hold = True
+        return not self._has_refused_hold
+
+    def take_refusal(self) -> bool:
+        """Return True if the driver refused to hold the arm since the last call."""
+        has_refused, self._has_refused_hold = self._has_refused_hold, False
+        return has_refused
 
     def recover(self) -> None:
         """Clear an error of the robot while the arm is at rest.

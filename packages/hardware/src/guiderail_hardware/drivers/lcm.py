@@ -6,7 +6,7 @@ import secrets
 import struct
 import time as wall_time
 from collections import deque
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import partial
 from ipaddress import IPv4Address
 from typing import Any, ClassVar
@@ -18,7 +18,13 @@ from pydrake.lcm import DrakeLcm, DrakeLcmInterface
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail_hardware.drivers.driver import STATUS_PERIOD, CommandCallback, Driver, register_driver
-from guiderail_hardware.models.joint_status import MALFORMED_STATUS, MAX_SENDERS, Heartbeat, JointStatus
+from guiderail_hardware.models.joint_status import (
+    MALFORMED_STATUS,
+    MAX_MISSED_MESSAGES,
+    MAX_SENDERS,
+    Heartbeat,
+    JointStatus,
+)
 from guiderail_hardware.models.message_sequence import StatusSequence
 from guiderail_hardware.systems.heartbeat_monitor import FORGET_TIME
 
@@ -27,7 +33,7 @@ MAX_WAIT = 3600.0  # longest wait for messages [s]; LCM counts milliseconds in 3
 MICROSECOND = 1e-6  # unit of a message's time [s]
 HEAD_FORMAT = ">8sq"  # first fields of a status or command: message type, time [µs]
 HEAD_SIZE = struct.calcsize(HEAD_FORMAT)
-HEARTBEAT_FORMAT = struct.Struct(">q?q")
+HEARTBEAT_FORMAT = struct.Struct(">q?qq")
 # A safety monitor counts as ended if more than this number of other monitors' heartbeats arrived after its own last
 # heartbeat. `MAX_SENDERS` monitors send this number of heartbeats in `FORGET_TIME`.
 MAX_HEARTBEATS_MISSED = MAX_SENDERS * round(FORGET_TIME / STATUS_PERIOD)
@@ -219,7 +225,7 @@ class LcmDriver(Driver):
         if self._number in used:
             # Two monitors on one channel both change it: with a fixed rule they would choose the same channel again.
             self._number = secrets.choice(sorted(set(range(MAX_SENDERS)) - used) or [self._number])
-        message = HEARTBEAT_FORMAT.pack(heartbeat.sequence, heartbeat.is_stopping, heartbeat.sender)
+        message = HEARTBEAT_FORMAT.pack(*astuple(heartbeat))
         self.lcm.Publish(self.heartbeat_channel(self._number), message)
 
     def __str__(self) -> str:
@@ -229,6 +235,8 @@ class LcmDriver(Driver):
     def _on_status(self, message: bytes) -> None:
         status = self.decode(message)
         self._sequence.add(status)
+        if self._status is not None and 0.0 < self._status.time - status.time <= MAX_MISSED_MESSAGES * self.period:
+            status = self._status  # an older status has been overtaken
         self._status = replace(status, conflicts=self._sequence.num_conflicts, foreign_commands=self._num_contested)
         self.statuses.add(message)
         self.num_statuses = self.statuses.count

@@ -9,6 +9,8 @@ import numpy as np
 from guiderail.models.common.errors import InputError
 
 MAX_SENDERS = 8  # largest number of safety monitors whose heartbeats are distinguished
+HOLD_TIME = 0.05  # time in which a driver that holds the arm must halve its speed [s]
+HELD_SPEED = 0.05  # joint speed below which a driver holds the arm [rad/s]
 MAX_MISSED_MESSAGES = 6  # number of periods without a status message after which the arm is stopped
 
 
@@ -21,6 +23,22 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
     exp(−h / T). M (n, n) is the mass matrix, and T the decay time [s].
     """
     return (M @ v) * (np.expm1(-period / decay_time) / period)
+
+
+def is_hold_ineffective(speed: float, initial_speed: float, elapsed: float, age: float, *, period: float) -> bool:
+    """Return True if an arm that its driver should hold still moves.
+
+    After `HOLD_TIME`, the speed must be below half of the initial one or `HELD_SPEED`. Without a fresh status the speed
+    is unknown, and the result False.
+
+    Args:
+        speed: Largest joint speed [rad/s].
+        initial_speed: Largest joint speed when the driver was asked to hold the arm [rad/s].
+        elapsed: Time since then [s].
+        age: Age of the status with the speed [s].
+        period: Period of the statuses [s].
+    """
+    return elapsed >= HOLD_TIME and age <= 2.0 * period and speed > max(0.5 * initial_speed, HELD_SPEED)
 
 
 class Fault(IntEnum):
@@ -64,9 +82,10 @@ class Fault(IntEnum):
     SECOND_COMMANDER = 23, "another program commands the arm as well"
     INITIALIZED = 24, "the simulation was initialized while it controlled the arm"
     COMMAND_FAILED = 25, "a command could not be sent to the robot"
+    ROUND_TRIP = 26, "commands or statuses are later than the impedance tolerates: a constant delay on the network"
 
 
-STATUS_FAULTS = tuple(fault for fault in Fault if Fault.NONE < fault <= Fault.CLOCK_RATE)
+STATUS_FAULTS = (*(fault for fault in Fault if Fault.NONE < fault <= Fault.CLOCK_RATE), Fault.ROUND_TRIP)
 """Faults after which the robot's state is uncertain."""
 
 
@@ -80,6 +99,7 @@ class JointStatus:
     external_torque: np.ndarray  # external joint torques, (n,) [Nm]
     conflicts: int = 0  # number of messages so far that contradict their predecessors, as with two robots on a channel
     foreign_commands: int = 0  # number of commands so far that cannot be from the program that commands the arm
+    round_trip: float = np.nan  # time from a command to the report of its arrival [s]; NaN if it is unknown
 
     def __deepcopy__(self, memo: object) -> "JointStatus":
         """Return the same immutable object, because Drake copies abstract values often."""
@@ -102,6 +122,7 @@ class Heartbeat:
     sequence: int  # sequence number, larger in each message
     is_stopping: bool  # True while the monitor stops the arm
     sender: int = 0  # random number of the monitor's process
+    command: int = -1  # time stamp of the newest command that has arrived [µs]; −1 if unknown
 
     def __deepcopy__(self, memo: object) -> "Heartbeat":
         """Return the same immutable object."""
@@ -124,7 +145,9 @@ def parse_status(value: object) -> JointStatus | None:
     if not isinstance(value, JointStatus):
         return MALFORMED_STATUS
     try:
-        scalars = [_to_numbers(number) for number in (value.time, value.conflicts, value.foreign_commands)]
+        scalars = [
+            _to_numbers(number) for number in (value.time, value.conflicts, value.foreign_commands, value.round_trip)
+        ]
         if any(scalar.ndim for scalar in scalars):
             return MALFORMED_STATUS
         return JointStatus(
@@ -134,6 +157,7 @@ def parse_status(value: object) -> JointStatus | None:
             _to_numbers(value.external_torque),
             int(scalars[1]),
             int(scalars[2]),
+            float(scalars[3]),
         )
     except Exception:  # objects of a driver can raise any error
         return MALFORMED_STATUS
@@ -167,12 +191,15 @@ class StatusLimits:
     settling_time: float = 0.25
     clock_drift: float = 1e-3  # largest drift between the two clocks [s/s]; a slower drift is no fault
     max_check_interval: float = 0.03  # largest wall-clock time between two checks before a deadline is missed [s]
+    max_round_trip: float = np.inf  # longest round trip that the impedance tolerates (`max_round_trip`) [s]
 
     def __post_init__(self) -> None:
         positive = (*self.velocity, self.max_age, self.max_lead, self.position_jump, self.velocity_jump)
         positive += (self.max_check_interval, self.position_tolerance, self.velocity_noise)
         if not self.velocity or not all(0.0 < value < np.inf for value in positive):
             raise InputError("the limits of a robot's status must be positive")
+        if not self.max_round_trip > 0.0:
+            raise InputError(f"the longest round trip of a robot must be positive, not {self.max_round_trip} s")
         if not all(0.0 <= value < np.inf for value in (self.settling_time, self.clock_drift)):
             raise InputError("a robot's settling time and its clock's drift must be finite and not negative")
 

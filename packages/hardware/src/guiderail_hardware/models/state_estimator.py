@@ -49,7 +49,21 @@ DELAY = 2.0  # largest time from a command or a contact to its effect on torques
 REACTION = 1.5  # accepted change of velocity that no torque explains, relative to the measured change
 MAX_BIAS = 6.0  # largest learned bias of a torque, in torque tolerances
 BIAS_TIME, REST_BIAS_TIME = 1.0, 0.05  # time constants of the learned bias with and without commanded torque [s]
+SCALE_WINDOW, MAX_EXCESS = (
+    0.1,
+    0.35,
+)  # decay time and largest share of statuses with a larger impulse than commanded [s]
+PULSE_WINDOW = 0.02  # decay time of the largest commanded impulse, longer than the delay of its effect [s]
+MAX_SCALE_ERROR = 0.35  # largest relative error of a torque in effect
+# Signs of another robot or clock on the channel. Afterwards a status is only accepted if the prediction explains it,
+# until for `SOURCE_TIME` [s] all statuses have come from one source, an arm at rest in the last accepted posture.
+SOURCE_FAULTS = (Fault.OUT_OF_ORDER, Fault.FUTURE, Fault.CONFLICT)
+SOURCE_TIME = 1.0
+SOURCE_SPEED, SOURCE_DISTANCE = 0.05, 0.1  # largest speed [rad/s], and distance from the accepted positions [rad]
 MAX_PREDICTION_TIME = 0.1  # age of the accepted status above which the velocity is unknown [s]
+
+
+NUM_SCALARS = 13  # number of scalars of `EstimatorState`, which precede its vectors
 
 
 @dataclass(frozen=True)
@@ -61,6 +75,8 @@ class EstimatorState:
     fault: float  # last fault, a code of `Fault`; `NONE` after the settling time
     fault_time: float  # local time of that fault [s]
     doubt_time: float  # local time of the last fault that put statuses in doubt [s]; NaN if none
+    # Local time of the last sign of another robot or clock, or of an arm that has moved since then [s]; NaN if none
+    source_time: float
     early: float  # sum of the recent corrections of the clock offset for early statuses [s]
     conflicts: float  # `JointStatus.conflicts` of the last status
     foreign_commands: float  # `JointStatus.foreign_commands` of the last status
@@ -90,26 +106,40 @@ class EstimatorState:
     tolerance: np.ndarray
     bias: np.ndarray  # learned constant error of the torques, (n,) [Nm]
     drift: np.ndarray  # like `residual`, with the decay time `DRIFT_WINDOW`, (n,) [rad]
+    pulse: np.ndarray  # impulse of the commanded torques since the last status, (n,) [Nms]
+    other_pulse: np.ndarray  # impulse of all other torques since the last status, (n,) [Nms]
+    pulse_error: np.ndarray  # largest error of the two together, (n,) [Nms]
+    largest_pulse: np.ndarray  # size of the largest recent `pulse`, (n,) [Nms]
+    excess: np.ndarray  # recent share of statuses with a larger impulse than the torques explain, (n,)
 
     @classmethod
     def initial(cls, num_joints: int) -> "EstimatorState":
         """Return the state before the first check."""
-        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
-        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((15, num_joints)))
+        scalars = (0.0, 0.0, float(Fault.NO_STATUS), 0.0, np.nan, np.nan, 0.0, 0.0, 0.0, np.nan, 0.0, np.nan, 0.0)
+        num_vectors = len(fields(cls)) - NUM_SCALARS - 2
+        return cls(*scalars, *np.zeros((2, 3 * num_joints)), *np.zeros((num_vectors, num_joints)))
 
     @classmethod
     def from_vector(cls, vector: np.ndarray, num_joints: int) -> "EstimatorState":
         """Return the state from the result of `vector`."""
-        values, vectors = np.split(vector[12:], [6 * num_joints])
-        return cls(*vector[:12].tolist(), *values.reshape(2, -1), *vectors.reshape(15, -1))
+        values, vectors = np.split(vector[NUM_SCALARS:], [6 * num_joints])
+        return cls(*vector[:NUM_SCALARS].tolist(), *values.reshape(2, -1), *vectors.reshape(-1, num_joints))
 
     def vector(self) -> np.ndarray:
-        """Return the state as one vector, (12 + 21 n,)."""
+        """Return the state as one vector, (13 + 26 n,)."""
         return np.concatenate([np.atleast_1d(getattr(self, field.name)) for field in fields(self)])
 
     def shifted(self, seconds: float) -> "EstimatorState":
         """Return the state with all local times later, after a jump of the local clock [s]."""
-        names = ("check_time", "receipt_time", "fault_time", "doubt_time", "last_offset", "accepted_offset")
+        names = (
+            "check_time",
+            "receipt_time",
+            "fault_time",
+            "doubt_time",
+            "source_time",
+            "last_offset",
+            "accepted_offset",
+        )
         return replace(self, **{name: getattr(self, name) + seconds for name in names})
 
     @property
@@ -159,7 +189,9 @@ class StateEstimator:
     velocity, limited to the interval of the other two sources, widened by the velocity noise.
 
     The clocks are synchronized with the first status. Afterwards the clock offset follows early statuses quickly and
-    late statuses slowly. After a fault or a timeout the clocks are synchronized again. Delays of this program are not
+    late statuses slowly. After a fault or a timeout the clocks are synchronized again. After a sign of a second robot
+    (`SOURCE_FAULTS`), statuses are used again when they have come from one source for `SOURCE_TIME`, an arm at rest in
+    the last accepted posture. Delays of this program are not
     attributed to the robot; a delay that is too long is reported as `DEADLINE_MISSED`, and so is a jump of the local
     clock that the robot's clock does not show. After a jump the velocity remains known.
 
@@ -182,7 +214,7 @@ class StateEstimator:
             raise InputError("the torque tolerances of a robot must be positive and finite")
         if not 0.0 < period < np.inf:
             raise InputError(f"the period of an estimator must be positive, not {period} s")
-        self._zeros = np.zeros(n)
+        self._zeros, self._velocity_noise = np.zeros(n), np.full(n, limits.velocity_noise)
         self._positions, self._velocities, self._torques = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
 
     def evaluate(
@@ -205,7 +237,7 @@ class StateEstimator:
         if jump:
             before = before.shifted(jump)
         state = self._predict(before, now, M, drag)
-        is_doubted = np.isfinite(before.doubt_time)
+        is_doubted = np.isfinite(before.doubt_time) or np.isfinite(before.source_time)
         is_trusted = not is_doubted or (status is not None and self._agrees(status, state, now))
         last = before.accepted if is_doubted and is_trusted else before.last
         fault = self._find_fault(before, last, status, now) or (Fault.DEADLINE_MISSED if jump else Fault.NONE)
@@ -216,7 +248,9 @@ class StateEstimator:
         is_reordered = status.time <= last.time and fault in ACCEPTABLE_FAULTS
         if is_reordered or (status.time == last.time and np.array_equal(values, last.values)):
             return self._finish(state, before, fault, now)
-
+        # The return of the first robot is a sign of a second one as well.
+        is_other = {fault, self._find_fault(before, before.last, status, now)} & set(SOURCE_FAULTS)
+        state, fault = self._check_source(state, values, now, fault, is_trusted=is_trusted, is_other=bool(is_other))
         if fault == Fault.CONFLICT and not is_doubted:
             # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
@@ -233,6 +267,7 @@ class StateEstimator:
             # The momentum sums start again at this status.
             is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
+        state = replace(state, pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
         fault = fault or self._find_contradiction(state, M)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
@@ -310,6 +345,9 @@ class StateEstimator:
             predicted=before.predicted + step * net,
             commanded=before.commanded + step * (net - external),
             tolerance=before.tolerance + step * (error + DELAY * before.variation),
+            pulse=before.pulse + step * before.torque,
+            other_pulse=before.other_pulse + step * (net - before.torque),
+            pulse_error=before.pulse_error + step * error,
             variation=self._zeros,
         )
 
@@ -320,9 +358,30 @@ class StateEstimator:
                 return Fault.CONFLICT
             if status.foreign_commands > before.foreign_commands:
                 return Fault.SECOND_COMMANDER
+            if status.round_trip > self._limits.max_round_trip:
+                return Fault.ROUND_TRIP
         if not fault and now - before.check_time > self._limits.max_check_interval:
             return Fault.DEADLINE_MISSED
         return fault
+
+    def _check_source(
+        self, state: EstimatorState, values: np.ndarray, now: float, fault: Fault, *, is_trusted: bool, is_other: bool
+    ) -> tuple[EstimatorState, Fault]:
+        """Return the state after a status that may be from another robot, and the fault.
+
+        After one of `SOURCE_FAULTS` the fault is repeated until the statuses have come from one source for
+        `SOURCE_TIME`. A robot at another posture, or in motion, is therefore never adopted.
+        """
+        if not (is_other or np.isfinite(state.source_time)):
+            return state, fault
+        is_moving = (np.abs(values[self._velocities]) > SOURCE_SPEED).any()
+        distance = np.abs(values[self._positions] - state.accepted_values[self._positions]).max()
+        is_elsewhere = np.isfinite(state.accepted_time) and distance > SOURCE_DISTANCE
+        if is_other or (not is_trusted and (is_moving or is_elsewhere)):
+            state = replace(state, source_time=now)
+        if now - state.source_time > SOURCE_TIME:
+            return replace(state, source_time=np.nan), fault
+        return state, fault if fault or is_trusted else Fault(int(state.fault)) or Fault.CONFLICT
 
     def _agrees(self, status: JointStatus, state: EstimatorState, now: float) -> bool:
         """Return True if a status is valid and fresh relative to the accepted one, and its velocity is as predicted."""
@@ -370,6 +429,9 @@ class StateEstimator:
     ) -> EstimatorState:
         decay, share = np.exp(-elapsed / MOMENTUM_WINDOW), elapsed / (MOMENTUM_WINDOW * BIAS_TIME)
         predicted, measured = decay * state.predicted, decay * (state.measured + M @ change)
+        largest = np.maximum(np.abs(state.pulse), np.exp(-elapsed / PULSE_WINDOW) * state.largest_pulse)
+        allowed = (1.0 + MAX_SCALE_ERROR) * largest + state.pulse_error + np.abs(M) @ self._velocity_noise
+        is_excessive = np.abs(M @ change - state.other_pulse) > allowed
         return replace(
             state,
             predicted=predicted,
@@ -378,6 +440,8 @@ class StateEstimator:
             reaction=np.exp(-elapsed / REACTION_WINDOW) * (state.reaction + np.abs(change)),
             tolerance=decay * state.tolerance,
             bias=self._limited_bias(state.bias - share * (predicted - measured)),
+            largest_pulse=largest,
+            excess=is_excessive + np.exp(-elapsed / SCALE_WINDOW) * (state.excess - is_excessive),
         )
 
     def _update_rest(self, state: EstimatorState, change: np.ndarray) -> EstimatorState:
@@ -385,7 +449,7 @@ class StateEstimator:
         bias = self._limited_bias(state.bias - (state.predicted - change) / REST_BIAS_TIME)
         zero = self._zeros
         state = replace(state, bias=bias, predicted=zero, commanded=zero, measured=zero)
-        return replace(state, reaction=zero, tolerance=zero)
+        return replace(state, reaction=zero, tolerance=zero, excess=zero)
 
     def _limited_bias(self, bias: np.ndarray) -> np.ndarray:
         limit = MAX_BIAS * self._torque_tolerance
@@ -416,7 +480,9 @@ class StateEstimator:
         deviation = np.abs(inverse @ (state.predicted - state.measured))
         reaction = np.minimum(REACTION * state.reaction, limits.velocity_jump)
         allowed = limits.velocity_noise + np.abs(inverse) @ state.tolerance + reaction
-        return Fault.NOT_REACTING if (deviation > allowed).any() else Fault.NONE
+        if (deviation > allowed).any() or (state.excess > MAX_EXCESS).any():
+            return Fault.NOT_REACTING
+        return Fault.NONE
 
     def _synchronize(
         self, state: EstimatorState, offset: float, measured: float, now: float, fault: Fault
@@ -451,7 +517,7 @@ class StateEstimator:
         state = replace(state, check_time=check_time)
         if fault:
             state = replace(state, fault=float(fault), fault_time=now)
-        elif check_time - state.fault_time > self._limits.settling_time:
+        elif check_time - state.fault_time > self._limits.settling_time and not np.isfinite(state.source_time):
             state = replace(state, fault=float(Fault.NONE))
         if fault and fault not in DROPPED_FAULTS and fault not in ACCEPTABLE_FAULTS:
             state = replace(state, doubt_time=now)

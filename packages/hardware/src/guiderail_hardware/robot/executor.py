@@ -138,7 +138,7 @@ class SkillExecutor:
         self._simulator = start_simulator(self._station, self._clock, self._max_wrench)
         log(f"taking over, and approaching the start at {SPEED / MM:.0f} mm/s")
         try:
-            outcome = self._approach()
+            outcome = self._approach(log)
             if outcome is None:
                 log(f"executing {self._task.name}")
                 outcome = self._execute()
@@ -204,7 +204,7 @@ class SkillExecutor:
             return Outcome(Fault.FORCE_LIMIT, f"pushed with {force:.0f} N, more than the task's {limit:.0f} N", 0)
         return None
 
-    def _approach(self) -> Outcome | None:
+    def _approach(self, log: Log) -> Outcome | None:
         """Take control where the arm is, and move to the start; return the outcome if the arm was stopped."""
         station, context = self._station, self._simulator.get_mutable_context()
         desired_pose = station.get_desired_pose_input_port()
@@ -217,6 +217,8 @@ class SkillExecutor:
             if elapsed > BLEND_TIMEOUT:
                 fault = Fault(int(station.get_fault_output_port().Eval(context)[0]))
                 return Outcome(fault, f"could not take over: {describe_stop(fault, station.driver)}", 0)
+        if text := station.describe_round_trip():
+            log(text)
         pose = station.get_pose_output_port().Eval(context).copy()
         for command in slow_approach(pose, self._start, self._skill.control_period):
             desired_pose.FixValue(context, command)

@@ -233,6 +233,13 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
         torque_share, torques, hint = torque_shares.max(), f"at most {_numbers(limits.torque, 1)} Nm sent", ""
         payload_set_by = "must be configured on the robot"
     has_monitor = station.has_safety_monitor(context)
+    round_trip = f"at most {1e3 * station.status_limits.max_round_trip:.1f} ms, "
+    if isinstance(driver, PoseDriver):
+        round_trip = "not measured: the robot's own program runs the impedance"
+    elif has_monitor:
+        round_trip += "measured while the controller takes over, before the arm moves"
+    else:
+        round_trip += "not measured, because no safety monitor reports commands: measure it"
     if driver.has_command_timeout:
         monitor = "not needed: this driver stops the arm when commands stop"
     elif has_monitor:
@@ -242,6 +249,7 @@ def check_robot(station: HardwareStation, context: Context, start: np.ndarray, n
     return [
         Check("robot", f"{station.robot.name}, {len(positions)} joints, {driver}", True),
         Check("monitor", monitor, driver.has_command_timeout or has_monitor),
+        Check("round trip", round_trip),
         Check(
             "joints",
             f"{np.rad2deg(positions).round(1).tolist()} degrees",

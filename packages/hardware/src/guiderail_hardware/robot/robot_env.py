@@ -120,6 +120,7 @@ class RobotEnv(DiagramEnv):
         self.preflight = PreflightChecks(self._transfer_station, clock, self._start, self._steps, max_wrench)
         self._last_transfer: Simulator | None = None
         self._return_path: list[np.ndarray] = []  # poses (6,) of the motion back; the last is next
+        self._has_shown_round_trip = False
         self._must_be_freed = ""  # reason why the workpiece has to be released by hand before the arm resumes
         self.fault = Fault.NONE
 
@@ -376,6 +377,9 @@ class RobotEnv(DiagramEnv):
             if elapsed > RESUME_TIMEOUT:
                 reason = describe_stop(self._active_fault, self._station.driver)
                 raise InputError(f"the arm can't be taken over: {reason}")
+        if not self._has_shown_round_trip and (text := self._station.describe_round_trip()):
+            self._log(text)
+            self._has_shown_round_trip = True
 
     def _retry_until_ok(self, motion: Callable[[], Any]) -> None:
         """Retry `motion` until it completes without a stop."""

@@ -11,10 +11,11 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant
-from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault, damping_torque
+from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault, damping_torque, is_hold_ineffective
 
 # Indices into the discrete state [value of `ArmState`; code of the `Fault` that caused the last stop; time since the
-# last change to DAMPING or OFF in s; blend factor from 0 to 1].
+# last change to DAMPING or OFF in s; blend factor from 0 to 1; largest joint speed at the beginning of the stop in
+# rad/s; 1 if the driver does not hold the arm although it was asked to].
 _ARM_STATE, _BLEND_FACTOR = 0, 3
 
 ZERO_TORQUE_TIME = 0.05  # shortest time for which zero torque is sent after damping, even with a status fault [s]
@@ -92,7 +93,8 @@ class TorqueSafetyLimiter(LeafSystem):
     The output is always finite and within the torque limits. At zero torque, the robot only compensates its weight.
     After damping, zero torque is sent for `ZERO_TORQUE_TIME`, and then only while there is no status fault. If the
     driver can hold the arm by itself (brakes, position control), ``is_holding`` requests this after a fault of
-    `STATUS_FAULTS`.
+    `STATUS_FAULTS`, and ``safe_torque`` is zero meanwhile. A driver that refuses (`refuse_hold`), or whose arm does not
+    become slower (`is_hold_ineffective`), does not hold the arm: it is damped by torques.
 
     .. pydrake_system::
 
@@ -161,7 +163,7 @@ class TorqueSafetyLimiter(LeafSystem):
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._velocity_port = self.DeclareVectorInputPort("velocity", num_joints)
         self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
-        self._state = self.DeclareDiscreteState([ArmState.WAITING, Fault.NONE, 0.0, 0.0])
+        self._state = self.DeclareDiscreteState([ArmState.WAITING, Fault.NONE, 0.0, 0.0, 0.0, 0.0])
 
         self._plant_context = declare.plant_context(
             self, plant, self._estimated_state_port.Eval, [self._estimated_state_port]
@@ -206,15 +208,21 @@ class TorqueSafetyLimiter(LeafSystem):
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state == ArmState.WAITING:
             # Nothing to damp: no velocity has been accepted and no torque has been sent.
-            context.SetDiscreteState(self._state, [ArmState.OFF, fault, np.inf, 0.0])
+            context.SetDiscreteState(self._state, [ArmState.OFF, fault, np.inf, 0.0, 0.0, 0.0])
         elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
-            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
+            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0, self._speed(context), 0.0])
 
     def damp_again(self, context: Context) -> None:
         """Restart the damping of a stopped arm, after commands could not be sent; `context` is this system's."""
-        arm_state, fault, _, _ = self._state_of(context)
+        arm_state, fault, *_, is_refused = self._state_of(context)
         if arm_state in (ArmState.DAMPING, ArmState.OFF):
-            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0])
+            context.SetDiscreteState(self._state, [ArmState.DAMPING, fault, 0.0, 0.0, self._speed(context), is_refused])
+
+    def refuse_hold(self, context: Context) -> None:
+        """Damp a stopped arm by torques, because the driver refuses to hold it; `context` is this system's."""
+        arm_state, fault, state_time, *rest, _ = self._state_of(context)
+        if arm_state in (ArmState.DAMPING, ArmState.OFF):
+            context.SetDiscreteState(self._state, [arm_state, fault, state_time, *rest, 1.0])
 
     def resume(self, context: Context) -> None:
         """Resume after a stop, from the present pose of the arm; `context` is this system's.
@@ -228,7 +236,7 @@ class TorqueSafetyLimiter(LeafSystem):
         fault = self._present_fault.Eval(context)
         if fault:
             raise InputError(f"the arm can't resume yet: {fault.description}")
-        context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0])
+        context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0, 0.0, 0.0])
 
     def _state_of(self, context: Context) -> np.ndarray:
         return context.get_discrete_state().value(self._state)
@@ -265,10 +273,11 @@ class TorqueSafetyLimiter(LeafSystem):
 
     def _stop_at_initialization(self, context: Context, discrete_state: DiscreteValues) -> None:
         if self._state_of(context)[_ARM_STATE] in (ArmState.RAMPING, ArmState.RUNNING):
-            discrete_state.set_value(self._state, [ArmState.DAMPING, Fault.INITIALIZED, 0.0, 0.0])
+            speed = self._speed(context)
+            discrete_state.set_value(self._state, [ArmState.DAMPING, Fault.INITIALIZED, 0.0, 0.0, speed, 0.0])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        arm_state, fault, state_time, blend_factor = self._state_of(context)
+        arm_state, fault, state_time, blend_factor, speed, is_refused = self._state_of(context)
         state_time += self._period
         present_fault = self._present_fault.Eval(context)
         if arm_state == ArmState.WAITING:
@@ -277,18 +286,25 @@ class TorqueSafetyLimiter(LeafSystem):
         elif arm_state in (ArmState.RAMPING, ArmState.RUNNING):
             if present_fault:
                 arm_state, fault, state_time, blend_factor = ArmState.DAMPING, present_fault, 0.0, 0.0
+                speed, is_refused = self._speed(context), 0.0
             else:
                 blend_factor = min(blend_factor + self._period / self._limits.ramp_time, 1.0)
                 if arm_state == ArmState.RAMPING and blend_factor == 1.0:
                     arm_state = ArmState.RUNNING
+        elif self._is_holding(context) and is_hold_ineffective(
+            self._speed(context), speed, state_time, self._status_age_port.Eval(context)[0], period=self._period
+        ):
+            arm_state, state_time, is_refused = ArmState.DAMPING, 0.0, 1.0
         elif arm_state == ArmState.DAMPING and state_time >= self._limits.damping_time:
             arm_state, state_time = ArmState.OFF, 0.0
-        discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor])
+        discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor, speed, is_refused])
 
     def _safe_torque(self, context: Context) -> np.ndarray:
-        arm_state, _, _, blend_factor = self._state_of(context)
+        arm_state, _, _, blend_factor, *_ = self._state_of(context)
         is_active = arm_state in (ArmState.RAMPING, ArmState.RUNNING)
         torque = np.zeros(self._num_joints)
+        if self._is_holding(context):
+            return torque
         if is_active and not self._present_fault.Eval(context):
             torque = blend_factor * self._freshness(context) * self._torque_port.Eval(context)
             if blend_factor < 1.0:  # not while RUNNING, to avoid the evaluation of the inertia
@@ -297,6 +313,10 @@ class TorqueSafetyLimiter(LeafSystem):
             torque = self._damping_torque(context)
         torque = np.where(np.isfinite(torque), torque, 0.0)
         return np.clip(torque, -self._torque_limits, self._torque_limits)
+
+    def _speed(self, context: Context) -> float:
+        """Return the speed of the fastest joint [rad/s]; 0 if it is unknown."""
+        return float(np.nan_to_num(np.abs(self._velocity_port.Eval(context)), posinf=0.0).max())
 
     def _freshness(self, context: Context) -> float:
         return float(np.clip(2.0 - self._status_age_port.Eval(context)[0] / self._period, 0.0, 1.0))
@@ -310,22 +330,22 @@ class TorqueSafetyLimiter(LeafSystem):
         return damping_torque(M, velocity, self._limits.decay_time, period=self._period)
 
     def _fault(self, context: Context) -> float:
-        arm_state, fault, _, _ = self._state_of(context)
+        arm_state, fault, *_ = self._state_of(context)
         is_stopped = arm_state in (ArmState.DAMPING, ArmState.OFF)
         return float(fault if is_stopped else self._present_fault.Eval(context))
 
     def _is_sending(self, context: Context) -> float:
-        arm_state, _, state_time, _ = self._state_of(context)
+        arm_state, _, state_time, *_ = self._state_of(context)
         is_sending = arm_state in (ArmState.RAMPING, ArmState.RUNNING, ArmState.DAMPING)
         if arm_state == ArmState.OFF:
             is_sending = state_time <= ZERO_TORQUE_TIME or self._status_fault_port.Eval(context)[0] == Fault.NONE
         return float(is_sending)
 
     def _is_holding(self, context: Context) -> float:
-        arm_state, fault, _, _ = self._state_of(context)
+        arm_state, fault, *_, is_refused = self._state_of(context)
         if arm_state in (ArmState.RAMPING, ArmState.RUNNING):
-            fault = self._present_fault.Eval(context)
-        return float(self._can_hold and arm_state != ArmState.WAITING and fault in STATUS_FAULTS)
+            fault, is_refused = self._present_fault.Eval(context), False
+        return float(self._can_hold and not is_refused and arm_state != ArmState.WAITING and fault in STATUS_FAULTS)
 
     def _not_following(self, context: Context) -> float:
         has_timed_out = self._command_timed_out_port.Eval(context)[0] > 0.0
