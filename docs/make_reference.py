@@ -518,7 +518,7 @@ def workcells() -> str:
     from guiderail.diagrams.tasks.registry import TASKS
 
     page = (
-        "# Workcells and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns the object that a "
+        "# Workcells and stations\n\nA task names a station, and its `workcell()` returns the object that a "
         "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a "
         "workcell of another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
@@ -530,9 +530,9 @@ def workcells() -> str:
         )
     )
     page += table(["port", "size", "description"], rows)
-    tasks = {TASKS.get(name).workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    tasks = {TASKS.get(name).station_kind().workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
-        workcell = EnvConfig.resolve(task, {}).make_task().workcell()
+        workcell = EnvConfig.resolve(task, {}).declared.workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
         page += f"`{type(workcell).__module__}.{type(workcell).__name__}`.\n\n"
         if kind == "insertion":
@@ -546,7 +546,7 @@ def workcells() -> str:
         for name in stations_for(kind):
             if not STATIONS.get(name).is_simulated:
                 continue
-            station = make_station(EnvConfig.resolve(task, {"station": name}).make_task())
+            station = make_station(EnvConfig.resolve(task, {"station": name}))
             ports = (station.get_output_port(index) for index in range(station.num_output_ports()))
             sizes = {one.get_name(): one.size() for one in ports if one.get_data_type() == PortDataType.kVectorValued}
             rows.append((code(name), ", ".join(f"`{port}` {size}" for port, size in sizes.items())))

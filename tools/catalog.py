@@ -6,12 +6,15 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, prior_of, stations_of
 from guiderail.diagrams.envs.options import (
+    STANDARD,
     CommonOptions,
     Options,
     PrimitiveOptions,
+    TaskOptions,
     TemplateOptions,
+    choices_of,
     describe_options,
     option_fields,
 )
@@ -23,7 +26,6 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.plugins import find_plugins
 from guiderail.models.common.registry import Registry
@@ -72,13 +74,13 @@ def describe_task(name: str) -> dict[str, Any]:
     return {
         "description": _first_paragraph(declared),
         "environment": environment_id(name),
-        "guidance": possible_guidance(declared.provides()),
-        "stations": declared.stations(),
-        "rewards": list(declared.rewards),
-        "observations": list(declared.observations),
-        "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
+        "guidance": possible_guidance(prior_of(declared).provides),
+        "stations": stations_of(declared),
+        "rewards": list(choices_of(declared, "reward")),
+        "observations": list(choices_of(declared, "observation")),
+        "difficulties": {STANDARD: {}} | {level: dict(settings) for level, settings in declared.presets.items()},
         "defaults": {**declared.defaults, **declared.learner},
-        "options": describe_options(declared.Options),
+        "options": [row for row in describe_options(declared) if row["name"] not in TaskOptions.model_fields],
         "reset_options": describe_options(declared.Reset),
     }
 
@@ -110,7 +112,7 @@ def describe_task_groups(name: str) -> dict[str, dict[str, str]]:
     groups = dict.fromkeys(BASIC, "basic")
     for part in ("task", "disturbances", "station"):
         groups = dict.fromkeys(option_fields(type(parts[part])), part) | groups
-    for kind in map(STATIONS.get, TASKS.get(name).stations()):
+    for kind in map(STATIONS.get, stations_of(TASKS.get(name))):
         groups = dict.fromkeys(option_fields(kind.options or Options), "station") | groups
     result: dict[str, dict[str, str]] = {
         group: {} for group in ("basic", "task", "motion", "station", "disturbances", "difficulties", "reset")
@@ -152,11 +154,9 @@ def describe_task_options(name: str) -> dict[str, str]:
     config = EnvConfig.resolve(name, {})
     declared = TASKS.get(name)
     choices = {
-        "guidance": possible_guidance(declared.provides()),
-        "station": declared.stations(),
-        "reward": declared.rewards,
-        "observation": declared.observations,
-        "difficulty": tuple(declared.difficulties),
+        "guidance": possible_guidance(prior_of(declared).provides),
+        "station": stations_of(declared),
+        "difficulty": (STANDARD, *declared.presets),
     }
     texts = {}
     for model in (CommonOptions, *map(type, config.parts.values())):
@@ -172,11 +172,11 @@ def describe_task_options(name: str) -> dict[str, str]:
     for (name, choice, text), names in names_by_text.items():
         text = f"with {choice}={' or '.join(names)}: {text}"
         texts[name] = f"{texts[name]}; {text}" if name in texts else text
-    for difficulty, settings in declared.difficulties.items():
+    for difficulty, settings in declared.presets.items():
         if settings:
             pairs = ", ".join(f"{key}={_format_value(value)}" for key, value in settings.items())
             texts[f"difficulty={difficulty}"] = f"is the same as {pairs}"
-    if declared.rewards is Task.rewards:
+    if len(choices_of(declared, "reward")) == 1:
         texts["reward"] = "the task has a single reward without a name"
     reset = {f"reset: {row['name']}": row["description"] for row in describe_options(declared.Reset)}
     if not declared.has_held_out_distribution:

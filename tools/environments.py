@@ -120,7 +120,7 @@ def declared_models(task: str) -> list[type[Options]]:
 
     Options of guidance and stations whose package declares no plug-in for them are missing.
     """
-    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS, "Options")]
+    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS)]
     models += [PrimitiveOptions, TemplateOptions, Disturbances]
     models += [point.load() for kind in ("station_options", "guidance_options") for _, point in find_plugins(kind)]
     return list(dict.fromkeys(models))
@@ -145,12 +145,12 @@ def warn_of_deviation(config: Any) -> None:
     """
     from guiderail.models.primitives.fit import MIN_SHARE, estimated_share  # imports SciPy, which takes a second
 
-    declared = config.make_task()
-    if "demonstrations" not in declared.provides():
+    reference = config.reference()
+    if reference is None:
         return
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
-    share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
+    share = estimated_share(reference, kernel_from_options(values), **chosen)
     if share < MIN_SHARE:
         _LOGGER.warning(
             "without actions, %.0f%% of the steps stay within a standard deviation of the demonstrations: let "

@@ -14,6 +14,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.diagrams.envs.observation import Observed
 from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
@@ -79,11 +80,11 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     if len(policy.description["observation_shape"]) != 1 or "image_shape" in policy.description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     resolved = EnvConfig.resolve(config.task, config.environment)
-    task, prior = resolved.make_task(), make_prior_knowledge(resolved)
+    task, prior = resolved.declared, make_prior_knowledge(resolved)
     description: dict[str, Any] = {"task": config.task, "environment": dict(config.environment)}
     description["action_repeat"] = config.action_repeat
     observed = math.prod(policy.description["observation_shape"])
-    description["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size, observed)
+    description["observation"] = _observation(Observed.of(task.observe()), task.clip, prior.pose_size, observed)
     if len(description["observation"]) != observed:
         raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")
     for option, value in exported.items():
@@ -197,9 +198,10 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _observation(terms: Any, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
+def _observation(declared: Observed, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
     """Return the entries of the observation, each clip((value − center) / scale); there are `observed` of them."""
-    if not isinstance(terms, Sequence):
+    terms = declared.terms
+    if declared.camera is not None:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     sizes = [_size(term, pose_size) for term in terms]
     if sizes.count(1) and observed > sum(sizes):  # one signal whose size neither its name nor its scale tells

@@ -18,7 +18,6 @@ _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
 
 MAX_FILE_SIZE = 200_000_000  # largest CSV file [bytes]
-_MAX_HEADER = 100_000  # largest number of characters of a header
 _MAX_LIST = 1_000  # number of list elements that count as one row of a Parquet file
 MAX_ROWS = 20_000_000  # largest number of rows of Parquet files that are read together
 
@@ -48,17 +47,6 @@ def read_table(path: Path) -> pd.DataFrame:
         return pd.DataFrame({name: _parse_column(cells) for name, cells in zip(header, columns, strict=True)})
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is not a table of episodes: restore it, or train again") from error
-
-
-def read_columns(path: Path) -> list[str]:
-    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8."""
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return next(csv.reader([file.readline(_MAX_HEADER)], strict=True), [])
-    except (UnicodeError, csv.Error):
-        return []
-    except OSError as error:
-        raise InputError(f"the table '{path}' can't be read ({error.strerror}): check the path") from error
 
 
 def _parse_column(cells: Sequence[str]) -> pd.Series:

@@ -85,9 +85,9 @@ class DiagramEnv(DrakeGymEnv):
     `info` has, at every step and at a reset, `is_success`, `termination` (a `Termination`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `impedance_force` and
     `contact_force` (maxima of the step [N]; the first is 0 without an impedance), `cost` (number of unsafe control
-    steps, see `EpisodeTrace.unsafe`), `fallback` (True if guidance fell back to a safe command), every reward term by name (summed over the step), and `control_steps` since the
-    reset. Here a step is a call of `step`, with all its control steps. The `info` of a reset also has the values that
-    the task sampled.
+    steps of the step, see `EpisodeTrace.unsafe`), `fallback` (True if guidance fell back to a safe command), every
+    reward term by name (summed over the step), and `control_steps` since the reset. Here a step is a call of `step`,
+    with all its control steps. The `info` of a reset also has the values that the task sampled.
 
     An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
 

@@ -1,6 +1,6 @@
 """Pouring station: an arm under Cartesian position control with a thermos and balls, and a mug on a table."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -147,14 +147,17 @@ class PouringStation(Station):
     """
 
     wraps_angles = True
+    pushable = False  # the balls in the thermos would not move with the robot
 
-    def __init__(self, config: PouringConfig):
-        """Construct the station.
+    def __init__(self, config: PouringConfig, control_period: float | None = None):
+        """Construct the station; a `control_period` [s] replaces that of the `config`.
 
         Raises:
             InputError: If the data of the robot have no drives or no level posture.
         """
         super().__init__()
+        if control_period is not None:
+            config = replace(config, substeps=round(control_period / config.plant_period))
         builder = DiagramBuilder()
         self.config = config
         self.control_period = config.control_period

@@ -27,6 +27,7 @@ SIBLINGS = {
     "lerobot": (),
     "mujoco": (),
     "cpp": (),
+    "calibration": ("calibrate", "probe"),
 }
 """Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""
 

@@ -91,9 +91,6 @@ class Sphere(ConvexShape):
         center: Center (D,).
         radius: Radius, positive.
         margin: Distance by which the shape is enlarged, not negative.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(self, center: ArrayLike, radius: float, margin: float = 0.0):
@@ -203,9 +200,6 @@ def linearize(
             touches the nearest point of the surface. A path through the middle of a shape therefore does not determine
             the side on which commands pass.
         linear: Further constraints; none by default.
-
-    Raises:
-        InputError: If the constraints of a step contradict each other.
     """
     steps, outputs = path.shape
     rows = [] if linear is None else [linear.window(np.arange(steps))]

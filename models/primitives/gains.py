@@ -24,9 +24,6 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 
     The displacement [unit of the output] is the RMS over the motion. `outputs` are indices or a mask of the explored
     outputs, all by default. The result is zero for the outputs that are not explored.
-
-    Raises:
-        InputError: If there is no explored output, an index does not exist, or a mask does not have O entries.
     """
     explored = _explored_mask(primitive, outputs)
     # Displacement of output i by a constant raw action of one in output j, (N, O, O).
@@ -117,9 +114,6 @@ def residual_gains(
         action_scale: κ, positive.
         groups: Indices of the outputs of each group; one group of all outputs by default. An output in no group gets a
             displacement of zero.
-
-    Raises:
-        InputError: If κ is not positive, or a group is empty or has an index that does not exist.
     """
     check_action_scale(action_scale)
     variances = np.mean(reference.standard_deviations**2, axis=0)

@@ -72,20 +72,12 @@ class Kmp:
         self._factor_reference()
 
     def mean(self, inputs: np.ndarray) -> np.ndarray:
-        """Compute means (n, O) at `inputs` (n,) or (n, I) (equation 2.17).
-
-        Raises:
-            InputError: If the inputs are not finite.
-        """
+        """Compute means (n, O) at `inputs` (n,) or (n, I) (equation 2.17)."""
         F = self._basis.features(self._queries(inputs))
         return (F @ self._weights.reshape(-1, self.num_outputs)).reshape(-1, self.num_outputs)
 
     def covariance(self, inputs: np.ndarray) -> np.ndarray:
-        """Compute covariances (n, O, O) at `inputs` (n,) or (n, I) (equation 2.18).
-
-        Raises:
-            InputError: As `mean`.
-        """
+        """Compute covariances (n, O, O) at `inputs` (n,) or (n, I) (equation 2.18)."""
         queries = self._queries(inputs)
         F = self._basis.features(queries)
         unexplained = np.maximum(self._basis.residual(queries, F), 0)
@@ -107,9 +99,6 @@ class Kmp:
 
         Returns:
             An identifier for `move_via_point` and `remove_via_point`.
-
-        Raises:
-            InputError: If a number is not finite, or the covariance is not symmetric or not positive definite.
         """
         identifier = self._next_identifier
         self._via[identifier] = self._check_point(input_, mean, covariance)
@@ -118,21 +107,13 @@ class Kmp:
         return identifier
 
     def move_via_point(self, identifier: int, input_: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> None:
-        """Change input (I,), mean (O,) and covariance (O, O) of a via-point.
-
-        Raises:
-            InputError: As `add_via_point`, or if there is no such via-point.
-        """
+        """Change input (I,), mean (O,) and covariance (O, O) of a via-point."""
         self._check_identifier(identifier)
         self._via[identifier] = self._check_point(input_, mean, covariance)
         self._factor_via_points()
 
     def remove_via_point(self, identifier: int) -> None:
-        """Remove a via-point.
-
-        Raises:
-            InputError: If there is no such via-point.
-        """
+        """Remove a via-point."""
         self._check_identifier(identifier)
         del self._via[identifier]
         self._factor_via_points()

@@ -145,9 +145,6 @@ class LcNsKmp:
             steps: Steps n ≥ 0 (B,), or one step for all; past the end, the last step.
             null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, with B from `histories` or `steps`.
             histories: (B, P, O), as in `predict`; None if P = 0.
-
-        Raises:
-            InputError: As `predict`.
         """
         x, at = self._stack_batch(steps, null_space_actions, histories)
         outputs = np.empty((len(x), self.num_outputs))
@@ -446,9 +443,6 @@ def get_shared_primitive(
         constraints: As in `LcNsKmp`.
         kernel: As in `LcNsKmp`; kernels that compare equal share a primitive.
         arguments: Further arguments of `LcNsKmp`, numbers or strings.
-
-    Raises:
-        InputError: As `LcNsKmp`.
     """
     arrays = {name: getattr(reference, name) for name in ("times", "means", "covariances")}
     arrays |= {"G": constraints.G, "c": constraints.c}

@@ -79,9 +79,6 @@ def fit_new_mixture(times: np.ndarray, outputs: np.ndarray, components: int | No
             Bayesian information criterion, at most 20; the search stops after two consecutive numbers that are worse
             than the best earlier one.
         seed: Seed of scikit-learn's generator, from 0 to 2^32 − 1.
-
-    Raises:
-        InputError: If there are fewer than two steps for each component, or less than one component.
     """
     _, center, scale = _standardize(times, outputs)
     candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)

@@ -85,9 +85,6 @@ def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "e
     Args:
         orientation_numbers: Orientation outputs, (3,) or (N, 3) [rad].
         orientation: As in `pose_outputs`.
-
-    Raises:
-        InputError: If there is no such orientation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -113,9 +110,6 @@ def pose_demonstrations(
         target_position: p_WT (3,) [m]; each demonstration's last position by default (thesis, section 4.4.2).
         target_quaternion_wxyz: R_WT (4,); each demonstration's last orientation by default.
         orientation: As in `pose_outputs`.
-
-    Raises:
-        InputError: As `pose_outputs` and `Demonstrations`.
     """
     outputs: list[np.ndarray] = []
     for p, q in zip(positions, quaternions_wxyz, strict=True):

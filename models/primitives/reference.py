@@ -101,6 +101,8 @@ class ReferenceTrajectory:
             InputError: If an argument is out of range, `prior_std` is missing or superfluous, or a covariance is
                 singular.
         """
+        if model not in ("gmr", "promp"):
+            raise InputError(f"the model of a reference is gmr or promp, not {model!r}")
         if not 0.0 < as_number(gap_scale, "gap_scale") < np.inf:
             raise InputError(f"gap_scale is a factor of the standard deviation and must be positive, not {gap_scale}")
         recordings, number = demonstrations, demonstrations.num_demonstrations
@@ -138,10 +140,6 @@ class ReferenceTrajectory:
             promp: Primitive, with or without via-points (`ProMp.conditioned`).
             times: Times (N,) of the phases from 0 to 1, strictly increasing [s].
             floor: Standard deviation, (O,) or scalar, as in `from_demonstrations`.
-
-        Raises:
-            InputError: If the times do not increase, the floor is negative, or a covariance is singular without a
-                floor.
         """
         times = as_numbers(times, "times")
         floor = _checked_floor(floor, promp.num_outputs)

@@ -78,9 +78,6 @@ class StepFactor:
         lambda_: Regularization λ of problem 4.5.
         beta: Weight β of a null-space action.
 
-    Raises:
-        InputError: If a covariance of the window is not positive definite.
-
     Attributes:
         output_map, output_offset: Map (O, PO+O) and offset (O,) from x to the executed point.
         constraint_map: Map (m, PO+O) from x to the constrained directions, each scaled so that a correction of norm one

@@ -83,9 +83,6 @@ def parse_template(text: str, where: str = "template", **parameters: float) -> S
         text: Content of a template file.
         where: Name of the text, for messages.
         **parameters: As in `load_template`.
-
-    Raises:
-        InputError: If the text is not a valid template.
     """
     return _read(parse_yaml(text, where), where, parameters)
 

@@ -32,9 +32,9 @@ OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
 MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
 PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses with 4 N
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
-NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 CONTACTS = {  # station and time step [s]
-    "Drake, 10 ms": ("gantry", PLANT_PERIOD),
+    "Drake, 5 ms": ("gantry", PLANT_PERIOD / 2),  # the default of the connector
     "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4),
     "MuJoCo": ("mujoco", PLANT_PERIOD),
 }

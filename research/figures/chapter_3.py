@@ -63,7 +63,7 @@ def figure_3_4(out: Path) -> dict[str, Any]:
     rows = []
     for name, X_WF in frames.items():
         tips = [X_WF.translation() + 0.06 * X_WF.rotation().col(i) for i in range(3)]
-        (u, v), *ends = task.camera().project(np.stack([X_WF.translation(), *tips]))
+        (u, v), *ends = task.scene().camera.project(np.stack([X_WF.translation(), *tips]))
         for (x, y), color in zip(ends, ("red", "green", "blue"), strict=True):
             axis.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": color, "linewidth": 1.6})
         axis.annotate(name, (u, v), xytext=(8, 10), textcoords="offset points", color="black", fontsize=9)

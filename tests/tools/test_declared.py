@@ -3,7 +3,8 @@
 import subprocess
 import sys
 
-from guiderail.diagrams.envs.config import option_models
+from guiderail.diagrams.envs.config import option_models, prior_of, stations_of
+from guiderail.diagrams.envs.options import option_fields
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.tools.environments import declared_models
@@ -15,10 +16,15 @@ def test_every_option_of_an_environment_is_declared():
     assert {"BncConnector", "GridClamp", "NarrowPassage"} <= {*TASKS_WITH_OPTIONS}
     for name in TASKS_WITH_OPTIONS:
         task, declared = TASKS.get(name), declared_models(name)
-        for guidance in possible_guidance(task.provides()):
-            for station in task.stations():
-                used = {model for model in option_models(task, guidance, station).values() if model.model_fields}
-                assert used <= {*declared}, (name, guidance, station)
+        for guidance in possible_guidance(prior_of(task).provides):
+            for station in stations_of(task):
+                known = {option for model in declared for option in option_fields(model)}
+                used = {
+                    option
+                    for model in option_models(task, guidance, station).values()
+                    for option in option_fields(model)
+                }
+                assert used <= known, (name, guidance, station)
 
 
 def test_option_models_import_no_slow_package():

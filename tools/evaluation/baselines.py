@@ -161,7 +161,7 @@ def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
     find_scripted_policy(task, name)
 
     def make_policy(env: gymnasium.Env) -> PolicyFn:
-        config = getattr(cast(Any, env.unwrapped).diagram.task, "config", None)
+        config = getattr(cast(Any, env.unwrapped).diagram, "config", None)
         return find_scripted_policy(task, name, getattr(config, "difficulty", STANDARD))
 
     return make_policy

@@ -77,7 +77,7 @@ def _has_hidden_offset(task: str) -> bool:
 
 def counts_collisions(task: str) -> bool:
     """Return True if a task declares a collision signal (a `TerminationTerm` does not count) or is not in `TASKS`."""
-    return task not in TASKS.names() or TASKS.get(task).declares_collision()
+    return task not in TASKS.names() or TASKS.get(task)().collision is not None
 
 
 def has_held_out_distribution(task: str) -> bool:

@@ -127,7 +127,7 @@ def path_in_picture(base: Any) -> np.ndarray:
     The result is empty if the task has no camera.
     """
     task = base.diagram.task
-    camera = None if task is None else task.camera()
+    camera = None if task is None else task.scene().camera
     return np.empty((0, 2)) if camera is None else camera.project(task.scene().to_world(base.trace.measured))
 
 

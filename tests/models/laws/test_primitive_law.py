@@ -137,17 +137,6 @@ def test_step_refuses_invalid_arguments_without_advancing():
     assert stepper.num_steps == 1
 
 
-def test_filter_of_another_type_or_size_is_refused():
-    p = primitive()
-    larger = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(3)), PERIOD)
-    for motion in (5, MotionConstraints(p.constraints), larger):
-        with pytest.raises(InputError, match="command_filter is a"):
-            make_stepper(p, command_filter=motion)
-    for arguments in ((p.constraints, PERIOD), (MotionConstraints(p.constraints), "0.02")):
-        with pytest.raises(InputError, match=r"needs MotionConstraints|must be a number, not '0.02'"):
-            MotionConstraintFilter(*arguments)
-
-
 @pytest.mark.parametrize("history", [0, 1])
 def test_filter_starts_with_the_velocity_of_two_outputs(history):
     p = primitive(history)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from safetensors.numpy import save
 
-from guiderail.diagrams.envs.task_checks import call_checked
 from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.stations.impedance_control import (
@@ -100,7 +99,7 @@ def _guidance_arrays(guidance: str, prior: PriorKnowledge) -> Arrays:
 
 def _force_arrays(skill: TrainedSkill) -> Arrays:
     """Return the arrays of the task's force bound, if any: the governor's, and the limits of a template's states."""
-    impedance = call_checked(skill.task, "impedance")
+    impedance = skill.task.impedance()
     if impedance is None or impedance.bound is None:
         return {}
     stiffness = np.array(impedance.stiffness)

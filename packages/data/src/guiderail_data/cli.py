@@ -58,6 +58,33 @@ def export(
     print_result(export_demonstrations(file, out, to, rate), as_json)
 
 
+@command("dataset record runs/connector --to lerobot --episodes 50 --out connector_episodes", "record", dataset)
+def record(
+    policy: Annotated[
+        str, argument("Folder of a run, pretrained:NAME ({pretrained}), or with --task a policy's name.", "POLICY")
+    ],
+    out: Annotated[str, option("LeRobot: folder to write. Minari: identifier, such as guiderail/clamp/scripted-v0.")],
+    to: Annotated[str, option("Format: lerobot or minari.")],
+    task: cli.PolicyTask = None,
+    env: cli.Env = None,
+    episodes: Annotated[int, option("Number of episodes.")] = 50,
+    seed: Annotated[int, option("Seed of the first episode; episode i has this seed + i.")] = 0,
+    as_json: cli.Json = False,
+) -> None:
+    """Run a policy and write its episodes as a data set of LeRobot or Minari.
+
+    The demonstrations of a task are the episodes of its scripted policy. LeRobot has the commanded pose as action, and
+    the measured pose and wrench as observation.state and observation.wrench; Minari has observations, actions and
+    rewards, in the folder that the variable MINARI_DATASETS_PATH names.
+    """
+    from guiderail_data.episodes import record_episodes
+
+    name = None if task is None else cli.find_task(task, None)[0]
+    environment = cli.parse_environment(env)
+    result = record_episodes(policy, out, to, task=name, environment=environment, episodes=episodes, seed=seed)
+    print_result(result, as_json)
+
+
 @command("dataset validate demonstrations.csv --draw demonstrations.png", None, dataset)
 def validate(
     file: cli.Demonstrations,

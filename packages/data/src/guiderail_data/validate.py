@@ -20,10 +20,10 @@ from guiderail.tools.files import (
     ENDINGS,
     check_new,
     check_picture,
-    load_demonstrations,
     path_exists,
     write_atomically,
 )
+from guiderail_data.reading import load_demonstrations
 
 JUMP_RATIO = 150.0  # ratio of an output's largest to its median speed above which a jump is reported
 GAP_RATIO = 10.0  # ratio of the longest to the median sampling period above which missing samples are reported

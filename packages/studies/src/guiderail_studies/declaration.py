@@ -279,7 +279,9 @@ def sentence(error: ValidationError, kinds: tuple[type[Strict], ...] = ()) -> st
     first = error.errors()[0]
     where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":
-        known = {n for kind in kinds or (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio) for n in kind.model_fields}
+        known = {
+            n for kind in kinds or (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio) for n in kind.model_fields
+        }
         return f"a {'method' if kinds else 'study'} has no key {where}: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":
         return " ".join(str(first["ctx"]["error"]).split())

@@ -449,10 +449,10 @@ def attempt(
     return Outcome(tuple(rows))
 
 
-def cpu_time(job: Job) -> float:
-    """Return the CPU time of all attempts at a job that ended [s]; the time of killed attempts is unknown."""
-    log = job.log.read_text(encoding="utf-8", errors="replace") if job.log.exists() else ""
-    return sum(float(number) for number in re.findall(rf"{CPU_TIME}([0-9.]+) s$", log, re.MULTILINE))
+def cpu_time(log: Path) -> float:
+    """Return the CPU time of all attempts in the log of a job that ended [s]; that of killed attempts is unknown."""
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    return sum(float(number) for number in re.findall(rf"{CPU_TIME}([0-9.]+) s$", text, re.MULTILINE))
 
 
 def _process_times() -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -28,7 +29,7 @@ from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_step_log
 from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.tables import read_columns, read_table
+from guiderail.tools.tables import read_table
 from guiderail.tools.visualization.figures import color, label
 from guiderail_studies.declaration import source_file
 
@@ -213,7 +214,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
     """
     tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda path: (len(path.stem), path.stem)):
-        if file.is_file() and not {*STUDY_COLUMNS} <= {*read_columns(file)}:
+        if file.is_file() and not {*STUDY_COLUMNS} <= {*_read_columns(file)}:
             continue
         table = read_table(file)
         studies = _studies_of(file.stem, table)
@@ -361,3 +362,17 @@ def command(config: RunConfig, out: str) -> str:
     if config.human_in_the_loop:
         words.append("--human-in-the-loop")
     return shlex.join([*words, "--out", out])
+
+
+_MAX_HEADER = 100_000  # largest number of characters of a header
+
+
+def _read_columns(path: Path) -> list[str]:
+    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return next(csv.reader([file.readline(_MAX_HEADER)], strict=True), [])
+    except (UnicodeError, csv.Error):
+        return []
+    except OSError as error:
+        raise InputError(f"the table '{path}' can't be read ({error.strerror}): check the path") from error

@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.files import write_atomically, write_record
+from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail.tools.progress import EpisodeProgress
@@ -24,6 +24,7 @@ from guiderail.tools.tables import table_text
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import hardware_environment, recordings_folder
+from guiderail_hardware.robot.records import write_record
 from guiderail_hardware.robot.session import robot_session
 
 STATISTICS = (

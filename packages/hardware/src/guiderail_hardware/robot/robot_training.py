@@ -18,7 +18,7 @@ from guiderail.models.common.termination import Termination
 from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.step_log import step_log_file, table
-from guiderail.tools.files import check_room, write_atomically
+from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.networks import SpacesOnlyEnv
@@ -36,6 +36,7 @@ from guiderail.tools.progress import EpisodeProgress
 from guiderail_hardware.drivers.clock import garbage_collection_disabled
 from guiderail_hardware.robot.connection import Log, RobotConnection
 from guiderail_hardware.robot.executor import record_size
+from guiderail_hardware.robot.records import check_room
 from guiderail_hardware.robot.robot_env import RobotEnv
 from guiderail_hardware.robot.session import robot_session
 
@@ -100,7 +101,7 @@ def train_on_robot(
         raise InputError("the operator ends training on a robot: leave the setting stop_after_successes out")
     config = replace(config, simulated_driver=connection.sim)
     if config.step_log:
-        num_steps = EnvConfig.resolve(config.task, config.environment).make_task().num_steps
+        num_steps = EnvConfig.resolve(config.task, config.environment).num_steps
         check_room(step_log_file(folder.steps, 0), config.episodes * record_size(num_steps))
     with folder.locked(), robot_session(config, connection, assume_yes=assume_yes, log=log) as (env, timing):
         folder.write_config(config)

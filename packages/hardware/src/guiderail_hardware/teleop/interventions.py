@@ -143,17 +143,17 @@ class ViaPointCorrections:
             InputError: If the guidance has no demonstrations to correct.
         """
         config = EnvConfig.resolve(task, environment)
-        instance, kind = config.make_task(), config.guidance_kind
+        kind, reference = config.guidance_kind, config.reference()
         if not any("demonstrations" in alternative for alternative in kind.needs):
             raise InputError(f"guidance {kind.name!r} has no demonstrations to correct: choose another, such as kgrl")
         values = config.options
         self.points = tuple(values["via_points"])
-        reference = instance.reference()
+        assert reference is not None
         self._reference = pass_through(reference, self.points, kernel_from_options(values))
         action_dims = values["action_dims"]
         self._action_dims = list(range(reference.num_outputs)) if action_dims is None else list(action_dims)
         self.reach = np.sqrt(3.0) * values["action_scale"] * deviation(reference)[self._action_dims]
-        self._constraints = instance.constraints()
+        self._constraints = config.constraints()
 
     def check_offset(self, offset: np.ndarray) -> np.ndarray:
         """Return a correction (A,) as doubles; raise an `InputError` unless it has this shape and is finite."""

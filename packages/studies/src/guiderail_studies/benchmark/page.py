@@ -165,7 +165,9 @@ def _task_block(protocol: Protocol, task: str, entries: Sequence[Entry]) -> Bloc
     empty = [MISSING] * len(SHOWN)
     for name in FLOORS:
         if name in declared.floors:
-            rows.append([f"{name.replace('_', ' ')} (no learning)", MISSING, f"{100 * declared.floors[name]:.0f}", *empty])
+            rows.append(
+                [f"{name.replace('_', ' ')} (no learning)", MISSING, f"{100 * declared.floors[name]:.0f}", *empty]
+            )
     if not rows:
         return None
     text = f"{declared.description} {declared.episodes} training episodes."

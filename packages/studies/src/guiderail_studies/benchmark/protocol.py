@@ -53,8 +53,10 @@ class ProtocolTask(Strict):
     core_seconds: float = Field(gt=0)  # CPU time of a run of the reference method with its evaluation [s]
     floor_env: dict[str, Any]  # options that the policies without learning choose
     scripted: str  # name of the scripted policy
-    reset: dict[str, Any] = {}  # options of the resets of the policies without learning
-    floors: dict[str, Rate] = {}  # measured success rates of the policies without learning, by name
+    reset: dict[str, Any] = Field(default_factory=dict)  # options of the resets of the policies without learning
+    floors: dict[str, Rate] = Field(
+        default_factory=dict
+    )  # measured success rates of the policies without learning, by name
 
 
 class Protocol(Strict):
@@ -129,7 +131,7 @@ def _is_plain(value: Any) -> bool:
 class TaskChoice(Strict):
     """What a method chooses for one task, in addition to its choices for all tasks."""
 
-    env: dict[str, Any] = {}
+    env: dict[str, Any] = Field(default_factory=dict)
     learner: LearnerChoice = LearnerChoice()
 
 
@@ -141,9 +143,10 @@ class BenchmarkMethod(Strict):
 
     name: FolderName  # name in the tables
     description: str = Field("", max_length=300)  # one sentence
-    env: dict[str, Any] = {}  # options of the environment that the method chooses
+    env: dict[str, Any] = Field(default_factory=dict)  # options of the environment that the method chooses
     learner: LearnerChoice = LearnerChoice()  # default: the task's own
-    tasks: dict[str, TaskChoice | None] = {}  # choices by task; null: the method does not apply to the task
+    # Choices by task; null: the method does not apply to the task.
+    tasks: dict[str, TaskChoice | None] = Field(default_factory=dict)
     cost: float = Field(1.0, gt=0)  # CPU time of a run as a multiple of the reference method's
     # Files or modules that register the learner or the guidance; paths are relative to the working directory.
     imports: tuple[str, ...] = ()
@@ -169,6 +172,8 @@ class BenchmarkMethod(Strict):
         for choice in (self.learner, *(own.learner for own in self.tasks.values() if own is not None)):
             if choice.episodes is not None:
                 raise ValueError("the protocol fixes the number of training episodes: leave episodes out")
+            if "init_from" in choice.settings:
+                raise ValueError("a run of the benchmark starts from no other run: leave init_from out")
         return self
 
 

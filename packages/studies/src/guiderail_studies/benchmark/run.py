@@ -179,14 +179,9 @@ def run_method(
     for study, name in zip(studies, chosen, strict=True):
         rows = run_study(study, out / name, engine)
         result[f"{name}, success"] = float(rows["success_rate"].mean())
-    result["core_hours"] = sum(cpu_time(job) for study in studies for job in jobs_of(study, out)) / HOUR
+    logs = [Job(study, method.name, seed, out / study.name).log for study in studies for seed in study.seeds]
+    result["core_hours"] = sum(map(cpu_time, logs)) / HOUR
     return result
-
-
-def jobs_of(study: Any, out: Path) -> list[Job]:
-    """Return the jobs of a study of one method whose folder is in `out`."""
-    (method,) = study.methods
-    return [Job(study, method, seed, out / study.name) for seed in study.seeds]
 
 
 def _write_method(protocol: Protocol, method: BenchmarkMethod, tasks: Sequence[str], out: Path) -> None:
@@ -222,18 +217,42 @@ def check_digests(protocol: Protocol, digests: Mapping[str, str], source: Path) 
     """Raise an InputError if tasks that were run are unknown to the protocol, or their rules have changed."""
     for name, digest in digests.items():
         if name not in protocol.tasks or protocol.task_digest(name) != digest:
-            raise InputError(f"{source} was run on {name} with other rules than protocol {protocol.version}: run it again")
+            raise InputError(
+                f"{source} was run on {name} with other rules than protocol {protocol.version}: run it again"
+            )
 
 
-def finished_jobs(protocol: Protocol, method: BenchmarkMethod, out: Path) -> Iterator[tuple[str, Job]]:
-    """Yield task and job of every trained and evaluated run in a folder of runs."""
-    for name in protocol.tasks:
-        if not method.applies(name):
-            continue
-        for job in jobs_of(method_study(protocol, name, method, protocol.seeds), out):
-            file = job.folder.path / EVALUATED_FILE
-            if file.is_file() and len(read_table(file)) == protocol.episodes:
-                yield name, job
+@dataclass(frozen=True)
+class FinishedRun:
+    """Trained and evaluated run."""
+
+    task: str  # name of the task in the protocol
+    seed: int
+    training: pd.DataFrame  # training episodes
+    evaluated: pd.DataFrame  # held-out episodes
+    policy: Path  # folder of the policy
+    seconds: float  # CPU time [s]
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """Row of the table."""
+        return run_row(self.task, self.seed, self.training, self.evaluated, self.seconds)
+
+
+def finished_runs(protocol: Protocol, method: BenchmarkMethod, out: Path) -> Iterator[FinishedRun]:
+    """Yield every trained and evaluated run in a folder of runs, in the order of the protocol."""
+    for name, task in protocol.tasks.items():
+        for seed in protocol.seeds:
+            folder = out / name / str(seed)
+            files = folder / "episodes.csv", folder / EVALUATED_FILE
+            policy = folder / "after_episodes" / str(task.episodes)
+            if not all(file.is_file() for file in (*files, policy / "policy.json")):
+                continue
+            training, evaluated = map(read_table, files)
+            if len(training) == task.episodes and len(evaluated) == protocol.episodes:
+                study = method_study(protocol, name, method, (seed,))
+                seconds = cpu_time(Job(study, method.name, seed, out / name).log)
+                yield FinishedRun(name, seed, training, evaluated, policy, seconds)
 
 
 def check_floors(

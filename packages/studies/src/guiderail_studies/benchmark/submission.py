@@ -25,9 +25,8 @@ from guiderail.tools.files import atomic_folder, check_new
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import read_table, table_text
 from guiderail_studies.benchmark.protocol import EVALUATED_FILE, BenchmarkMethod, Protocol, load_protocol
-from guiderail_studies.benchmark.run import check_digests, finished_jobs, run_row, stored_method
+from guiderail_studies.benchmark.run import check_digests, finished_runs, run_row, stored_method
 from guiderail_studies.declaration import Strict
-from guiderail_studies.job import cpu_time
 
 FORMAT = "guiderail benchmark submission 1"
 SUBMISSION, TABLE, TRAINING_FILE = "submission.json", "table.csv", "training.csv"
@@ -72,14 +71,14 @@ def submit(runs: Path, out: Path) -> dict[str, Any]:
     protocol, method, digests = stored_method(runs)
     rows: list[dict[str, Any]] = []
     with atomic_folder(out) as folder:
-        for task, job in finished_jobs(protocol, method, runs):
-            target = folder / task / str(job.seed)
+        for run in finished_runs(protocol, method, runs):
+            target = folder / run.task / str(run.seed)
             target.mkdir(parents=True)
             for name in POLICY_FILES:
-                shutil.copyfile(job.policy_folder(job.after_episodes[-1]) / name, target / name)
-            for name, given in ((TRAINING_FILE, job.folder.episodes()), (EVALUATED_FILE, read_table(_evaluated(job)))):
-                write_atomically(target / name, table_text(given).encode())
-            rows.append(run_row(task, job.seed, job.folder.episodes(), read_table(_evaluated(job)), cpu_time(job)))
+                shutil.copyfile(run.policy / name, target / name)
+            for name, table in ((TRAINING_FILE, run.training), (EVALUATED_FILE, run.evaluated)):
+                write_atomically(target / name, table_text(table).encode())
+            rows.append(run.row)
         if not rows:
             raise InputError(f"{runs} has no finished run: finish guiderail benchmark run first")
         write_atomically(folder / TABLE, table_text(rows).encode())
@@ -96,10 +95,6 @@ def submit(runs: Path, out: Path) -> dict[str, Any]:
         write_atomically(folder / SUBMISSION, submission.model_dump_json(indent=1).encode())
     counts = pd.Series([row["task"] for row in rows]).value_counts(sort=False)
     return {"submission": str(out), **{f"{task}, runs": int(number) for task, number in counts.items()}}
-
-
-def _evaluated(job: Any) -> Path:
-    return Path(job.folder.path) / EVALUATED_FILE
 
 
 def processor() -> str:
@@ -177,7 +172,7 @@ def read_table_of(folder: Path, submission: Submission, protocol: Protocol) -> p
         ):
             if len(table) != number:
                 raise InputError(
-                    f"{task}, seed {seed}, has {len(table)} {kind} episodes, and protocol {protocol.version} has {number}"
+                    f"{task}, seed {seed}, has {len(table)} {kind} episodes instead of {number}: finish the run"
                 )
         rows.append(run_row(task, seed, training, evaluated, float(duration)))
     for name, values in pd.DataFrame(rows).items():

@@ -3,7 +3,8 @@ import itertools
 import numpy as np
 import pytest
 
-from guiderail.tools.evaluation.metrics import bootstrap_band, interquartile_mean, median_survival, survival, wilson
+from guiderail.tools.evaluation.metrics import wilson
+from guiderail_studies.run_statistics import bootstrap_band, interquartile_mean, median_survival, survival
 
 
 def test_bootstrap_band_contains_the_mean_and_narrows():
