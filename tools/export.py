@@ -52,6 +52,7 @@ class TrainedSkill:
         policy: Deterministic policy.
         task: Task.
         prior: Prior knowledge of the task.
+        num_steps: Number of control steps of an episode.
         description: Meaning of observation and action, and settings of the guidance, as written to `skill.json`.
     """
 
@@ -59,6 +60,7 @@ class TrainedSkill:
     policy: Policy
     task: Task
     prior: PriorKnowledge
+    num_steps: int
     description: dict[str, Any]
 
 
@@ -102,7 +104,7 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     description["action"] = [
         {"name": name, "low": low[index], "high": high[index]} for index, name in enumerate(names)
     ]  # fmt: skip
-    return TrainedSkill(config, policy, task, prior, description)
+    return TrainedSkill(config, policy, task, prior, resolved.num_steps, description)
 
 
 @dataclass(frozen=True)

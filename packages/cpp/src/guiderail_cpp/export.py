@@ -71,7 +71,7 @@ def skill_arrays(skill: TrainedSkill) -> tuple[Arrays, dict[str, str], dict[str,
     guidance, prior = skill.config.environment["guidance"], skill.prior
     arrays = {
         "period": np.array([prior.period]),
-        "duration": np.array([prior.period * skill.task.num_steps]),
+        "duration": np.array([prior.period * skill.num_steps]),
         "observation/min_force": np.array([MIN_CONTACT_FORCE]),
         "action_repeat": np.array([float(skill.config.action_repeat)]),
     }

@@ -51,14 +51,14 @@ def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int 
             port.FixValue(context, values[name])
         simulator.Initialize()
         command = guidance.GetOutputPort("desired_pose").Eval(context)
-        for step in range(skill.task.num_steps):
+        for step in range(skill.num_steps):
             pose = values["pose"] if step == 0 else command + TRACKING_SPREAD * rng.normal(size=size)
             raw = _random_signals(entries, signals, rng)
             if step % skill.config.action_repeat == 0:
                 own = {"time": [step * period], "pose": pose, "desired_pose": command}
                 if signals.get("wrench") == WRENCH_SIZE:
                     own["center_of_pressure"] = center_of_pressure(raw["wrench"], MIN_CONTACT_FORCE)
-                own["phase"] = [-1.0 + 2.0 * step / skill.task.num_steps]
+                own["phase"] = [-1.0 + 2.0 * step / skill.num_steps]
                 for name in ("state", "transition_distance"):
                     if guidance.HasOutputPort(name):
                         own[name] = guidance.GetOutputPort(name).Eval(context)
