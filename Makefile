@@ -70,6 +70,7 @@ injections: $(VENV)/.ready  ## faults on a robot's bus, minutes
 	$(BIN)/python tests/harness/injections/inject.py --injections 500
 	$(BIN)/python tests/harness/injections/campaign.py --instants 25 --pairs 200
 	$(BIN)/python tests/harness/injections/processes.py
+	$(BIN)/python tests/harness/injections/ros2_campaign.py --instants 25 --pairs 200
 
 scaling: $(VENV)/.ready  ## constraints in every scale against an adversary, minutes
 	$(BIN)/python tests/harness/constraint_scaling.py

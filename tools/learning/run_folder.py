@@ -286,11 +286,12 @@ class RunFolder:
 
 def _shown_settings(algorithm: str, settings: dict[str, Any]) -> LearnerConfig:
     """Return the stored settings of a learner whose code is not imported."""
-    base = {name: settings.pop(name) for name in LearnerConfig.__dataclass_fields__ if name in settings}
-    kind = make_dataclass(
-        "ShownConfig", [(name, Any) for name in settings], bases=(LearnerConfig,), frozen=True, kw_only=True
-    )
-    shown: LearnerConfig = kind(algorithm=algorithm, **base, **settings)
+    # A name of a structured setting has a dot, which the name of a field cannot have.
+    entries = {name.replace(".", "_"): name for name in settings}
+    own = [(name, Any) for name in entries if name not in LearnerConfig.__dataclass_fields__]
+    namespace = {"entries": entries}
+    kind = make_dataclass("ShownConfig", own, bases=(LearnerConfig,), namespace=namespace, frozen=True, kw_only=True)
+    shown: LearnerConfig = kind(algorithm=algorithm, **{name: settings[entry] for name, entry in entries.items()})
     return shown
 
 
