@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUTSIDE := .venv-outside
 ALONE := .venv-alone
 # Distributions of this repository, installed together: the core and its siblings require each other.
-SIBLINGS := hardware parts studies data lerobot mujoco cpp
+SIBLINGS := hardware parts studies data lerobot mujoco cpp calibration
 EDITABLE := $(SIBLINGS:%=-e packages/%)
 # Meshcat and LCM use this machine's network only. Without package_map, Drake's Parser(plant) refuses its remote package
 # drake_models, whose files it would download: `make TARGET DRAKE_ALLOW_NETWORK=meshcat:lcm:package_map` permits it.
@@ -108,7 +108,8 @@ siblings:  ## each sibling's tests with the core and that sibling alone, in an e
 	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,osqp,piqp,onnx]" \
 	  pytest pytest-xdist hypothesis psutil mpmath colorednoise rosbags ruckig ur-rtde
 	for sibling in $(SIBLINGS); do \
-	  $(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e packages/$$sibling && \
+	  required=""; [ $$sibling = calibration ] && required="-e packages/studies"; \
+	  $(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt $$required -e packages/$$sibling && \
 	  $(ALONE)/bin/python -m pytest -q -n 2 --dist loadfile packages/$$sibling/tests || exit 1; \
 	  $(ALONE)/bin/python -m pip uninstall -qq -y guiderail-$$sibling || exit 1; \
 	done

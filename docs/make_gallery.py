@@ -32,9 +32,9 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, make_baseline, 
 from guiderail.tools.evaluation.episode import PolicyFn
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.train import train
 from guiderail.tools.visualization.camera import path_in_picture
-from guiderail.tools.visualization.curves import draw_passage
+from guiderail.tools.visualization.figures import draw_passage
 from guiderail_parts.create_task import create_task
 
 HERE = Path(__file__).parent
@@ -189,15 +189,7 @@ def _learned(env: Any) -> PolicyFn:
     """Train the policy of the demo."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        arguments = {"guidance": "skgrl"}
-        start_or_resume(
-            "NarrowPassage",
-            out,
-            environment=arguments,
-            preset="tqc_cheap_correlated",
-            episodes=LEARNING_EPISODES,
-            seed=0,
-        )
+        train("NarrowPassage", "skgrl", out=out, preset="tqc_cheap_correlated", episodes=LEARNING_EPISODES, seed=0)
         return Policy.load(out)
 
 

@@ -215,27 +215,15 @@ def systems() -> str:
 
 
 def ports(system: type) -> list[tuple[str, str, str]]:
-    """Return kind, name and description of each port in a system's docstring."""
-    block = DIAGRAM.search((inspect.getdoc(system) or "") + "\n")
+    """Return kind, name and description of each port of a system, by its getters."""
     rows = []
     for kind in ("input", "output"):
-        lines = re.search(rf"{kind}_ports:\n((?: *- .*\n)+)", block[0] if block else "")
-        for line in re.findall(r"- (.*)", lines[1]) if lines else []:
-            name, _, more = line.partition(" (")
-            own = vars(system).get(f"get_{name}_{kind}_port") or vars(system).get(f"get_{kind}_port")
-            words = inspect.getdoc(own) if own else more.rstrip(")")
-            text, result = sections(words or "")
-            is_name = name.isidentifier()
-            rows.append(
-                (
-                    kind,
-                    code(name) if is_name else cell(name),
-                    cell(
-                        text.removeprefix("Return the port of the ")
-                        or " ".join(words for rows_of in result.values() for _, words in rows_of)
-                    ),
-                )
-            )
+        for getter in vars(system):
+            if found := re.fullmatch(rf"get_(\w+)_{kind}_port", getter):
+                text, _ = sections(inspect.getdoc(getattr(system, getter)) or "")
+                has_many = "name" in inspect.signature(getattr(system, getter)).parameters
+                name = f"one per {found[1]}" if has_many else code(found[1])
+                rows.append((kind, name, cell(text.removeprefix("Return the port of the "))))
     return rows
 
 
@@ -530,7 +518,7 @@ def workcells() -> str:
     from guiderail.diagrams.tasks.registry import TASKS
 
     page = (
-        "# Workcells and stations\n\nA task names a `workcell_kind`, and its `workcell()` returns the object that a "
+        "# Workcells and stations\n\nA task names a station, and its `workcell()` returns the object that a "
         "station of that kind is built from. [Make your own task](../tutorials/own_task.md) uses a plane. For a "
         "workcell of another kind, `register_station` decorates a subclass of `Station` that is built from it. Every "
         "station has the inputs and outputs below; sizes are those of a pose with six numbers.\n\n"
@@ -542,9 +530,9 @@ def workcells() -> str:
         )
     )
     page += table(["port", "size", "description"], rows)
-    tasks = {TASKS.get(name).workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    tasks = {TASKS.get(name).station_kind().workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
-        workcell = EnvConfig.resolve(task, {}).make_task().workcell()
+        workcell = EnvConfig.resolve(task, {}).declared.workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "
         page += f"`{type(workcell).__module__}.{type(workcell).__name__}`.\n\n"
         if kind == "insertion":
@@ -558,7 +546,7 @@ def workcells() -> str:
         for name in stations_for(kind):
             if not STATIONS.get(name).is_simulated:
                 continue
-            station = make_station(EnvConfig.resolve(task, {"station": name}).make_task())
+            station = make_station(EnvConfig.resolve(task, {"station": name}))
             ports = (station.get_output_port(index) for index in range(station.num_output_ports()))
             sizes = {one.get_name(): one.size() for one in ports if one.get_data_type() == PortDataType.kVectorValued}
             rows.append((code(name), ", ".join(f"`{port}` {size}" for port, size in sizes.items())))
@@ -599,7 +587,7 @@ def files() -> str:
     from guiderail.models.primitives.demonstrations import Demonstrations
     from guiderail.tools.evaluation.metrics import COLUMNS
     from guiderail.tools.evaluation.step_log import MEANINGS
-    from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
+    from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig
     from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 
     page = (

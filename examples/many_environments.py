@@ -1,19 +1,13 @@
 """Step many environments in parallel: Gymnasium's vector environment runs each of them in a separate process."""
 
-import multiprocessing
-
 import gymnasium
 
 import guiderail  # noqa: F401 (registers the environments)
 
 if __name__ == "__main__":  # each process imports this file first
-    multiprocessing.set_forkserver_preload(["guiderail.diagrams.envs.make"])  # imports the module once, not per process
     envs = gymnasium.make_vec(
         "guiderail/NarrowPassage-v0",
         num_envs=2,
-        vectorization_mode="async",
-        # The processes are forked from a new process: forks of this one would copy locks that its threads hold.
-        vector_kwargs={"context": "forkserver"},
         guidance="skgrl",
         action_repeat=5,
     )

@@ -1,4 +1,4 @@
-"""Change the reward of a task: override `reward_terms` in a subclass. Each term is a column of the results."""
+"""Change the reward of a task: override `rewards` in a subclass. Each term is a column of the results."""
 
 import numpy as np
 
@@ -10,15 +10,11 @@ from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
 class TimeCost(GridClamp):
     """Grid clamp with a cost of time and a cost of jumps of the command."""
 
-    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
-        def jump(desired_pose: np.ndarray, last_desired_pose: np.ndarray) -> float:
+    def rewards(self):
+        def jump(desired_pose, last_desired_pose):
             return -10.0 * float(np.linalg.norm(desired_pose - last_desired_pose))
 
-        return [
-            *super().reward_terms(num_actions),
-            gr.RewardTerm("time_cost", {}, lambda: -0.01),
-            gr.RewardTerm("jump_cost", {"desired_pose": 6, "last_desired_pose": 6}, jump),
-        ]
+        return {**super().rewards(), "time_cost": lambda: -0.01, "jump_cost": jump}
 
 
 env = gr.make_env("examples/TimeCost", guidance="sct", action_repeat=10)

@@ -1,57 +1,33 @@
-"""Define your own task, here a narrow passage with another gap and another goal."""
+"""Define your own task, here a passage to another goal; an option is a field of the task."""
 
-from collections.abc import Sequence
-from typing import Any
-
-import gymnasium
 import numpy as np
-from pydrake.systems.framework import Context, Diagram
 
 import guiderail as gr
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
-WORLD = PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.28, 0.42))
-STEPS, PERIOD = 80, 0.02
+PATH = np.column_stack([np.full(80, 0.35), np.linspace(0.1, 0.9, 80)])
 
 
 @gr.register_task("examples/WideGap")
 class WideGap(gr.Task):
-    """Pass a wide gap to a goal next to the demonstrations."""
+    """Pass a gap to a goal next to the demonstrations."""
 
-    workcell_kind, num_steps, clip = "plane", STEPS, 1.0
+    station, presets = gr.PlaneStation, {"hard": {"gap": 0.1}}
+    gap: float = gr.Field(0.14, ge=0.05, le=0.3, description="width of the gap [m]")
 
-    def workcell(self) -> PassageGeometry:
-        return WORLD
+    def workcell(self):
+        return PassageGeometry(goal=(0.42, 0.9), goal_radius=0.06, gap_x=(0.35 - self.gap / 2, 0.35 + self.gap / 2))
 
-    def reference(self) -> gr.ReferenceTrajectory:  # for kmp, residual, kgrl and skgrl
-        means = np.column_stack([np.full(STEPS, 0.35), np.linspace(0.1, 0.9, STEPS)])
-        return gr.ReferenceTrajectory(PERIOD * np.arange(STEPS), means, np.tile(0.04**2 * np.eye(2), (STEPS, 1, 1)))
+    def prior(self):
+        reference = gr.ReferenceTrajectory(0.02 * np.arange(80), PATH, np.tile(0.04**2 * np.eye(2), (80, 1, 1)))
+        return gr.Prior(reference, gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf]))
 
-    def constraints(self) -> gr.LinearConstraints:
-        return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
+    def rewards(self):
+        return {"nearness": lambda pose: -float(np.linalg.norm(pose - self.workcell().goal))}
 
-    def observation_terms(self) -> Sequence[gr.ObservationTerm]:
-        return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", center=0.5, scale=0.5))
-
-    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
-        return [
-            gr.RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - np.array(WORLD.goal))))
-        ]
-
-    def termination_terms(self) -> list[gr.TerminationTerm]:
-        return [gr.TerminationTerm("success", {"pose": 2}, WORLD.at_goal)]
-
-    def reset(
-        self, station: gr.Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
-    ) -> dict[str, Any]:
-        station.set_pose(context, start := np.array(WORLD.start) + 0.005 * rng.standard_normal(2))
-        return {"start": start}
+    def done(self):
+        return {"success": self.workcell().at_goal}
 
 
-env = gymnasium.make("examples/WideGap-v0", guidance="skgrl", action_repeat=5)
-print("start:", env.reset(seed=1)[1]["start"].round(3))
-is_over = False
-while not is_over:
-    _, _, terminated, truncated, info = env.step(np.array([0.8, 0.0], np.float32))
-    is_over = terminated or truncated
-print(f"termination: {info['termination']}, largest commanded violation: {info['constraint_violation']:.3f} m")
+env = gr.make_env("examples/WideGap", guidance="skgrl", action_repeat=5)
+print(gr.rollout(env, lambda observation: np.array([0.8, 0.0]), seed=1)["termination"])

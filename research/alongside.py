@@ -23,10 +23,9 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.episode import Callback, Transition
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.learner import described_observation, learner_arguments
 from guiderail.tools.learning.off_policy import OffPolicyLearner, TqcLearner
-from guiderail.tools.learning.run_folder import RunConfig
+from guiderail.tools.learning.run_folder import RunConfig, configure
 from guiderail.tools.tables import read_table, write_table
 from research.command import Parser, print_rows, run_program
 from research.distillation import evaluate_in_blocks, median_time, teacher_actions

@@ -17,8 +17,8 @@ from pydantic.dataclasses import dataclass
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import OffPolicyConfig
 from guiderail.tools.learning.learner import Positive, register_learner
+from guiderail.tools.learning.learner_config import OffPolicyConfig
 from guiderail.tools.learning.off_policy import TqcLearner
 
 
@@ -72,9 +72,9 @@ class AutoInterventionLearner(TqcLearner):
         """
         super().__init__(config, env, **arguments)
         self._env: Any = env.unwrapped
-        if config.pipelined or config.num_envs or "demonstrations" not in self._env.diagram.task.provides():
+        if config.pipelined or config.num_envs or self._env.diagram.config.reference() is None:
             raise InputError("auto_intervention needs a task with demonstrations: leave out pipelined and num_envs")
-        self._reference = self._env.diagram.task.reference()
+        self._reference = self._env.diagram.config.reference()
         self._start()
 
     def _start(self) -> None:

@@ -73,7 +73,7 @@ def evaluate_guard(guard: str, base_policy: str, episodes: int, seed: int) -> pd
     limits = {} if guard == "none" else {"max_speed": MAX_SPEED, "base_policy.max_jerk": MAX_JERK}
     env: Any = make_environment(TASK, {**options, "horizon": 15, **limits})
     try:
-        bound = env.unwrapped.diagram.task.options.bound
+        bound = env.unwrapped.diagram.task.bound
         size, period = env.action_space.shape, env.unwrapped.diagram.control_period
         limits = [np.repeat(pair, 3) for pair in (MAX_SPEED, MAX_JERK)]
         upper = np.array([bound, bound, np.inf, np.inf, np.inf, np.inf])

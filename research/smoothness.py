@@ -29,7 +29,7 @@ from guiderail.tools.evaluation.evaluation import load_or_compute
 from guiderail.tools.evaluation.metrics import jerk, summary
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import color, new_figure, save_figure
+from guiderail.tools.visualization.figures import color, new_figure, save_figure
 from research.command import Parser, print_result, run_program
 from research.exploration import RMS, low_pass, open_loop, ornstein_uhlenbeck, pink, state_dependent, uniform
 

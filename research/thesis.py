@@ -16,7 +16,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.tools.learning.config import PRESETS, OffPolicyConfig, action_gamma
+from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig, action_gamma
 from guiderail.tools.learning.run_folder import RunConfig
 
 HISTORY = ("history", "history.variance", "history.source", "history.adaptive")

@@ -21,12 +21,13 @@ import pandas as pd
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
-from guiderail.tools.ensemble import write_ensemble
 from guiderail.tools.environments import make_environment, task_named
 from guiderail.tools.evaluation.baselines import make_baseline
 from guiderail.tools.evaluation.evaluate import evaluate_policy
+from guiderail.tools.export import write_ensemble
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.run_folder import Choices
+from guiderail.tools.learning.train import Training, train
 from guiderail.tools.tables import read_table, table_text, write_table
 from guiderail_parts.batch import create_tasks
 from guiderail_parts.pairs import Pair, find_pairs
@@ -74,13 +75,11 @@ def train_once(parts: Sequence[Path], run: Path, seed: int, episodes: int) -> Pa
     _report(f"training {run.name} on {len(parts)} parts")
     names = [task_named(str(part)) for part in parts]
     if (run / "config.yaml").exists():
-        start_or_resume(None, run, environment={}, episodes=episodes, resume=True, pictures=False)
+        train(out=run, episodes=episodes, resume=True, pictures=False)
     else:
         imports = [folder for _, folders in names for folder in folders]
-        start_or_resume(
-            [name for name, _ in names], run, environment=ENVIRONMENT, settings=SETTINGS, episodes=episodes, seed=seed,
-            imports=imports, step_log=False, pictures=False,
-        )  # fmt: skip
+        choices = Choices(settings=SETTINGS, episodes=episodes, seed=seed, step_log=False)
+        Training(run, [name for name, _ in names], ENVIRONMENT, choices, imports=imports, pictures=False).start()
     return run
 
 

@@ -1,4 +1,4 @@
-"""Drake LeafSystems, one per file; most of them wrap a law of `models` that can also be called without a diagram.
+"""Drake LeafSystems; most of them wrap a law of `models` that can also be called without a diagram.
 
 The systems and the public classes of their files are exported: `from guiderail.systems import HistoryBuffer`.
 `__init__.pyi` lists the names. A module is imported at the first use of one of its names.

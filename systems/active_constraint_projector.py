@@ -7,8 +7,8 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.laws.template import TemplateLaw, TemplateState
-from guiderail.models.templates.template import SharedControlTemplate, check_template
+from guiderail.models.laws.template_law import TemplateLaw, TemplateState
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
@@ -28,21 +28,6 @@ class ActiveConstraintProjector(LeafSystem):
     for example while an obstacle blocks the robot. A repeated command can be outside the constraints after a transition
     or the motion of an object; it is then projected into the constraints.
 
-    .. pydrake_system::
-
-        name: ActiveConstraintProjector
-        input_ports:
-        - requested_pose
-        - pose
-        - state
-        - frame_poses (optional)
-        output_ports:
-        - desired_pose
-        - last_desired_pose
-        - fallback
-        - commanded_violation
-        - measured_violation
-
     All poses are (6,), [x y z Rz Ry Rx] in meters and radians; the other ports are (1,). ``state`` is the number of the
     template's state. Each violation output is the largest violation of an active constraint, in meters or radians; it
     is 0 if all active constraints are satisfied. If ``state`` is not the number of a state, the last command is
@@ -56,9 +41,9 @@ class ActiveConstraintProjector(LeafSystem):
             distance between the last command and the position measured at the same instant.
 
     Raises:
-        InputError: If an argument is out of range, a frame is missing or not finite, or active constraints of a state
-            contradict each other. At initialization, if the measured pose or a frame is not finite, or the measured
-            pose is more than 0.2 m or 1 rad outside of the active constraints.
+        InputError: If a frame is missing or not finite, or active constraints of a state contradict each other. At
+            initialization, if the measured pose or a frame is not finite, or the measured pose is more than 0.2 m or 1
+            rad outside of the active constraints.
 
     Attributes:
         frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is
@@ -73,8 +58,6 @@ class ActiveConstraintProjector(LeafSystem):
         max_tracking_error: float = np.inf,
     ):
         super().__init__()
-        check_template(template, frames)
-        declare.check_period(period)
         self._law = TemplateLaw(template, {}, period, max_tracking_error=max_tracking_error)
         self._requested_pose_port = self.DeclareVectorInputPort("requested_pose", 6)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

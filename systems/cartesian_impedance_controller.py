@@ -11,9 +11,9 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import BasicVector, BasicVector_, Context
 
-from guiderail.models.common.arrays import as_number, as_numbers, is_finite
-from guiderail.models.common.errors import InputError, brief
-from guiderail.models.control.cartesian_impedance import JointTorques, impedance_torques
+from guiderail.models.common.arrays import as_numbers, is_finite
+from guiderail.models.common.errors import InputError
+from guiderail.models.control.cartesian_impedance import ArmImpedance, JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.convertible_system import ConvertibleSystem
@@ -47,7 +47,7 @@ class ImpedanceGains:
         bound: Bound of the wrench along the axes of the stiffness frame; None: `wrench_limits`.
 
     Raises:
-        InputError: If an argument is out of range, of another type, or of another shape.
+        InputError: If an argument is out of range or of another shape.
     """
 
     stiffness: np.ndarray
@@ -74,8 +74,6 @@ class ImpedanceGains:
                 "an impedance's damping ratio must be positive, its posture's gains not negative, and all of them "
                 "finite"
             )
-        if self.bound is not None and not isinstance(self.bound, WrenchBound):
-            raise InputError(f"an impedance's bound must be a WrenchBound or None, not {brief(self.bound)}")
         posture = as_numbers(self.posture, "the posture of an impedance")
         if not np.isfinite(posture).all():
             raise InputError(f"an impedance's posture must be finite joint positions, not {self.posture}")
@@ -101,10 +99,8 @@ class Payload:
 
     def __post_init__(self) -> None:
         center = as_numbers(self.center, "the center of a payload")
-        if not 0.0 <= as_number(self.mass, "the mass of a payload") < np.inf or not np.isfinite(center).all():
-            raise InputError(f"a payload has a finite mass of at least 0 and a finite center, not {self}")
-        if center.shape != (3,):
-            raise InputError(f"the center of a payload is three numbers, not {self.center}")
+        if not 0.0 <= self.mass < np.inf or center.shape != (3,) or not np.isfinite(center).all():
+            raise InputError(f"a payload has a finite mass of at least 0 and a center of three numbers, not {self}")
 
 
 class CartesianImpedanceController(ConvertibleSystem):
@@ -122,21 +118,6 @@ class CartesianImpedanceController(ConvertibleSystem):
 
     `ToAutoDiffXd` converts a controller without bound, for derivatives with respect to state, desired pose, gains and
     payload. The converted controller follows the present command, whether it is valid or not.
-
-    .. pydrake_system::
-
-        name: CartesianImpedanceController
-        input_ports:
-        - desired_pose
-        - estimated_state
-        - command_time (optional)
-        - max_wrench (optional)
-        output_ports:
-        - generalized_force
-        - pose
-        - impedance_wrench
-        - saturation
-        - command_timed_out
 
     ``desired_pose`` and ``pose`` are X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``estimated_state`` is (2n,),
     joint positions and velocities [rad, rad/s]. ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it
@@ -163,10 +144,9 @@ class CartesianImpedanceController(ConvertibleSystem):
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range, the plant is not finalized, a frame belongs to another plant, T is
-            not fixed in the world, the posture does not have n joints, or a joint does not have exactly one actuator.
-            At an evaluation, if the estimated state is not finite. At a conversion, if the impedance is bounded or the
-            scalar type is not AutoDiffXd.
+        InputError: If a frame belongs to another plant, T is not fixed in the world, or a joint does not have exactly
+            one actuator. At an evaluation, if the estimated state is not finite. At a conversion, if the impedance is
+            bounded or the scalar type is not AutoDiffXd.
     """
 
     def __init__(
@@ -183,11 +163,7 @@ class CartesianImpedanceController(ConvertibleSystem):
     ):
         super().__init__()
         check_plant(plant, target, target=target, tool_center=tool_center, stiffness_frame=stiffness_frame or target)
-        if not isinstance(gains, ImpedanceGains):
-            raise InputError(f"the gains of an impedance are ImpedanceGains, not {brief(gains)}")
         num_joints = plant.num_positions()
-        if np.shape(gains.posture) != (num_joints,):
-            raise InputError(f"an impedance's posture must have {num_joints} joints, not {np.shape(gains.posture)}")
         self._plant, self._target, self._tool_center, self._gains = plant, target, tool_center, gains
         self._stiffness_frame = stiffness_frame
         self._default_parameters = [*_to_numbers(gains), np.zeros(4)]
@@ -209,12 +185,7 @@ class CartesianImpedanceController(ConvertibleSystem):
         )
         bound = gains.bound or WrenchBound(gains.wrench_limits, np.inf, np.inf)
         self._requested_bound = LastValidBound(self, bound, self._max_wrench_port, period=period)
-        sources = [
-            *self._followed_pose.sources,
-            self._estimated_state_port,
-            *self._requested_bound.sources,
-            self._tuning,
-        ]
+        sources = [*self._followed_pose.sources, self._estimated_state_port, *self._requested_bound.sources]
         self._law = declare.cache(self, "law", self._calc_law, [*sources, self._tuning])
         declare.part_output(self, "generalized_force", self._law, lambda law: law.torque, num_joints)
         declare.output(self, "pose", 6, self._pose, [self._estimated_state_port])
@@ -241,12 +212,10 @@ class CartesianImpedanceController(ConvertibleSystem):
         """Set the gains in the context of the system.
 
         Raises:
-            InputError: If the context is another system's, the posture has another number of joints, or the bound is
-                not the one of the constructor; lower a bound at ``max_wrench``.
+            InputError: If the context is another system's, or the bound is not the one of the constructor; lower a
+                bound at ``max_wrench``.
         """
         declare.check_own_context(self, context)
-        if np.shape(gains.posture) != np.shape(self._gains.posture):
-            raise InputError(f"an impedance's posture must have {len(self._gains.posture)} joints, as in this plant")
         if gains.bound is not self._gains.bound:
             raise InputError("the bound of an impedance is constant: keep it, and lower it at the port max_wrench")
         for index, numbers in zip(self._parameters, _to_numbers(gains), strict=False):
@@ -289,11 +258,11 @@ class CartesianImpedanceController(ConvertibleSystem):
         plant_context = self._plant_context.Eval(context)
         X_TPd = pose_to_transform(self._followed_pose.eval(context))
         law = self._law_arguments(self._plant, plant_context, X_TPd, gains, payload.mass, np.array(payload.center))
-        return impedance_torques(**law, bound=self._bound(context))
+        return impedance_torques(law, self._bound(context))
 
     def _law_arguments(
         self, plant: Any, plant_context: Any, X_TPd: Any, gains: Any, mass: Any, center: np.ndarray
-    ) -> dict[str, Any]:
+    ) -> ArmImpedance:
         """Return the arguments of the law, for a plant of any scalar type; `mass` and `center` are of the payload."""
         frames = (self._tool_center, self._target)
         tool_center, target = (plant.get_frame(frame.index()) for frame in frames)
@@ -320,21 +289,21 @@ class CartesianImpedanceController(ConvertibleSystem):
             if self._compensate_gravity:
                 weight = mass * plant.gravity_field().gravity_vector()
                 gravity_torque = gravity_torque - J_center.T @ weight
-        return {
-            "K": gains.stiffness,
-            "damping_ratio": gains.damping_ratio,
-            "wrench_limits": gains.wrench_limits,
-            "R_axes": R_TAxes,
-            "p_error": X_TPd.translation() - X_TP.translation(),
-            "eta": eta,
-            "epsilon": epsilon,
-            "J": J[[3, 4, 5, 0, 1, 2]],
-            "M": M,
-            "v": v,
-            "posture_torque": gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
-            "gravity_torque": gravity_torque,
-            "torque_limits": self._torque_limits,
-        }
+        return ArmImpedance(
+            K=gains.stiffness,
+            damping_ratio=gains.damping_ratio,
+            wrench_limits=gains.wrench_limits,
+            R_axes=R_TAxes,
+            p_error=X_TPd.translation() - X_TP.translation(),
+            eta=eta,
+            epsilon=epsilon,
+            J=J[[3, 4, 5, 0, 1, 2]],
+            M=M,
+            v=v,
+            posture_torque=gains.posture_stiffness * (gains.posture - q) - gains.posture_damping * (M @ v),
+            gravity_torque=gravity_torque,
+            torque_limits=self._torque_limits,
+        )
 
     def declare_converted(self, system: Any, scalar: type) -> None:
         """Declare the ports, states and parameters of this system in `system`, a system of `AutoDiffXd`.
@@ -378,7 +347,7 @@ class CartesianImpedanceController(ConvertibleSystem):
             X_TP = tool_center.CalcPose(plant_context, target)
             measured = [*X_TP.translation(), *RollPitchYaw_[scalar](X_TP.rotation()).vector()[::-1]]
             law = self._law_arguments(plant, plant_context, X_TPd, gains, payload[0], payload[1:])
-            return differentiable_torques(**law), np.array(measured)
+            return differentiable_torques(law), np.array(measured)
 
         sources = [state, desired_pose, inputs["max_wrench"], system.all_parameters_ticket()]
         law = declare.cache(system, "law", calc_law, sources)

@@ -14,10 +14,10 @@ from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_number, as_numbers, norm
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.damped_inverse import damped_joint_velocities, is_following
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant, pose_to_transform, transform_to_pose
 from guiderail.systems.support.last_valid_pose import CommandValidity
 
@@ -58,19 +58,6 @@ class CartesianPositionController(LeafSystem):
     (`models.control.damped_inverse`). The joint velocities then stay small, the direction of the tool deviates
     slightly from V, and null-space control moves the arm out of the singularity.
 
-    .. pydrake_system::
-
-        name: CartesianPositionController
-        input_ports:
-        - desired_pose
-        - positions
-        - command_time (optional)
-        output_ports:
-        - joint_positions
-        - pose
-        - stuck
-        - command_timed_out
-
     ``desired_pose`` is X_TP as (6,) [x y z Rz Ry Rx] in meters and radians. ``positions`` is (n,), measured joint
     positions [rad], read at initialization as the first joint command. ``command_time`` is (1,), the time stamp of
     ``desired_pose`` [s]; if it is not connected, commands never time out. ``joint_positions`` is the joint command,
@@ -89,8 +76,7 @@ class CartesianPositionController(LeafSystem):
         timeout: Age above which a desired pose is stale [s], positive and finite.
 
     Raises:
-        InputError: If an argument is out of range or has the wrong shape. At initialization, if a measured position is
-            not finite.
+        InputError: If an argument is out of range. At initialization, if a measured position is not finite.
     """
 
     def __init__(
@@ -106,19 +92,12 @@ class CartesianPositionController(LeafSystem):
         timeout: float = 0.1,
     ):
         super().__init__()
-        check_period(period)
         check_plant(plant, target, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         if num_joints < 6:
             raise InputError(f"a position controller needs an arm of at least six joints, not {num_joints}")
         if not 0.0 <= as_number(posture_gain, "posture_gain") < np.inf:
-            raise InputError(
-                f"a position controller's posture gain must be finite and not negative, not {posture_gain}"
-            )
-        if not isinstance(speed_limits, SpeedLimits):
-            raise InputError(f"a position controller's speed_limits must be SpeedLimits, not {brief(speed_limits)}")
-        if np.shape(posture) != (num_joints,):
-            raise InputError(f"a position controller's posture must have {num_joints} joints")
+            raise InputError(f"a position controller's posture gain must not be negative, not {posture_gain}")
         if not np.isfinite(posture).all():
             raise InputError(f"a position controller's posture must be finite joint positions, not {posture}")
         self._plant, self._target, self._tool_center = plant, target, tool_center
@@ -161,10 +140,7 @@ class CartesianPositionController(LeafSystem):
         return self._tool_center.CalcPose(self._plant_context.Eval(context), self._target)
 
     def _start_at_measured_positions(self, context: Context, discrete_state: DiscreteValues) -> None:
-        measured = self._positions_port.Eval(context)
-        if not np.isfinite(measured).all():
-            raise InputError(f"the first joint command is measured: measured positions must be finite, not {measured}")
-        discrete_state.set_value(self._command, measured)
+        discrete_state.set_value(self._command, declare.start_pose(self._positions_port.Eval(context)))
         for flag in (self._is_stuck, self._has_timed_out):
             discrete_state.set_value(flag, [0.0])
 

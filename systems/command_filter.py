@@ -21,16 +21,6 @@ class CommandFilter(LeafSystem):
     `MotionConstraintFilter` brakes, and the other laws repeat the last command. If the result of a law is not finite,
     the last command is repeated.
 
-    .. pydrake_system::
-
-        name: CommandFilter
-        input_ports:
-        - desired_pose
-        - pose
-        output_ports:
-        - safe_pose
-        - intervention
-
     ``desired_pose``, ``pose`` (measured) and ``safe_pose`` are (O,). ``intervention`` (1,) is 1
     if the law intervened (see the class of the law) or the last command is repeated.
 
@@ -39,7 +29,7 @@ class CommandFilter(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If the period is not positive; at initialization, if the measured pose is not finite.
+        InputError: At initialization, if the measured pose is not finite.
     """
 
     def __init__(self, law: CommandLaw, period: float):

@@ -3,7 +3,7 @@
 from pydrake.systems.framework import LeafSystem
 
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.last_valid_pose import LastValidPose
 
 
@@ -14,18 +14,6 @@ class CommandWatchdog(LeafSystem):
     than the timeout, and not more than one period in the future; see `LastValidPose`. While the blend factor is zero,
     the last valid pose is the measured pose. If there is no valid command when control begins, the robot therefore
     stays where it is.
-
-    .. pydrake_system::
-
-        name: CommandWatchdog
-        input_ports:
-        - desired_pose
-        - pose
-        - command_time (optional)
-        - blend_factor (optional)
-        output_ports:
-        - safe_pose
-        - command_timed_out
 
     ``desired_pose``, ``pose`` (measured, read at initialization and while the blend factor is zero) and ``safe_pose``
     are (O,). ``command_time`` is (1,), the time stamp of ``desired_pose`` [s]; if it is not connected, commands never
@@ -38,12 +26,11 @@ class CommandWatchdog(LeafSystem):
         pose_size: Number of coordinates O, at least 1.
 
     Raises:
-        InputError: If an argument is out of range; at initialization, if the measured pose is not finite.
+        InputError: If the timeout is out of range; at initialization, if the measured pose is not finite.
     """
 
     def __init__(self, period: float, timeout: float = 0.1, pose_size: int = 6):
         super().__init__()
-        pose_size = as_count(pose_size, "pose_size")
         self._desired_pose_port = self.DeclareVectorInputPort("desired_pose", pose_size)
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)

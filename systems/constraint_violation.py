@@ -6,21 +6,13 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import Source, check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import Source, input_getter, output_getter
 
 
 class ConstraintViolation(LeafSystem):
     """Largest violation of linear constraints G y ≥ c, or of motion constraints, by a pose y.
 
         violation = max(c − G y), negative if all constraints are slack
-
-    .. pydrake_system::
-
-        name: ConstraintViolation
-        input_ports:
-        - pose
-        output_ports:
-        - violation
 
     ``pose`` is (O,), commanded or measured. ``violation`` is (1,), in the unit of c, or as in
     `MotionConstraints.violation`; it is `UNCONSTRAINED` if there is no constraint. The violation depends only on the
@@ -29,9 +21,6 @@ class ConstraintViolation(LeafSystem):
     Args:
         constraints: Linear constraints (constant, or one set per control step) or motion constraints, on O outputs.
         period: Control period [s], positive.
-
-    Raises:
-        InputError: If the period is not positive.
     """
 
     #: Violation if there is no constraint: finite, so that it can be logged.
@@ -39,7 +28,6 @@ class ConstraintViolation(LeafSystem):
 
     def __init__(self, constraints: LinearConstraints | MotionConstraints, period: float):
         super().__init__()
-        check_period(period)
         self._constraints, self._period = constraints, period
         self._pose_port = self.DeclareVectorInputPort("pose", constraints.num_outputs)
         sources: list[Source] = [self._pose_port]

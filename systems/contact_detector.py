@@ -9,7 +9,6 @@ from pydrake.multibody.plant import ContactResults, MultibodyPlant
 from pydrake.multibody.tree import RigidBody
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_bodies
@@ -23,16 +22,6 @@ class ContactDetector(LeafSystem):
     The contact results are evaluated at every plant step, so collisions that are shorter than a control step are
     detected. All outputs are state without direct feedthrough, delayed by one plant step.
 
-    .. pydrake_system::
-
-        name: ContactDetector
-        input_ports:
-        - contact_results
-        output_ports:
-        - collision
-        - has_collided
-        - contact_force
-
     ``contact_results`` is the plant's output. ``collision`` (1,) is 1 while bodies and obstacles are in contact.
     ``has_collided`` (1,) is 1 from the first contact of the episode on. ``contact_force`` is (1,), the norm of the
     largest contact force between the two sets [N]. Point contact and hydroelastic contact both count.
@@ -40,12 +29,8 @@ class ContactDetector(LeafSystem):
     Args:
         plant: Finalized plant.
         bodies: Bodies of the plant that must not touch `obstacles`, at least one.
-        obstacles: Obstacles, at least one; no body may be in both sets.
+        obstacles: Obstacles, at least one, none in both sets.
         period: Plant step [s], positive.
-
-    Raises:
-        InputError: If the period is not positive, the plant is not finalized, a set is empty or has a body of another
-            plant, or a body is in both sets.
     """
 
     def __init__(
@@ -55,8 +40,6 @@ class ContactDetector(LeafSystem):
         check_bodies(plant, "bodies", bodies)
         check_bodies(plant, "obstacles", obstacles)
         body_indices, obstacle_indices = ({int(body.index()) for body in group} for group in (bodies, obstacles))
-        if body_indices & obstacle_indices:
-            raise InputError("a body can't collide with itself: bodies and obstacles overlap")
         self._pairs = {*product(body_indices, obstacle_indices), *product(obstacle_indices, body_indices)}
         self._body_of = {
             geometry: int(body.index())

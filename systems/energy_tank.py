@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.common.arrays import as_number, is_finite
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_difference
 from guiderail.models.control.wrench import (
     MAX_WRENCH_SIZE,
@@ -42,18 +42,6 @@ class EnergyTank(LeafSystem):
     decrease of a limit applies at once. Only work of the environment therefore increases the total energy of spring,
     tank and motion, and the environment cannot extract more than the initial energy (Ferraguti, Secchi, Fantuzzi 2013).
 
-    .. pydrake_system::
-
-        name: EnergyTank
-        input_ports:
-        - desired_pose
-        - pose
-        - max_wrench (optional)
-        output_ports:
-        - reference_pose
-        - admitted_wrench
-        - energy
-
     ``desired_pose``, ``pose`` (measured) and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. A
     desired pose that is not finite is output unchanged and uses no energy. While the measured pose is not finite, the
     reference and the energy are constant and no limit increases. ``max_wrench`` and ``admitted_wrench`` are (8,),
@@ -79,8 +67,6 @@ class EnergyTank(LeafSystem):
         self._stiffness, self._damping = check_spring_damper(stiffness, damping, "an energy tank")
         if not 0.0 < as_number(capacity, "capacity") < np.inf:
             raise InputError(f"an energy tank's capacity must be positive and finite, not {capacity} J")
-        if not isinstance(bound, WrenchBound):
-            raise InputError(f"an energy tank's bound must be a WrenchBound, not {brief(bound)}")
         if not is_finite(bound.axes):
             raise InputError(f"an energy tank needs finite limits of the wrench per axis, not {bound.axes}")
         self._capacity, self._period = capacity, period
@@ -95,13 +81,8 @@ class EnergyTank(LeafSystem):
         inputs = (self._desired_pose_port, self._pose_port, *self._requested_bound.sources)
         states = (self._last_reference, self._last_limits, self._last_pose, self._content)
         self._admitted = declare.cache_entry(self, "admitted", self._calc_admitted, [*inputs, *states])
-        sources = declare.tickets(self, [self._admitted])
-        self.DeclareVectorOutputPort(
-            "reference_pose", POSE_SIZE, self._calc_reference_pose, prerequisites_of_calc=sources
-        )
-        self.DeclareVectorOutputPort(
-            "admitted_wrench", MAX_WRENCH_SIZE, self._calc_admitted_wrench, prerequisites_of_calc=sources
-        )
+        declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, [self._admitted])
+        declare.output(self, "admitted_wrench", MAX_WRENCH_SIZE, self._admitted_wrench, [self._admitted])
         self.DeclareStateOutputPort("energy", self._content)
         declare.update(self, period, self._update, self._reset)
 
@@ -143,14 +124,13 @@ class EnergyTank(LeafSystem):
             admitted = limits + share * (requested - limits)
         value.set_value(_Admitted(next_reference, admitted, min(self._capacity, max(energy - stored, 0.0))))
 
-    def _calc_reference_pose(self, context: Context, reference: BasicVector) -> None:
+    def _reference_pose(self, context: Context) -> np.ndarray:
         desired = self._desired_pose_port.Eval(context)
-        reference.SetFromVector(self._admitted.Eval(context).reference if is_finite(desired) else desired)
+        return self._admitted.Eval(context).reference if is_finite(desired) else desired
 
-    def _calc_admitted_wrench(self, context: Context, wrench: BasicVector) -> None:
-        bound = self._requested_bound.eval(context)
-        limits = self._admitted.Eval(context).limits.tolist()
-        wrench.SetFromVector([*(limits[i] for i in POSE_ORDER), bound.force, bound.torque])
+    def _admitted_wrench(self, context: Context) -> list[float]:
+        bound, limits = self._requested_bound.eval(context), self._admitted.Eval(context).limits.tolist()
+        return [*(limits[i] for i in POSE_ORDER), bound.force, bound.torque]
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_port.Eval(context)

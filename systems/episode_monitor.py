@@ -10,7 +10,7 @@ from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.termination import EVALUATED, TERMINATIONS, Termination
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_signature, output_getter
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class TerminationTerm:
         min_progress: Increase of the value of `progress` up to which the count is not reset, not negative, finite.
 
     Raises:
-        InputError: If the termination is unknown, or `steps` or `min_progress` is out of range.
+        InputError: If the termination is unknown, or `steps` is out of range.
     """
 
     termination: str
@@ -44,8 +44,6 @@ class TerminationTerm:
             raise InputError(f"an episode can't end as '{self.termination}', only as {', '.join(EVALUATED)}")
         if not is_whole(self.steps, 1):
             raise InputError(f"the steps of a condition must be a whole number of at least 1, not {brief(self.steps)}")
-        if not 0.0 <= self.min_progress < np.inf:
-            raise InputError(f"the smallest progress must be finite and not negative, not {self.min_progress}")
 
 
 class EpisodeMonitor(LeafSystem):
@@ -55,14 +53,6 @@ class EpisodeMonitor(LeafSystem):
     this step, and the update event of the same instant stores the count. The output is constant after a term has
     terminated the episode. `simulator.set_monitor(episode_monitor.monitor)` ends the simulation with it.
 
-    .. pydrake_system::
-
-        name: EpisodeMonitor
-        input_ports:
-        - one per signal of the terms
-        output_ports:
-        - termination
-
     ``termination`` is (1,), an index of a `Termination`; 0 while the episode continues.
 
     Args:
@@ -71,18 +61,14 @@ class EpisodeMonitor(LeafSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If there is no term, the period is not positive, a signal has two sizes or a size below 1, or the
-            parameters of a function are not named like its signals. At evaluation, if a condition is neither a truth
-            value nor one finite number.
+        InputError: If a signal has two sizes, or the parameters of a function are not named like its signals. At
+            evaluation, if a condition is neither a truth value nor one finite number.
     """
 
     def __init__(self, terms: Sequence[TerminationTerm], period: float, task_name: str = ""):
         super().__init__()
         self._period = period
         self._of_task = f" of {task_name}" if task_name else ""
-        check_terms(terms, TerminationTerm, f"a monitor{self._of_task}")
-        if not terms:
-            raise InputError("a monitor needs at least one condition")
         for term in terms:
             for function in filter(None, (term.condition, term.progress)):
                 check_signature(function, term.inputs, f"the condition {term.termination!r}{self._of_task}")

@@ -9,10 +9,9 @@ from pydrake.multibody.tree import BodyIndex, RigidBody
 from pydrake.systems.framework import BasicVector, Context, DiscreteValues, LeafSystem, ValueProducer
 
 from guiderail.models.common.arrays import as_numbers
-from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.sensor_disturbance import DRIFT_TIME
+from guiderail.systems.disturbances import DRIFT_TIME
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_bodies
 
 FRICTION_SPEED = 0.01  # joint speed at which friction has 76 % of its magnitude [rad/s]
@@ -48,15 +47,6 @@ class ExternalTorqueSensor(LeafSystem):
     v₀ = `FRICTION_SPEED`, b offsets, and d a random walk. Inertial torques are compensated exactly. ε, c, b and the
     actual bodies are parameters, which `set_errors` sets at a reset.
 
-    .. pydrake_system::
-
-        name: ExternalTorqueSensor
-        input_ports:
-        - state
-        - contact_torque
-        output_ports:
-        - external_torque
-
     ``state`` is (2n,), positions and velocities of the joints [rad, rad/s]. ``contact_torque`` and ``external_torque``
     are (n,) [Nm].
 
@@ -68,25 +58,16 @@ class ExternalTorqueSensor(LeafSystem):
         period: Period of noise and drift [s], positive.
 
     Raises:
-        InputError: If the period, the noise or the drift is out of range or has the wrong shape, the plant is not
-            finalized, or the body is the world or of another plant. At an evaluation, if a position is not finite.
+        InputError: If the body is of another plant. At an evaluation, if a position is not finite.
     """
 
     def __init__(
         self, plant: MultibodyPlant, payload_body: RigidBody, noise: np.ndarray, drift: np.ndarray, *, period: float
     ):
         super().__init__()
-        check_period(period)
         check_bodies(plant, "payload_body", [payload_body])
-        if payload_body.index() == plant.world_body().index():
-            raise InputError("payload_body is the world: give the body that carries the payload")
         n = plant.num_positions()
         self._noise, self._drift = as_numbers(noise, "noise"), as_numbers(drift, "drift")
-        for values in (self._noise, self._drift):
-            if values.shape != (n,) or not (np.isfinite(values) & (values >= 0.0)).all():
-                raise InputError(
-                    f"noise and drift of torque sensors must each be {n} finite numbers, none negative, not {values}"
-                )
         self._plant, self._step = plant, np.sqrt(period / DRIFT_TIME)
         self._bodies = [plant.get_body(BodyIndex(i)) for i in range(1, plant.num_bodies())]
         self._nominal = [body.default_mass() for body in self._bodies]
@@ -126,27 +107,11 @@ class ExternalTorqueSensor(LeafSystem):
         return tuple(self._bodies)
 
     def set_errors(self, context: Context, errors: JointTorqueErrors, seed: int) -> None:
-        """Set the errors of an episode, and the seed of noise and drift; `context` is this system's.
-
-        Raises:
-            InputError: If an error has the wrong shape or is not finite, or the seed is not a whole number of at
-                least 0.
-        """
-        n, bodies = len(self._noise), len(self._bodies)
-        parameters = {self._seed: np.array(declare.seed_parameter(seed))}
-        for name, index, shape in (
-            ("gain", self._gain, (n,)),
-            ("offset", self._offset, (n,)),
-            ("friction", self._friction, (n,)),
-            ("mass", self._mass, (bodies,)),
-            ("center", self._center, (bodies, 3)),
-        ):
-            values = as_numbers(getattr(errors, name), f"{name} of joint torque errors")
-            if values.shape != shape or not np.isfinite(values).all():
-                raise InputError(f"{name} of joint torque errors must be finite numbers {shape}, not {brief(values)}")
-            parameters[index] = values.ravel()
-        for index, values in parameters.items():
-            context.get_mutable_numeric_parameter(index).SetFromVector(values)
+        """Set the errors of an episode, and the seed of noise and drift; `context` is this system's."""
+        parameters = (self._gain, self._offset, self._friction, self._mass, self._center, self._seed)
+        values = (errors.gain, errors.offset, errors.friction, errors.mass, errors.center.ravel(), np.array([seed]))
+        for index, numbers in zip(parameters, values, strict=True):
+            context.get_mutable_numeric_parameter(index).SetFromVector(numbers)
 
     def add_payload(self, context: Context, mass: float) -> None:
         """Add a payload of `mass` [kg] that the model of the arm does not contain; `context` is this system's."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number, as_numbers
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -23,17 +23,6 @@ class GripperCommand(LeafSystem):
     With one joint, the distance of the fingers, the outputs ``desired_position`` and ``force_limit`` fit Drake's
     ``SchunkWsgPositionController``, its ``SchunkWsgCommandSender`` and a ``SchunkWsgDriver`` (see `for_wsg`).
 
-    .. pydrake_system::
-
-        name: GripperCommand
-        input_ports:
-        - position (optional)
-        - requested_force (optional)
-        output_ports:
-        - desired_state
-        - desired_position
-        - force_limit
-
     ``position`` and ``desired_position`` are (n,) [m or rad]. ``desired_state`` is (2n,), positions and velocities.
     ``requested_force`` and ``force_limit`` are (1,) [N].
 
@@ -45,39 +34,28 @@ class GripperCommand(LeafSystem):
         max_force: Largest and initial force limit [N], positive and finite.
 
     Raises:
-        InputError: If the sizes differ or an argument is out of range.
+        InputError: If the opening is outside of the limits, or the force is not positive and finite.
     """
 
     def __init__(
-        self,
-        lower: np.ndarray,
-        upper: np.ndarray,
-        opening: np.ndarray,
-        *,
-        period: float,
-        max_force: float = WSG_FORCE,
+        self, lower: np.ndarray, upper: np.ndarray, opening: np.ndarray, *, period: float, max_force: float = WSG_FORCE
     ):
         super().__init__()
         self._lower, self._upper = as_numbers(lower, "lower"), as_numbers(upper, "upper")
         opening = as_numbers(opening, "opening")
-        if not self._lower.shape == self._upper.shape == opening.shape or opening.ndim != 1:
-            raise InputError("a gripper needs a lower limit, an upper limit and an opening for each of its joints")
         if not ((self._lower <= opening) & (opening <= self._upper)).all():
             raise InputError(f"a gripper's opening must be within its joints' limits, not {opening}")
-        self._max_force = as_number(max_force, "max_force")
-        if not 0.0 < self._max_force < np.inf:
+        self._max_force = max_force
+        if not 0.0 < max_force < np.inf:
             raise InputError(f"a gripper's max_force must be positive and finite, not {max_force}")
         num_joints = len(opening)
         self._position_port = self.DeclareVectorInputPort("position", num_joints)
         self._force_port = self.DeclareVectorInputPort("requested_force", 1)
         self._last_position = self.DeclareDiscreteState(opening)
         self._last_force = self.DeclareDiscreteState([self._max_force])
-        declare.output(
-            self, "desired_state", 2 * num_joints, self._desired_state, [self._position_port, self._last_position]
-        )
-        declare.output(
-            self, "desired_position", num_joints, self._valid_position, [self._position_port, self._last_position]
-        )
+        sources = [self._position_port, self._last_position]
+        declare.output(self, "desired_state", 2 * num_joints, self._desired_state, sources)
+        declare.output(self, "desired_position", num_joints, self._valid_position, sources)
         declare.output(self, "force_limit", 1, self._valid_force, [self._force_port, self._last_force])
         declare.update(self, period, self._update, declare.reset_to_default(self))
 

@@ -6,7 +6,7 @@ from pydrake.systems.framework import Context, LeafSystem
 from pydrake.systems.sensors import ImageRgba8U
 
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class ImageObservation(LeafSystem):
@@ -16,15 +16,6 @@ class ImageObservation(LeafSystem):
 
     The image is stored channel by channel (red, green, blue), each row by row.
 
-    .. pydrake_system::
-
-        name: ImageObservation
-        input_ports:
-        - image
-        - state
-        output_ports:
-        - observation
-
     ``image`` is an abstract `ImageRgba8U` whose alpha channel is ignored. ``state`` is (n,). ``observation`` is
     (3 · height · width + n,).
 
@@ -32,15 +23,10 @@ class ImageObservation(LeafSystem):
         width: Width of the image, at least 1 [pixels].
         height: Height of the image, at least 1 [pixels].
         state_size: Size n of the state, at least 1.
-
-    Raises:
-        InputError: If a size is not a whole number of at least 1.
     """
 
     def __init__(self, width: int, height: int, state_size: int):
         super().__init__()
-        width, height = as_count(width, "the width of an image"), as_count(height, "the height of an image")
-        state_size = as_count(state_size, "state_size")
         self._image_port = self.DeclareAbstractInputPort("image", Value(ImageRgba8U(width, height)))
         self._state_port = self.DeclareVectorInputPort("state", state_size)
         size = 3 * height * width + state_size

@@ -5,7 +5,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, JacobianWrtVariable
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
-from guiderail.models.common.arrays import as_number, is_finite
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -22,15 +22,6 @@ class JointTorqueWrench(LeafSystem):
     J is the Jacobian of the tool center, and y the output. τ_external are the measured joint torques minus the torques
     of the arm's weight and inertia. The controller of an arm with torque sensors provides τ_external. The pseudoinverse
     is damped, so that the estimate tends to zero near a singular posture instead of diverging.
-
-    .. pydrake_system::
-
-        name: JointTorqueWrench
-        input_ports:
-        - positions
-        - external_torque
-        output_ports:
-        - wrench
 
     ``positions`` [rad] and ``external_torque`` [Nm] are (n,), in the order of the plant's joint positions. ``wrench``
     is (6,), at the tool center P in the axes of T, [fx fy fz tx ty tz] in N and Nm. It is a discrete state without
@@ -63,9 +54,8 @@ class JointTorqueWrench(LeafSystem):
         damping: float = 1e-4,
     ):
         super().__init__()
-        if not all(0.0 <= as_number(value, "time_constant and damping") < np.inf for value in (time_constant, damping)):
+        if not (0.0 <= time_constant < np.inf and 0.0 <= damping < np.inf):
             raise InputError("a wrench estimate's time constant and damping must be finite and not negative")
-        declare.check_period(period)
         check_plant(plant, target=target, tool_center=tool_center)
         num_joints = plant.num_positions()
         self._plant, self._target, self._tool_center = plant, target, tool_center

@@ -8,7 +8,7 @@ from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
 from guiderail.models.laws.law import Law, check_command, check_law, safe_command
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import as_count, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class LawSystem(LeafSystem):
@@ -19,18 +19,6 @@ class LawSystem(LeafSystem):
 
     If the law does not command O finite numbers, the previous desired pose is repeated (initially the measured pose)
     and ``fallback`` is 1, so that NaN is never commanded.
-
-    .. pydrake_system::
-
-        name: LawSystem
-        input_ports:
-        - action
-        - pose
-        - wrench
-        output_ports:
-        - desired_pose
-        - held_action
-        - fallback
 
     ``action`` and ``held_action`` are (A,), ``pose`` and ``desired_pose`` (O,), ``wrench`` (W,), ``fallback`` (1,).
     ``wrench`` must not depend on ``desired_pose`` at the initialization; take it from a sensor or behind a hold.
@@ -44,8 +32,8 @@ class LawSystem(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If an argument is out of range, or `law` is not a law. At initialization, if the measured pose is
-            not finite, or the law does not command O numbers.
+        InputError: If `law` is not a law. At initialization, if the measured pose is not finite, or the law does not
+            command O numbers.
     """
 
     def __init__(self, law: Law, wrench_size: int, period: float):
@@ -54,7 +42,7 @@ class LawSystem(LeafSystem):
         self._law = law
         self._action_port = self.DeclareVectorInputPort("action", law.num_actions)
         self._pose_port = self.DeclareVectorInputPort("pose", law.num_outputs)
-        self._wrench_port = self.DeclareVectorInputPort("wrench", as_count(wrench_size, "wrench_size"))
+        self._wrench_port = self.DeclareVectorInputPort("wrench", wrench_size)
         self._example = law.default_state()
         self._state = self.DeclareDiscreteState(_flat(self._example))
         self._last = declare.unset_state(self, law.num_outputs)

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
+from pydrake.systems.framework import Context, DiscreteValues, LeafSystem
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.laws.law import checked_vector
 from guiderail.models.laws.primitive import output_or_nearest, predict
@@ -30,20 +30,6 @@ class LcNsKmpSystem(LeafSystem):
 
         command = LC-NS-KMP(step, gain · null_space_action)             KGRL, equation 4.21
         command = LC-NS-KMP(step, gain · null_space_action, history)    sKGRL, equation 5.1
-
-    .. pydrake_system::
-
-        name: LcNsKmpSystem
-        input_ports:
-        - null_space_action
-        - history (if P > 0)
-        - history_length (if there are primitives with shorter histories)
-        - motion_time (optional)
-        - reference_window (optional)
-        output_ports:
-        - command
-        - constraint_violation
-        - fallback
 
     ``null_space_action`` is (O,), the policy's action in [−1, 1], which is not clipped here, constant during a control
     step. ``history`` is (P*O,), row-major, oldest output first (`HistoryBuffer`). ``history_length`` (1,) selects the
@@ -72,12 +58,9 @@ class LcNsKmpSystem(LeafSystem):
         primitive: Primitive with the longest history.
 
     Raises:
-        InputError: If an argument has the wrong type, a gain has the wrong shape or is not finite, the period is not
-            positive, or the primitives in `shorter` do not have different histories of 1 to P − 1 outputs and the
-            constraints of `primitive`. At initialization, if ``reference_window`` is connected and the primitives
-            have different horizons. At an evaluation, if the action, the history or the time is not finite, no
-            primitive has the selected history length, or the history of a pose (O = 6) starts more than half a turn
-            from the reference.
+        InputError: If the gain is not finite, or a primitive in `shorter` has other constraints. At an evaluation, if
+            the action, the history or the time is not finite, no primitive has the selected history length, or the
+            history of a pose (O = 6) starts more than half a turn from the reference.
     """
 
     def __init__(
@@ -88,15 +71,7 @@ class LcNsKmpSystem(LeafSystem):
         shorter: Sequence[tuple[LcNsKmp, np.ndarray]] = (),
     ):
         super().__init__()
-        shorter = _checked_pairs(shorter)
-        for candidate in (primitive, *(other for other, _ in shorter)):
-            if not isinstance(candidate, LcNsKmp):
-                raise InputError(f"a primitive of this system is an LcNsKmp, not {brief(candidate)}")
         outputs = primitive.num_outputs
-        if any(other.history not in range(1, primitive.history) for other, _ in shorter):
-            raise InputError(f"a shorter history has 1 to {primitive.history - 1} outputs")
-        if len({other.history for other, _ in shorter}) < len(shorter):
-            raise InputError("two shorter histories have the same length")
         for other, _ in shorter:
             first, second = primitive.constraints, other.constraints
             if not (np.array_equal(first.G, second.G) and np.array_equal(first.c, second.c)):
@@ -135,27 +110,10 @@ class LcNsKmpSystem(LeafSystem):
         return self._by_history_length[self.primitive.history][1].copy()
 
     get_null_space_action_input_port = input_getter("null_space_action", "policy's action in [−1, 1], (O,)")
-
-    def get_history_input_port(self) -> InputPort:
-        """Return the port of the last outputs, (P*O,), oldest first.
-
-        Raises:
-            InputError: If the primitive has no history.
-        """
-        if self._history_port is None:
-            raise InputError("this primitive has no history (P = 0), hence no such port")
-        return self._history_port
-
-    def get_history_length_input_port(self) -> InputPort:
-        """Return the port of the history length, (1,).
-
-        Raises:
-            InputError: If there is only one primitive.
-        """
-        if self._history_length_port is None:
-            raise InputError("this system has one primitive, hence no such port: give `shorter` primitives")
-        return self._history_length_port
-
+    get_history_input_port = input_getter("history", "last outputs, (P*O,), oldest first, if P > 0")
+    get_history_length_input_port = input_getter(
+        "history_length", "history length, (1,), if there are primitives with shorter histories"
+    )
     get_motion_time_input_port = input_getter("motion_time", "time of the motion, (1,) [s]; optional")
     get_reference_window_input_port = input_getter(
         "reference_window", "means and covariances of the window, ((H+1)(O + O²),); optional"
@@ -165,9 +123,6 @@ class LcNsKmpSystem(LeafSystem):
     get_fallback_output_port = output_getter("fallback", "flag that the command is a fallback, (1,)")
 
     def _reset(self, context: Context, discrete_state: DiscreteValues) -> None:
-        horizons = sorted({primitive.horizon for primitive, _ in self._by_history_length.values()})
-        if len(horizons) > 1 and self._reference_window_port.HasValue(context):
-            raise InputError(f"with a reference window all primitives must have one horizon, not {horizons}")
         step = round(context.get_time() / self._period)
         discrete_state.set_value(self._step, [step])
         if step == 0:  # after a later initialization, a fallback still uses the last command
@@ -213,9 +168,3 @@ class LcNsKmpSystem(LeafSystem):
     def _violation(self, prediction: _Prediction) -> float:
         violation = self.primitive.constraints.violation(prediction.output, prediction.step)
         return max(violation, ConstraintViolation.UNCONSTRAINED)
-
-
-def _checked_pairs(shorter: object) -> tuple[tuple[LcNsKmp, np.ndarray], ...]:
-    if isinstance(shorter, Sequence) and all(isinstance(pair, tuple | list) and len(pair) == 2 for pair in shorter):
-        return tuple((primitive, gain) for primitive, gain in shorter)
-    raise InputError(f"shorter is a list of primitives with their gains, not {brief(shorter)}")

@@ -6,8 +6,8 @@ import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, LeafSystem, State, System
 
-from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.support.declarations import as_count, check_period, input_getter, output_getter
+from guiderail.models.common.errors import InputError
+from guiderail.systems.support.declarations import input_getter, output_getter
 
 
 class PolicyError(RuntimeError):
@@ -24,14 +24,6 @@ class PolicySystem(LeafSystem):
     the new action from that instant on. The results of a `Simulator` of a task diagram with this system are therefore
     bit-identical to those of `DiagramEnv` with the same policy (see docs/concepts/rates.md).
 
-    .. pydrake_system::
-
-        name: PolicySystem
-        input_ports:
-        - observation
-        output_ports:
-        - action
-
     ``observation`` is a vector (N,) or an abstract image. The policy's argument is an array as returned by an
     environment: (N,) of float32 or (h, w, 3) of uint8. ``action`` is (A,), in [−1, 1]. It is state without direct
     feedthrough: zero before the first evaluation and after a reset.
@@ -44,7 +36,6 @@ class PolicySystem(LeafSystem):
         period: Action period [s], positive, an integer multiple of the control period.
 
     Raises:
-        InputError: If an argument is out of range, or `policy` is not a function.
         PolicyError: At an update, if the policy does not return A finite numbers.
     """
 
@@ -56,17 +47,13 @@ class PolicySystem(LeafSystem):
         period: float,
     ):
         super().__init__()
-        check_period(period)
-        if not callable(policy):
-            raise InputError(f"a policy is a function from an observation to an action, not {brief(policy)}")
         self._policy = policy
         self._is_image = isinstance(observation, AbstractValue)
         if isinstance(observation, AbstractValue):
             self._observation_port = self.DeclareAbstractInputPort("observation", observation)
         else:
-            observation_size = as_count(observation, "the size of an observation")
-            self._observation_port = self.DeclareVectorInputPort("observation", observation_size)
-        self._action = self.DeclareDiscreteState(as_count(action_size, "action_size"))
+            self._observation_port = self.DeclareVectorInputPort("observation", observation)
+        self._action = self.DeclareDiscreteState(action_size)
         self._action_port = self.DeclareStateOutputPort("action", self._action)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period, 0.0, self._update)
 
@@ -74,11 +61,6 @@ class PolicySystem(LeafSystem):
     get_action_output_port = output_getter("action", "last action, (A,), in [−1, 1]")
 
     def _update(self, context: Context, state: State) -> None:
-        """Evaluate the policy and set the action.
-
-        Raises:
-            PolicyError: If the policy does not return A finite numbers.
-        """
         returned = self._policy(self._observe(context))
         try:
             action = np.asarray(returned, dtype=float)

@@ -10,15 +10,6 @@ from guiderail.systems.support.declarations import input_getter, output_getter
 class ProgressClock(LeafSystem):
     """Count the steps of a movement primitive while the robot follows the commands (`StateProgress`).
 
-    .. pydrake_system::
-
-        name: ProgressClock
-        input_ports:
-        - command
-        - pose
-        output_ports:
-        - motion_time
-
     ``command`` and ``pose`` (measured) are (O,). ``motion_time`` (1,) is the time of the motion [s], a whole multiple
     of the period; it is a discrete state, and zero at initialization.
 
@@ -26,9 +17,6 @@ class ProgressClock(LeafSystem):
         rule: Rule that determines the next step of the motion in each control step.
         num_outputs: Number O of outputs.
         period: Control period [s], positive.
-
-    Raises:
-        InputError: If the period is not positive.
     """
 
     def __init__(self, rule: StateProgress, num_outputs: int, period: float):

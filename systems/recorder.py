@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, EventStatus, LeafSystem
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import SignalPorts, as_count, output_getter
+from guiderail.systems.support.declarations import SignalPorts, output_getter
 
 
 @dataclass(frozen=True)
@@ -34,31 +33,17 @@ class Recorder(LeafSystem):
     these are the command since (k−1)·period and the resulting motion. Recording stops after `num_samples` samples. The
     samples are declared state, which a reset or an initialization clears.
 
-    .. pydrake_system::
-
-        name: Recorder
-        input_ports:
-        - one per signal
-        output_ports:
-        - num_recorded
-
     ``num_recorded`` is (1,), the number of samples so far. `recording` returns the samples.
 
     Args:
         signals: Size of each signal by name, at least one signal.
         num_samples: Maximum number of samples, at least 1.
         period: Control period [s], positive.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(self, signals: Mapping[str, int], num_samples: int, period: float):
         super().__init__()
-        num_samples = as_count(num_samples, "num_samples of a recorder")
         self._signals = SignalPorts(self, signals)
-        if not signals:
-            raise InputError("a recorder needs at least one signal")
         self._sizes = {name: self._signals.port(name).size() for name in signals}
         self._width, self._num_samples, self._period = sum(self._sizes.values()), num_samples, period
         self._count = self.DeclareDiscreteState(1)

@@ -1,7 +1,7 @@
 """Reference governor of an impedance whose spring and damper belong to the plant."""
 
 import numpy as np
-from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from pydrake.systems.framework import Context, LeafSystem
 
 from guiderail.models.common.arrays import as_number
 from guiderail.models.common.errors import InputError
@@ -20,16 +20,6 @@ class ReferenceGovernor(LeafSystem):
     coordinates, and h is the time step. The spring accelerates the mass m to at most the speed F / (2 √(k m)), with the
     force bound F and the contact stiffness k (see `slow_down`). If no limit is active, the desired pose is output
     unchanged up to rounding.
-
-    .. pydrake_system::
-
-        name: ReferenceGovernor
-        input_ports:
-        - desired_pose
-        - state
-        - max_wrench (optional)
-        output_ports:
-        - reference_pose
 
     ``desired_pose`` and ``reference_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``state`` is (12,), the
     measured pose and its velocity [m/s, rad/s]. ``max_wrench`` is (8,), the limits of [fx fy fz tx ty tz], of the norm
@@ -58,16 +48,14 @@ class ReferenceGovernor(LeafSystem):
         self._state_port = self.DeclareVectorInputPort("state", 2 * POSE_SIZE)
         self._max_wrench_port = self.DeclareVectorInputPort("max_wrench", MAX_WRENCH_SIZE)
         sources = [self._desired_pose_port, self._state_port, self._max_wrench_port]
-        self.DeclareVectorOutputPort(
-            "reference_pose", POSE_SIZE, self._calc_reference_pose, prerequisites_of_calc=declare.tickets(self, sources)
-        )
+        declare.output(self, "reference_pose", POSE_SIZE, self._reference_pose, sources)
 
     get_desired_pose_input_port = input_getter("desired_pose", "desired pose, (6,)")
     get_state_input_port = input_getter("state", "measured pose and its velocity, (12,)")
     get_max_wrench_input_port = input_getter("max_wrench", "limits per axis and of the norms, (8,) [N, Nm]; optional")
     get_reference_pose_output_port = output_getter("reference_pose", "reference of the spring, (6,)")
 
-    def _calc_reference_pose(self, context: Context, reference: BasicVector) -> None:
+    def _reference_pose(self, context: Context) -> np.ndarray:
         state, bound = self._state_port.Eval(context), self._bound
         if self._max_wrench_port.HasValue(context):
             bound = bound.lowered_to(self._max_wrench_port.Eval(context))
@@ -81,4 +69,4 @@ class ReferenceGovernor(LeafSystem):
             self._step,
             bound.in_pose_order,
         )
-        reference.SetFromVector(pose + error)
+        return pose + error

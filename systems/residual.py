@@ -6,7 +6,6 @@ import numpy as np
 from pydrake.systems.framework import Context
 
 from guiderail.models.common.arrays import as_numbers
-from guiderail.models.common.errors import InputError
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -17,31 +16,17 @@ class Residual(ConvertibleSystem):
 
         desired_pose = reference + K action
 
-    .. pydrake_system::
-
-        name: Residual
-        input_ports:
-        - reference
-        - action
-        output_ports:
-        - desired_pose
-
     All ports are (O,); ``action`` is in [−1, 1]. Drake's `Adder` is not used, because its output counts as
     time-dependent: downstream outputs would be computed again at every plant step. `ToAutoDiffXd` and `ToSymbolic`
     convert the system.
 
     Args:
         gain: Diagonal of K, (O,), in units of the reference per unit of action.
-
-    Raises:
-        InputError: If the gain is not a nonempty vector of finite numbers.
     """
 
     def __init__(self, gain: np.ndarray):
         super().__init__()
         self._gain = as_numbers(gain, "gain")
-        if self._gain.ndim != 1 or not self._gain.size or not np.isfinite(self._gain).all():
-            raise InputError(f"a residual's gain must be one finite number per output, not {gain}")
         self.declare_converted(self, float)
 
     get_reference_input_port = input_getter("reference", "reference, (O,)")

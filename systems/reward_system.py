@@ -12,7 +12,7 @@ from pydrake.systems.framework import Context, OutputPort
 from guiderail.models.common.errors import InputError, brief
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.convertible_system import ConvertibleSystem
-from guiderail.systems.support.declarations import SignalPorts, check_signature, check_terms, output_getter
+from guiderail.systems.support.declarations import SignalPorts, check_signature, output_getter
 
 
 @dataclass(frozen=True)
@@ -35,15 +35,6 @@ class RewardSystem(ConvertibleSystem):
 
         r = Σ_i r_i    (as in equation 4.22)
 
-    .. pydrake_system::
-
-        name: RewardSystem
-        input_ports:
-        - one per signal of the terms
-        output_ports:
-        - reward
-        - one per term
-
     All outputs are (1,). The system has no state: values of the previous control step come from a `ZeroOrderHold` of
     the control period. `ToAutoDiffXd` and `ToSymbolic` convert the system if the functions of the terms accept arrays
     of these numbers: without ``float()``, and for `ToSymbolic` without comparisons.
@@ -53,49 +44,34 @@ class RewardSystem(ConvertibleSystem):
         task_name: Name of the task, for messages.
 
     Raises:
-        InputError: If `terms` is not a sequence of reward terms, there is no term, a name is not allowed, a signal's
-            size is below 1 or differs between terms, or the parameters of a function are not named like its signals.
-            At an evaluation, if a term is not one finite number, or the sum of the terms is not finite.
+        InputError: If a signal has two sizes, or the parameters of a function are not named like its signals. At an
+            evaluation, if a term is not one finite number, or the sum of the terms is not finite.
     """
 
     def __init__(self, terms: Sequence[RewardTerm], task_name: str = ""):
         super().__init__()
         self._of_task = f" of {task_name}" if task_name else ""
-        check_terms(terms, RewardTerm, f"a reward{self._of_task}")
-        self._terms, names = tuple(terms), [term.name for term in terms]
-        are_allowed = all(isinstance(name, str) and name not in ("", "reward") for name in names)
-        if not names or not are_allowed or len(set(names)) < len(names):
-            raise InputError(
-                f"a reward{self._of_task} needs terms of different names, neither empty nor 'reward', "
-                f"not {brief(names)}"
-            )
+        self._terms = tuple(terms)
         for term in terms:
             check_signature(term.value, term.inputs, f"reward term {term.name!r}{self._of_task}")
         self._signals = SignalPorts(self, *(term.inputs for term in terms))
         sources = self._signals.tickets or {self.nothing_ticket()}
         self._values = declare.cache(self, "terms", self._calc_terms, sources)
         declare.part_output(self, "reward", self._values, self._sum)
-        self._term_ports = {
-            term.name: declare.part_output(self, term.name, self._values, itemgetter(i)) for i, term in enumerate(terms)
-        }
+        for i, term in enumerate(terms):
+            declare.part_output(self, term.name, self._values, itemgetter(i))
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the terms, in order."""
-        return tuple(self._term_ports)
+        return tuple(term.name for term in self._terms)
 
     get_signal_input_port = declare.get_signal_input_port
     get_reward_output_port = output_getter("reward", "sum of all terms, (1,)")
 
     def get_term_output_port(self, name: str) -> OutputPort:
-        """Return the port of the term `name`, (1,).
-
-        Raises:
-            InputError: If there is no such term.
-        """
-        if name not in self._term_ports:
-            raise InputError(f"the reward has no term '{name}', only {', '.join(self._term_ports)}")
-        return self._term_ports[name]
+        """Return the port of the term `name`, (1,)."""
+        return self.GetOutputPort(name)
 
     def declare_converted(self, system: Any, scalar: type) -> None:
         """Declare the ports of this system in `system`; the terms are computed with numbers of the type `scalar`."""

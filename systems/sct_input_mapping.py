@@ -6,10 +6,10 @@ import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem
 
-from guiderail.models.laws.template import requested_pose
-from guiderail.models.templates.template import SharedControlTemplate, check_template
+from guiderail.models.laws.template_law import requested_pose
+from guiderail.models.templates.template import SharedControlTemplate
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.declarations import check_period, input_getter, output_getter
+from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.template_frames import TemplateFrames
 
 
@@ -21,17 +21,6 @@ class SctInputMapping(LeafSystem):
     H is ``pose``, u is ``action`` clipped to [−1, 1] and constant for one period, and q is ``state``. If ``action`` is
     not finite, or ``state`` is not the number of a state, the requested pose is NaN, and an `ActiveConstraintProjector`
     repeats its last safe command.
-
-    .. pydrake_system::
-
-        name: SctInputMapping
-        input_ports:
-        - action
-        - pose
-        - state
-        - frame_poses (optional)
-        output_ports:
-        - requested_pose
 
     ``action`` is (n,), in [−1, 1]; ``pose`` and ``requested_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians;
     ``state`` is (1,), the number of the template's state.
@@ -51,8 +40,7 @@ class SctInputMapping(LeafSystem):
 
     def __init__(self, template: SharedControlTemplate, frames: Mapping[str, RigidTransform], period: float):
         super().__init__()
-        check_period(period)
-        check_template(template, frames)
+        declare.check_period(period)
         self._template, self._period = template, period
         self._action_port = self.DeclareVectorInputPort("action", template.inputs)
         self._pose_port = self.DeclareVectorInputPort("pose", 6)

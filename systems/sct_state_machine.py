@@ -26,19 +26,6 @@ class SctStateMachine(LeafSystem):
     postponed until a command can satisfy the active constraints of the next state within one period. An episode begins
     in the state of the initial pose (`SharedControlTemplate.state_at`).
 
-    .. pydrake_system::
-
-        name: SctStateMachine
-        input_ports:
-        - pose
-        - initial_pose
-        - frame_poses (optional)
-        output_ports:
-        - state
-        - transition_distance
-        - progress
-        - max_wrench
-
     ``pose`` and ``initial_pose`` are (6,), [x y z Rz Ry Rx] in meters and radians. ``initial_pose`` is the measured
     pose. It replaces ``pose`` at initialization, because a commanded ``pose`` may not be initialized yet. ``state`` is
     (1,), the number of the state, without direct feedthrough. ``transition_distance`` is (1,), d_q of the current state
@@ -57,8 +44,8 @@ class SctStateMachine(LeafSystem):
         period: Control period [s], positive.
 
     Raises:
-        InputError: If the period is not positive, or a frame is missing or not finite. At initialization, if
-            ``initial_pose`` is not finite, or a state limits force or torque and nothing reads ``max_wrench``.
+        InputError: If a frame is missing or not finite. At initialization, if ``initial_pose`` is not finite, or a
+            state limits force or torque and nothing reads ``max_wrench``.
 
     Attributes:
         frames: Poses of the template's object frames, parameters that a reset can set. While ``frame_poses`` (6·k,) is

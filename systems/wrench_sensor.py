@@ -8,8 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, Frame, Joint, RigidBody, WeldJoint
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
-from guiderail.models.common.arrays import as_number
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.control.wrench import external_wrench
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
@@ -25,17 +24,6 @@ class WrenchSensor(LeafSystem):
     of the wrist, a joint. The tool consists of the child body of the wrist and all bodies welded to it. F is
     transformed to the center of compliance P and expressed in axes that are fixed in the world. y is the output.
 
-    .. pydrake_system::
-
-        name: WrenchSensor
-        input_ports:
-        - reaction_forces
-        - body_poses
-        - body_spatial_velocities
-        - body_spatial_accelerations
-        output_ports:
-        - wrench
-
     The inputs are the plant's outputs of the same names. ``wrench`` is (6,), [fx fy fz tx ty tz] in N and Nm. It is a
     discrete state without direct feedthrough, delayed by one sample, and zero after an initialization.
 
@@ -49,8 +37,9 @@ class WrenchSensor(LeafSystem):
         time_constant: Time constant τ of the filter [s], not negative; 0 disables it.
 
     Raises:
-        InputError: If an argument is out of range, of another type or plant, the first body of `tool` is not the child
-            of the wrist, `center` is not fixed to a body of `tool`, or a body welded to the tool is missing in `tool`.
+        InputError: If the time constant is out of range, a body is of another plant, the first body of `tool` is not
+            the child of the wrist, `center` is not fixed to a body of `tool`, or a body welded to the tool is missing
+            in `tool`.
     """
 
     def __init__(
@@ -64,15 +53,10 @@ class WrenchSensor(LeafSystem):
         time_constant: float,
     ):
         super().__init__()
-        declare.check_period(period)
-        if not 0.0 <= as_number(time_constant, "time_constant") < np.inf:
+        if not 0.0 <= time_constant < np.inf:
             raise InputError(f"a wrench sensor's time constant must be finite and not negative, not {time_constant} s")
         check_bodies(plant, "tool", tool)
         check_plant(plant, center=center)
-        if not isinstance(R_WAxes, RotationMatrix):
-            raise InputError(f"R_WAxes is a RotationMatrix, not {brief(R_WAxes)}")
-        if not isinstance(wrist, Joint) or wrist.GetParentPlant() is not plant:
-            raise InputError(f"a wrist is a joint of the plant, not {brief(wrist)}")
         if wrist.child_body().index() != tool[0].index():
             raise InputError(f"the first body of a wrench sensor's tool must be the child of {wrist.name()}")
         indices = {int(body.index()) for body in tool}

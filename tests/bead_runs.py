@@ -15,7 +15,7 @@ bead.register()
 @pytest.fixture(scope="session")
 def bead_config():
     """Return the configuration of a run of about one second: small networks, updated from the second episode on."""
-    from guiderail.tools.learning.configure import configure
+    from guiderail.tools.learning.run_folder import configure
 
     settings = {"net_arch": "16", "batch_size": 16, "learning_starts": 10, "gradient_steps": 4}
     return configure("Bead", {}, settings=settings, episodes=8, seed=5)
@@ -39,9 +39,9 @@ def bead_run(_bead_run, tmp_path):
 @pytest.fixture(autouse=True, scope="session")
 def simplify_pictures():
     """Omit the layout of labels, half of the time of a picture, and show one episode on the page of a run."""
-    from guiderail.tools.visualization import replay, style
+    from guiderail.tools.visualization import figures, replay
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(style, "LAYOUT", None)
+        patch.setattr(figures, "LAYOUT", None)
         patch.setattr(replay, "EPISODES", 1)
         yield

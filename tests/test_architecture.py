@@ -18,6 +18,7 @@ MAY_IMPORT = {
 }
 # Siblings, and the other siblings that each of them imports where they are installed (`require_sibling`, extras).
 REQUIRED = {
+    "guiderail_calibration": ("guiderail_studies",),
     "guiderail_cpp": (),
     "guiderail_data": ("guiderail_parts",),
     "guiderail_hardware": ("guiderail_mujoco",),

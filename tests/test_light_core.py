@@ -80,7 +80,7 @@ def test_learners_import_neither_drake_nor_pandas():
     """The virtual environment with metaworld and robosuite (`make outside`) has neither package."""
     output = run_without_extras("""
     sys.meta_path.pop(0)  # the extras can be imported
-    from guiderail.tools.learning import fast_sb3, networks, sb3
+    from guiderail.tools.learning import checkpoint, fast_sb3, networks
     print(not {"pydrake", "pandas"} & set(sys.modules))
     """)
     assert output.strip() == "True"

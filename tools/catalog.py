@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, prior_of, stations_of
 from guiderail.diagrams.envs.options import (
+    STANDARD,
     CommonOptions,
     Options,
     PrimitiveOptions,
+    TaskOptions,
     TemplateOptions,
+    choices_of,
     describe_options,
     option_fields,
 )
@@ -22,12 +26,13 @@ from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import INPUTS as STATION_INPUTS
 from guiderail.diagrams.stations.station import OUTPUTS as STATION_OUTPUTS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
-from guiderail.diagrams.tasks.task import Task
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.plugins import find_plugins
 from guiderail.models.common.registry import Registry
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import END_EFFECTORS, ROBOTS, find_end_effector, find_robot
 from guiderail.tools.environments import task_options
+from guiderail.tools.files import path_exists
 from guiderail.tools.learning.learner import LEARNERS
 
 
@@ -64,22 +69,18 @@ def describe_all() -> dict[str, Any]:
 
 
 def describe_task(name: str) -> dict[str, Any]:
-    """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options.
-
-    Raises:
-        InputError: If there is no task of that name.
-    """
+    """Describe a task: its guidance, stations, rewards, observations, difficulties, defaults and options."""
     declared = TASKS.get(name)
     return {
         "description": _first_paragraph(declared),
         "environment": environment_id(name),
-        "guidance": possible_guidance(declared.provides()),
-        "stations": declared.stations(),
-        "rewards": list(declared.rewards),
-        "observations": list(declared.observations),
-        "difficulties": {level: dict(settings) for level, settings in declared.difficulties.items()},
+        "guidance": possible_guidance(prior_of(declared).provides),
+        "stations": stations_of(declared),
+        "rewards": list(choices_of(declared, "reward")),
+        "observations": list(choices_of(declared, "observation")),
+        "difficulties": {STANDARD: {}} | {level: dict(settings) for level, settings in declared.presets.items()},
         "defaults": {**declared.defaults, **declared.learner},
-        "options": describe_options(declared.Options),
+        "options": [row for row in describe_options(declared) if row["name"] not in TaskOptions.model_fields],
         "reset_options": describe_options(declared.Reset),
     }
 
@@ -103,9 +104,6 @@ def describe_task_groups(name: str) -> dict[str, dict[str, str]]:
     """Describe the options of a task in groups: basic, task, motion, station, disturbances, difficulties and reset.
 
     An entry of a structured option follows its option; its name is indented.
-
-    Raises:
-        InputError: If there is no task of that name.
     """
     texts = describe_task_options(name)
     if name not in TASKS.names():
@@ -114,7 +112,7 @@ def describe_task_groups(name: str) -> dict[str, dict[str, str]]:
     groups = dict.fromkeys(BASIC, "basic")
     for part in ("task", "disturbances", "station"):
         groups = dict.fromkeys(option_fields(type(parts[part])), part) | groups
-    for kind in map(STATIONS.get, TASKS.get(name).stations()):
+    for kind in map(STATIONS.get, stations_of(TASKS.get(name))):
         groups = dict.fromkeys(option_fields(kind.options or Options), "station") | groups
     result: dict[str, dict[str, str]] = {
         group: {} for group in ("basic", "task", "motion", "station", "disturbances", "difficulties", "reset")
@@ -150,20 +148,15 @@ def describe_task_options(name: str) -> dict[str, str]:
     """Describe the options of a task's environment and of its reset as text: meaning, range and default.
 
     For a task that is only registered with Gymnasium, the texts are the defaults.
-
-    Raises:
-        InputError: If there is no task of that name.
     """
     if name not in TASKS.names():
         return {key: f"{value!r}" for key, value in task_options(name).items()}
     config = EnvConfig.resolve(name, {})
     declared = TASKS.get(name)
     choices = {
-        "guidance": possible_guidance(declared.provides()),
-        "station": declared.stations(),
-        "reward": declared.rewards,
-        "observation": declared.observations,
-        "difficulty": tuple(declared.difficulties),
+        "guidance": possible_guidance(prior_of(declared).provides),
+        "station": stations_of(declared),
+        "difficulty": (STANDARD, *declared.presets),
     }
     texts = {}
     for model in (CommonOptions, *map(type, config.parts.values())):
@@ -179,11 +172,11 @@ def describe_task_options(name: str) -> dict[str, str]:
     for (name, choice, text), names in names_by_text.items():
         text = f"with {choice}={' or '.join(names)}: {text}"
         texts[name] = f"{texts[name]}; {text}" if name in texts else text
-    for difficulty, settings in declared.difficulties.items():
+    for difficulty, settings in declared.presets.items():
         if settings:
             pairs = ", ".join(f"{key}={_format_value(value)}" for key, value in settings.items())
             texts[f"difficulty={difficulty}"] = f"is the same as {pairs}"
-    if declared.rewards is Task.rewards:
+    if len(choices_of(declared, "reward")) == 1:
         texts["reward"] = "the task has a single reward without a name"
     reset = {f"reset: {row['name']}": row["description"] for row in describe_options(declared.Reset)}
     if not declared.has_held_out_distribution:
@@ -233,3 +226,50 @@ def _format_value(value: Any) -> str:
 
 def _first_paragraph(entry: object) -> str:
     return str(entry.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ").strip()
+
+
+_TEMPLATE_ENDINGS = (".yaml", ".yml")
+_SI_UNITS = {"m": "m", "deg": "rad"}  # unit of a loaded transition distance, by the unit in the template file
+
+
+def describe_template(file: Path, draw: Path | None = None) -> dict[str, Any]:
+    """Validate a template and return its inputs, frames, states and transitions, with remarks.
+
+    With `draw`, its state machine is drawn to a .png, .svg, .pdf, .dot or .gv file.
+    """
+    from guiderail.models.templates import load_template
+    from guiderail.models.templates.drawing import draw as draw_template
+    from guiderail.models.templates.schema import shipped_templates
+    from guiderail.models.templates.validate import validate
+
+    if not path_exists(file) and str(file) not in shipped_templates():
+        raise InputError(
+            f"there is no file {file}: name a template (.yaml), or one of {', '.join(shipped_templates())}"
+        )
+    if path_exists(file) and file.suffix not in _TEMPLATE_ENDINGS:
+        raise InputError(f"{file} has the ending {file.suffix!r}: a template is .yaml")
+    template = load_template(file)
+    findings = validate(template)
+    errors = [finding.message for finding in findings if finding.is_error]
+    if errors:
+        raise InputError(f"{file}: " + "; ".join(message.rstrip(".") for message in errors))
+    if draw is not None:
+        draw_template(template, draw)
+    return {
+        "file": str(file),
+        "template": template.name,
+        "inputs": template.inputs,
+        "frames": list(template.frames),
+        "states": [state.name for state in template.states],
+        "transitions": [_describe_transition(s, t) for s in template.states for t in s.transitions],
+        "remarks": [finding.message for finding in findings if not finding.is_error],
+    }
+
+
+def _describe_transition(state: Any, transition: Any) -> str:
+    """Return a transition as text, with its unit and the threshold of the transition back."""
+    unit = _SI_UNITS[state.transition_distance.unit]
+    text = f"{state.name} → {transition.to} below {transition.below:g} {unit}"
+    if transition.hysteresis is None:
+        return f"{text}, no way back"
+    return f"{text}, back above {transition.below + transition.hysteresis:g} {unit}"

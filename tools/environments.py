@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import logging
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -16,18 +17,15 @@ from gymnasium.envs.registration import load_env_creator
 from gymnasium.spaces import Box
 
 from guiderail.diagrams.envs.options import (
-    KERNEL_OPTIONS,
     CommonOptions,
     Options,
     PrimitiveOptions,
     TemplateOptions,
-    check_choice,
     flat_options,
     kernel_from_options,
     option_fields,
     validate_options,
 )
-from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import (
@@ -42,6 +40,7 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.plugins import find_plugins
 from guiderail.models.common.registry import did_you_mean, find_class
 
+_LOGGER = logging.getLogger(__name__)
 _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder
 
 
@@ -49,9 +48,6 @@ def task_named(name_or_folder: str) -> tuple[str, tuple[str, ...]]:
     """Return the name of a task from its name or folder, and the imports that a run of the task needs.
 
     An unknown name is returned unchanged.
-
-    Raises:
-        InputError: If the folder's task is not valid.
     """
     if name_or_folder in TASKS.names() or not is_task_folder(name_or_folder):
         return name_or_folder, ()
@@ -65,9 +61,6 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
     The digest covers the task folder and the imported files. It also covers the files that an option of the environment
     names, such as demonstrations or the code of FILE.py:FUNCTION, and the policy in a folder that an option names.
     Relative paths are skipped; `import_modules` returns absolute ones.
-
-    Raises:
-        InputError: If the task folder no longer exists, or a file cannot be read.
     """
     declared = TASKS.get(task) if task in TASKS.names() else None
     folder, folder_digest = (None, "") if declared is None else (declared.folder, declared.folder_digest())
@@ -88,11 +81,7 @@ def task_content(task: str, environment: Mapping[str, Any], imports: Iterable[st
 
 
 def task_options(task: str) -> dict[str, Any]:
-    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none.
-
-    Raises:
-        InputError: If the task is unknown.
-    """
+    """Return the options of a task's environment with their defaults, `inspect.Parameter.empty` if there is none."""
     if task in TASKS.names():
         return check_environment(task, {})
     check_task_name(task)
@@ -103,15 +92,17 @@ def task_options(task: str) -> dict[str, Any]:
 
 
 def check_environment(task: str, arguments: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a task's environment with all defaults filled in.
+    """Return the arguments of a task's environment with all defaults filled in; see `resolve_environment`."""
+    resolved = resolve_environment(task, arguments)
+    return resolved if isinstance(resolved, dict) else resolved.options
 
-    Raises:
-        InputError: If the task or an argument is unknown, or a value is invalid.
-    """
+
+def resolve_environment(task: str, arguments: Mapping[str, Any]) -> Any:
+    """Return the validated `EnvConfig` of a registered task; for another task, its arguments with all defaults."""
     if task in TASKS.names():
         from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
 
-        return EnvConfig.resolve(task, arguments).options
+        return EnvConfig.resolve(task, arguments)
     options = task_options(task)
     for name, value in arguments.items():
         if name not in options:
@@ -129,7 +120,7 @@ def declared_models(task: str) -> list[type[Options]]:
 
     Options of guidance and stations whose package declares no plug-in for them are missing.
     """
-    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS, "Options")]
+    models: list[type[Options]] = [CommonOptions, find_class("task_options", task, TASKS)]
     models += [PrimitiveOptions, TemplateOptions, Disturbances]
     models += [point.load() for kind in ("station_options", "guidance_options") for _, point in find_plugins(kind)]
     return list(dict.fromkeys(models))
@@ -140,72 +131,32 @@ def flat_environment(task: str, options: Mapping[str, Any]) -> dict[str, Any]:
     return flat_options(declared_models(task), options) if task in TASKS.names() else dict(options)
 
 
-def check_declared_options(task: str, options: Mapping[str, Any]) -> None:
-    """Check single options quickly, before Drake is imported; `EnvConfig.resolve` checks all of them together.
-
-    A value is refused if it is invalid in every model that has the option. Nothing is checked if the task, a guidance
-    or a station is of another package, because that package may declare further options.
-
-    Raises:
-        InputError: If an option is unknown or its value is out of range.
-    """
-    registered = ((TASKS, [task]), (GUIDANCE, GUIDANCE.names()), (STATIONS, STATIONS.names()))
-    if not all(registry.is_packaged(name) for registry, names in registered for name in names):
-        return
-    declared = find_class("task_options", task, TASKS, "Options")
-    for option, choices in (("reward", declared.rewards), ("observation", declared.observations)):
-        if option in options and choices:
-            check_choice(option, options[option], list(choices), task)
-    models = declared_models(task)
-    options = flat_options(models, options)
-    for option in options:
-        option_models = [model for model in models if option in option_fields(model)]
-        if not option_models:
-            known = {name for model in models for name in option_fields(model)}
-            raise InputError(f"{task} has no option {brief(option)} here: {did_you_mean(option, known)}")
-        checked = KERNEL_OPTIONS if option in KERNEL_OPTIONS else (option,)  # kernel options are validated together
-        values = {name: options[name] for name in checked if name in options}
-        errors = []
-        for model in option_models:
-            try:
-                validate_options(model, values, task)
-            except InputError as error:
-                errors.append(error)
-        if len(errors) == len(option_models):
-            raise errors[0]
-
-
 def check_reset(task: str, options: Mapping[str, Any]) -> None:
     """Raise an InputError if a reset option of a guiderail task is invalid; other tasks are not checked."""
     if task in TASKS.names():
         validate_options(TASKS.get(task).Reset, options, f"a reset of {task}")
 
 
-def warn_of_deviation(task: str, environment: Mapping[str, Any]) -> str | None:
-    """Return a warning if a task's motion without actions deviates from the demonstrations, otherwise None.
+def warn_of_deviation(config: Any) -> None:
+    """Warn if the motion without actions deviates from the demonstrations of an `EnvConfig`, if there are any.
 
     The motion deviates if less than the fraction `MIN_SHARE` of its steps lies within a standard deviation of the
-    demonstrations. A task without demonstrations has no warning.
-
-    Raises:
-        InputError: For an unknown task or option.
+    demonstrations.
     """
-    from guiderail.diagrams.envs.config import EnvConfig  # imports Drake, which takes a second
-    from guiderail.models.primitives.fit import MIN_SHARE, estimated_share
+    from guiderail.models.primitives.fit import MIN_SHARE, estimated_share  # imports SciPy, which takes a second
 
-    config = EnvConfig.resolve(task, environment)
-    declared = config.make_task()
-    if "demonstrations" not in declared.provides():
-        return None
+    reference = config.reference()
+    if reference is None:
+        return
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
-    share = estimated_share(declared.reference(), kernel_from_options(values), **chosen)
-    if share >= MIN_SHARE:
-        return None
-    return (
-        f"without actions, {share:.0%} of the steps stay within a standard deviation of the demonstrations: let "
-        "guiderail dataset validate FILE --fit choose length_scale, lambda_ and beta, and give them by --env"
-    )
+    share = estimated_share(reference, kernel_from_options(values), **chosen)
+    if share < MIN_SHARE:
+        _LOGGER.warning(
+            "without actions, %.0f%% of the steps stay within a standard deviation of the demonstrations: let "
+            "guiderail dataset validate FILE --fit choose length_scale, lambda_ and beta, and give them by --env",
+            100 * share,
+        )
 
 
 def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]:
@@ -213,9 +164,6 @@ def beyond_defaults(task: str, environment: Mapping[str, Any]) -> dict[str, Any]
 
     Guidance, station and difficulty are compared with the task's defaults. All other arguments are compared with the
     defaults that these three determine.
-
-    Raises:
-        InputError: If the task, guidance, station or difficulty is unknown.
     """
     environment = flat_environment(task, environment)
     names: tuple[str, ...] = ("guidance", "station", "difficulty")
@@ -230,9 +178,6 @@ def changed_environment(task: str, environment: Mapping[str, Any], changes: Mapp
 
     A change of difficulty replaces the settings that the run's own difficulty determined. A change of station removes
     the options that the new station does not have.
-
-    Raises:
-        InputError: If the difficulty changes and the resulting arguments are not valid.
     """
     environment, changes = flat_environment(task, environment), flat_environment(task, changes)
     removed = _options_of_station_only(environment.get("station"), changes.get("station"))
@@ -289,21 +234,13 @@ def _parse_numbers(value: Any) -> Any:
         return value
 
 
-def make_environment(task: str, arguments: Mapping[str, Any], render_mode: str | None = None) -> gymnasium.Env:
-    """Make the environment of a task; see `make_env`.
-
-    Raises:
-        InputError: If the task or an argument is unknown, or options are incompatible.
-    """
-    if task in TASKS.names():
-        from guiderail.diagrams.envs.config import EnvConfig  # imports Drake
-
-        arguments = {"task": EnvConfig.resolve(task, arguments), "render_mode": render_mode}
-    else:
-        arguments = check_environment(task, arguments)
-        if render_mode is not None or environment_id(task) != task:  # others may not have the argument
-            arguments = {**arguments, "render_mode": render_mode}
-    return gymnasium.make(environment_id(task), disable_env_checker=True, **arguments)
+def make_environment(task: str, arguments: Any, render_mode: str | None = None) -> gymnasium.Env:
+    """Make the environment of a task from its options, or from a result of `resolve_environment`; see `make_env`."""
+    resolved = resolve_environment(task, arguments) if isinstance(arguments, Mapping) else arguments
+    keywords = dict(resolved) if isinstance(resolved, Mapping) else {"task": resolved}
+    if render_mode is not None or environment_id(task) != task:  # others may not have the argument
+        keywords["render_mode"] = render_mode
+    return gymnasium.make(environment_id(task), disable_env_checker=True, **keywords)
 
 
 class _KeptOpen(gymnasium.Wrapper[Any, Any, Any, Any]):
@@ -336,12 +273,7 @@ class OtherTask:
 
 
 def trained_task(env: gymnasium.Env, name: str) -> Any:
-    """Return the task of an environment, or an `OtherTask` for an environment of another package.
-
-    Raises:
-        InputError: If an environment of another package has no limit of steps, or its observations or actions are not
-            those that a learner takes.
-    """
+    """Return the task of an environment, or an `OtherTask` for an environment of another package."""
     task = getattr(env.unwrapped, "diagram", None)
     if hasattr(env.unwrapped, "trace") and task is not None:
         return task
@@ -370,7 +302,7 @@ def trained_task(env: gymnasium.Env, name: str) -> Any:
 
 def _step_limit(env: Any) -> int | None:
     """Return the largest number of actions in an episode; None if no wrapper limits it."""
-    from guiderail.tools.guided.env import GuidedEnv
+    from guiderail.tools.guided.guided_env import GuidedEnv
 
     repeat, limits = 1, []
     while isinstance(env, gymnasium.Wrapper):
@@ -385,11 +317,7 @@ def _step_limit(env: Any) -> int | None:
 
 
 def task_of(env: gymnasium.Env, name: str) -> Any:
-    """Return the task of an environment; `name` is the environment's name for the message.
-
-    Raises:
-        InputError: If the environment has no task of guiderail.
-    """
+    """Return the task of an environment; `name` is the environment's name for the message."""
     task = getattr(env.unwrapped, "diagram", None)
     if task is None:
         raise InputError(f"{name} has no task of guiderail, so it can only be evaluated: register a task for it")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,13 +14,15 @@ import numpy as np
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge
+from guiderail.diagrams.envs.observation import Observed
 from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
 from guiderail.models.laws.skill import PRIMITIVE_FILE, SKILL_FILE
-from guiderail.models.policy import Policy
+from guiderail.models.policy import Ensemble, Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
+from guiderail.tools.evaluation.subject import refuse_guidance_change
 from guiderail.tools.files import check_new, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
@@ -67,9 +69,6 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
         run: Folder of a run, or `pretrained:NAME`.
         guidance: Kinds of guidance that can be exported.
         exported: Options of which only one value can be exported, with this value.
-
-    Raises:
-        InputError: If there is no such run, its policy observes images, or its guidance cannot be exported.
     """
     folder = RunFolder(find_run(run))
     config, policy = folder.config(), Policy.load(folder.path)
@@ -81,11 +80,11 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     if len(policy.description["observation_shape"]) != 1 or "image_shape" in policy.description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     resolved = EnvConfig.resolve(config.task, config.environment)
-    task, prior = resolved.make_task(), make_prior_knowledge(resolved)
+    task, prior = resolved.declared, make_prior_knowledge(resolved)
     description: dict[str, Any] = {"task": config.task, "environment": dict(config.environment)}
     description["action_repeat"] = config.action_repeat
     observed = math.prod(policy.description["observation_shape"])
-    description["observation"] = _observation(task.observation_terms(), task.clip, prior.pose_size, observed)
+    description["observation"] = _observation(Observed.of(task.observe()), task.clip, prior.pose_size, observed)
     if len(description["observation"]) != observed:
         raise InputError(f"the entries of {config.task}'s observation have no known names: this run cannot be exported")
     for option, value in exported.items():
@@ -106,25 +105,38 @@ def load_skill(run: Path | str, guidance: Sequence[str], exported: Mapping[str, 
     return TrainedSkill(config, policy, task, prior, description)
 
 
-def export_skill(run: Path | str, out: Path) -> list[Path]:
-    """Write the policy of a run, the meaning of its observation and action, and the data of its guidance.
+@dataclass(frozen=True)
+class Exporter:
+    """Format of exported skills; a call writes the skill of a run into a new folder and returns the paths of its files.
+
+    Attributes:
+        guidance: Kinds of guidance that can be exported.
+        exported: Options of which only one value can be exported, with this value.
+        files: Function from a skill to the contents of its files, by their path in the folder.
+    """
+
+    guidance: Sequence[str]
+    exported: Mapping[str, Any]
+    files: Callable[[TrainedSkill], Mapping[str, bytes]]
+
+    def __call__(self, run: Path | str, out: Path) -> list[Path]:
+        """Write the skill of a run, its folder or `pretrained:NAME`, into the folder `out`, which must not exist."""
+        check_new(out, "folder")
+        files = self.files(load_skill(run, self.guidance, self.exported))
+        paths = [out / name for name in files]
+        for path, content in zip(paths, files.values(), strict=True):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(path, content)
+        return paths
+
+
+def _onnx_files(skill: TrainedSkill) -> dict[str, bytes]:
+    """Return the policy, the meaning of its observation and action, and the data of its guidance.
 
     `policy.onnx` is the deterministic policy: observation (1, n) → action (1, A), both float32. `skill.json` lists the
     entries of both in their order, with names, units, centers and scales, and the settings of the guidance.
     `primitive.npz` has the reference, constraints and gains of a movement primitive.
-
-    Args:
-        run: Folder of a run, or `pretrained:NAME`.
-        out: Folder to write, which must not exist.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        InputError: As `load_skill`, or if the folder cannot be written.
     """
-    check_new(out, "folder")
-    skill = load_skill(run, GUIDED, EXPORTED)
     environment, config = skill.config.environment, skill.prior.primitive
     assert config is not None
     law = make_law(skill.prior, history=environment["guidance"] == "skgrl")
@@ -146,16 +158,35 @@ def export_skill(run: Path | str, out: Path) -> list[Path]:
     for entry, output in zip(description["action"], law.outputs, strict=True):
         entry["output"] = output
     files = {POLICY_FILE: policy_to_onnx(skill.policy), PRIMITIVE_FILE: buffer.getvalue()}
-    return write_files(out, files | {SKILL_FILE: to_json(description)})
+    return files | {SKILL_FILE: to_json(description)}
 
 
-def write_files(out: Path, files: Mapping[str, bytes]) -> list[Path]:
-    """Write files, by their path in the folder, into a new folder; return their paths."""
-    paths = [out / name for name in files]
-    for path, content in zip(paths, files.values(), strict=True):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, content)
-    return paths
+export_skill = Exporter(GUIDED, EXPORTED, _onnx_files)
+"""Write the skill of a run as ONNX, JSON and NumPy files."""
+
+
+def write_ensemble(runs: Sequence[str | Path], out: Path) -> Ensemble:
+    """Write the mean of several runs' policies as a run folder with the configuration of the first run.
+
+    The folder has no table of episodes and no checkpoint. Commands evaluate it like a run.
+    """
+    if len(runs) < 2:
+        raise InputError("an ensemble has the policies of several runs: name at least two")
+    folders = [RunFolder(find_run(run)) for run in runs]
+    configs = [folder.config() for folder in folders]
+    for config in configs[1:]:
+        refuse_guidance_change(configs[0].environment, config.environment)
+    try:
+        ensemble = Ensemble([Policy.load(folder.path) for folder in folders])
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{error}: give runs of the same task and options") from error
+    folder = RunFolder(out)
+    with folder.locked():
+        folder.create(configs[0])
+        ensemble.save(out, write=write_atomically)
+    return ensemble
 
 
 def to_json(description: Mapping[str, Any]) -> bytes:
@@ -167,9 +198,10 @@ def _plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
-def _observation(terms: Any, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
+def _observation(declared: Observed, clip: float, pose_size: int, observed: int) -> list[dict[str, Any]]:
     """Return the entries of the observation, each clip((value − center) / scale); there are `observed` of them."""
-    if not isinstance(terms, Sequence):
+    terms = declared.terms
+    if declared.camera is not None:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")
     sizes = [_size(term, pose_size) for term in terms]
     if sizes.count(1) and observed > sum(sizes):  # one signal whose size neither its name nor its scale tells
@@ -197,11 +229,7 @@ def _size(term: Any, pose_size: int) -> int:
 
 
 def policy_to_onnx(policy: Policy) -> bytes:
-    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n).
-
-    Raises:
-        InputError: If the policy observes images.
-    """
+    """Return the content of an ONNX file that computes a policy's action (1, A) for an observation (1, n)."""
     layers, description = policy.layers, policy.description
     if len(description["observation_shape"]) != 1 or "image_shape" in description:
         raise InputError("a policy that observes images cannot be exported: train one with observation=state")

@@ -7,15 +7,13 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.files import visible_files
 from guiderail.models.common.files import write_atomically as write_atomically
-from guiderail.models.primitives import Demonstrations
 
 PICTURES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 PAGES = (".html", ".htm")
@@ -98,9 +96,6 @@ def atomic_folder(out: Path) -> Iterator[Path]:
     """Yield a temporary folder that is renamed to `out` at the end, or removed after an error.
 
     Partial folders that killed processes left for the same path are removed first.
-
-    Raises:
-        InputError: If the folder cannot be written. An OSError about another file is raised unchanged.
     """
     temporary = out.with_name(f".{out.name}.{os.getpid()}.part")
     for partial_folder in out.parent.glob(f".{glob.escape(out.name)}.*.part"):
@@ -125,52 +120,11 @@ def write_error(path: Path, error: OSError) -> InputError:
 
 
 def path_exists(path: Path) -> bool:
-    """Return True if a path is an existing file or folder.
-
-    Raises:
-        InputError: If the file system refuses the path, for example because a name is too long.
-    """
+    """Return True if a path is an existing file or folder."""
     try:
         return path.exists()
     except OSError as error:
         raise InputError(f"the path {brief(str(path))} cannot be read ({error.strerror}): check it") from error
-
-
-def check_room(path: Path, size: int) -> None:
-    """Raise an InputError if the file system of a file or a new folder has room for less than `size` bytes."""
-    try:
-        room = shutil.disk_usage(next(folder for folder in path.absolute().parents if folder.exists())).free
-    except OSError as error:
-        raise write_error(path, error) from error
-    if room < size:
-        raise InputError(
-            f"{path.parent} has room for {room:,} bytes, and the record may need {size:,}: choose a folder with room"
-        )
-
-
-def write_record(path: Path, write: Callable[[Path], object]) -> tuple[Path, str]:
-    """Write a record that cannot be repeated; if that fails, write it into a temporary folder or the home folder.
-
-    Args:
-        path: File to write.
-        write: Function that writes the file of a path.
-
-    Returns:
-        The path of the written file, and a sentence on the failure, empty if there was none.
-
-    Raises:
-        InputError: If the record cannot be written to any of these folders.
-    """
-    try:
-        write(path)
-    except (InputError, OSError) as error:
-        for parent in (None, os.path.expanduser("~")):
-            with suppress(InputError, OSError):
-                fallback = Path(tempfile.mkdtemp(prefix="guiderail-", dir=parent)) / path.name
-                write(fallback)
-                return fallback, f"{path} cannot be written, so the record is in {fallback}"
-        raise InputError(f"{error}; the record could not be written to another folder either") from error
-    return path, ""
 
 
 def check_new(out: Path, what: str) -> None:
@@ -181,31 +135,6 @@ def check_new(out: Path, what: str) -> None:
 
 
 ENDINGS = (".npz", ".csv")  # endings of demonstration files
-
-
-def load_demonstrations(path: Path) -> Demonstrations:
-    """Return the demonstrations of a file, or of all .npz and .csv files of a folder that are not hidden.
-
-    Each file is read by `Demonstrations.load`, as in training. `Demonstrations.load` itself accepts only folders of
-    .csv files.
-
-    Raises:
-        InputError: If there are no demonstrations, a file is invalid, or files have different outputs.
-    """
-    if path_exists(path) and path.is_dir():
-        files = visible_files(path, ENDINGS)
-        if not files:
-            raise InputError(f"there is no file {' or '.join(ENDINGS)} in {path}: name a folder of demonstrations")
-        parts = [Demonstrations.load(file) for file in files]
-        for file, part in zip(files, parts, strict=True):
-            if part.names != parts[0].names:
-                raise InputError(
-                    f"{file} has the outputs {', '.join(part.names)}, and {files[0].name} {', '.join(parts[0].names)}: "
-                    "record the same outputs in all files"
-                )
-        times, outputs = ([array for part in parts for array in getattr(part, name)] for name in ("times", "outputs"))
-        return Demonstrations(times, outputs, parts[0].names)
-    return Demonstrations.load(path)
 
 
 def refuse_existing_run(path: Path) -> None:

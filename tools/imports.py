@@ -46,9 +46,6 @@ def import_modules(modules: Iterable[str], remedy: str = ": restore it, or give 
     Returns:
         Names with which the modules can be imported again. Files and folders have absolute paths, so that a run can be
         resumed from another folder.
-
-    Raises:
-        InputError: If there is no such module, file or folder, or it cannot be imported.
     """
     names = []
     for module in modules:
@@ -80,10 +77,6 @@ def import_stored(modules: Iterable[str], source: Path) -> tuple[str, ...]:
 
     Returns:
         Names with which the modules can be imported again, as `import_modules` returns them.
-
-    Raises:
-        InputError: If new code would be executed without trust, a module, file or folder is missing, or it cannot be
-            imported.
     """
     modules = tuple(modules)
     if not _TRUSTED.get() and (untrusted := [module for module in modules if _executes(module)]):

@@ -18,7 +18,6 @@ _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _NUMBER = re.compile(r"[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?|-?inf|nan")
 
 MAX_FILE_SIZE = 200_000_000  # largest CSV file [bytes]
-_MAX_HEADER = 100_000  # largest number of characters of a header
 _MAX_LIST = 1_000  # number of list elements that count as one row of a Parquet file
 MAX_ROWS = 20_000_000  # largest number of rows of Parquet files that are read together
 
@@ -36,10 +35,6 @@ def read_table(path: Path) -> pd.DataFrame:
 
     A column of only numbers and empty cells is numeric; its empty cells are NaN. A column of only True and False is
     boolean. All other columns are text; their empty cells are "".
-
-    Raises:
-        InputError: If the file is missing, larger than `MAX_FILE_SIZE` or not CSV in UTF-8, a row is not as long as the
-            header, or column names are missing or repeated.
     """
     if not path.is_file():
         raise InputError(f"{path} is missing: the run has no finished episode yet, or the file was moved")
@@ -54,21 +49,6 @@ def read_table(path: Path) -> pd.DataFrame:
         raise InputError(f"{path} is not a table of episodes: restore it, or train again") from error
 
 
-def read_columns(path: Path) -> list[str]:
-    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8.
-
-    Raises:
-        InputError: If the file cannot be read.
-    """
-    try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return next(csv.reader([file.readline(_MAX_HEADER)], strict=True), [])
-    except (UnicodeError, csv.Error):
-        return []
-    except OSError as error:
-        raise InputError(f"the table '{path}' can't be read ({error.strerror}): check the path") from error
-
-
 def _parse_column(cells: Sequence[str]) -> pd.Series:
     """Return the cells of a column as integers, floats, booleans or text, the same type for all."""
     if all(map(_INTEGER.fullmatch, cells)):
@@ -81,12 +61,7 @@ def _parse_column(cells: Sequence[str]) -> pd.Series:
 
 
 def check_parquet(files: Iterable[Path], max_rows: int = MAX_ROWS) -> None:
-    """Check the numbers of rows in the footers of Parquet files, before memory is allocated for the rows.
-
-    Raises:
-        InputError: If a file is not a readable Parquet file, or all files together have more than `max_rows` rows. Long
-            lists count as several rows.
-    """
+    """Check the numbers of rows in the footers of Parquet files, before memory is allocated for the rows."""
     import pyarrow as arrow
     import pyarrow.parquet as parquet
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,8 +10,9 @@ import gymnasium
 import numpy as np
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort, PortDataType, System
-from pydrake.systems.primitives import ZeroOrderHold
+from pydrake.systems.primitives import ConstantVectorSource, ZeroOrderHold
 
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.observation import (
     CLOCKS,
@@ -19,127 +20,123 @@ from guiderail.diagrams.envs.observation import (
     ImageAndStateSpace,
     Observation,
     ObservationTerm,
+    Observed,
     affine,
 )
-from guiderail.diagrams.envs.options import PrimitiveOptions, kernel_from_options, validate_options
+from guiderail.diagrams.envs.options import PrimitiveOptions, validate_options
 from guiderail.diagrams.envs.scene import (
-    Camera,
     add_meshcat,
     add_observation_camera,
     add_picture,
     contact_results_of,
     scene_of,
 )
-from guiderail.diagrams.envs.task_checks import call_checked, check_takes_arguments, refuse_half_turns, threshold_of
-from guiderail.diagrams.envs.task_diagram import TaskDiagram
+from guiderail.diagrams.envs.task_checks import check_functions, check_terms, refuse_half_turns
+from guiderail.diagrams.envs.task_diagram import Symmetry, TaskDiagram
 from guiderail.diagrams.guidance.guidance import OUTPUTS, check_guidance_ports
-from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
-from guiderail.diagrams.guidance.registry import GUIDANCE
+from guiderail.diagrams.guidance.prior import PlacedTemplate, PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.stations.impedance_control import make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Station
-from guiderail.diagrams.tasks.task import Task
+from guiderail.diagrams.tasks.task import Condition, Threshold, World, signals_of
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
+from guiderail.models.primitives.kernels import make_kernel
 from guiderail.models.primitives.reference import pass_through
 from guiderail.systems.constraint_violation import ConstraintViolation
 from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
 from guiderail.systems.reward_system import RewardSystem, RewardTerm
 
 
-def build_prior_knowledge(task: Task, station: Station) -> PriorKnowledge:
+def build_prior_knowledge(config: EnvConfig, station: Station) -> PriorKnowledge:
     """Return the prior knowledge that a task provides to guidance on a station.
 
     Raises:
-        InputError: If the time steps of the reference trajectory differ from the control period, its angles come near
-            ±180°, where the station's pose jumps, or an option of the primitive does not fit the task or the station.
+        InputError: If the angles of the reference come near ±180°, where the station's pose jumps, or an option of the
+            primitive does not fit the task or the station.
     """
-    provides = task.provides()
+    prior, reference, template = config.declared.prior(), config.reference(), template_of(config)
     primitive = None
-    constraints = call_checked(task, "constraints") or LinearConstraints.none(station.pose_size)
-    if "demonstrations" in provides:
-        options = task.config.part("primitive")
-        kernel = kernel_from_options({PrimitiveOptions.entries.get(name, name): options[name] for name in options})
-        reference = pass_through(call_checked(task, "reference"), options.get("via_points", ()), kernel)
-        options = {name: value for name, value in options.items() if name not in _CONVERTED_OPTIONS}
-        _check_clock(reference.times, station.nominal_period)
+    constraints = config.constraints() or LinearConstraints.none(station.pose_size)
+    if reference is not None:
+        options = dict(config.parts["primitive"])
+        kernel = make_kernel(options["kernel"], options["length_scale"], options["kernel_parameters"])
+        reference = pass_through(reference, options["via_points"], kernel)
         if station.wraps_angles:
             refuse_half_turns(reference.means)
         primitive = PrimitiveConfig(
             reference=reference,
             kernel=kernel,
             constraints=constraints,
-            motion=_motion_constraints(task, constraints, station),
-            progress=_state_progress(task, station.control_period),
+            motion=_motion_constraints(prior.motion, options, constraints, station),
+            progress=_state_progress(config, station.control_period),
             control_period=station.control_period,
-            isotropic_groups=task.isotropic_groups,
-            keep_out=call_checked(task, "keep_out") if "keep_out" in provides else None,
+            isotropic_groups=prior.isotropic_groups,
+            keep_out=prior.keep_out,
             wrench_size=station.wrench_size,
-            **options,
+            **{name: value for name, value in options.items() if name not in _CONVERTED_OPTIONS},
         )
     return PriorKnowledge(
         period=station.control_period,
         primitive=primitive,
-        template=call_checked(task, "template") if "template" in provides else None,
-        approach=call_checked(task, "approach") if "approach" in provides else None,
-        options=task.config.part("guidance"),
+        template=template,
+        approach=prior.approach,
+        options=dict(config.parts["guidance"]),
         pose_size=station.pose_size,
         wrench_size=station.wrench_size,
     )
 
 
+def template_of(config: EnvConfig) -> PlacedTemplate | None:
+    """Return the task's template with the option `active_constraints`, or None."""
+    template = config.declared.prior().template
+    placed = template() if callable(template) else template
+    if placed is None:
+        return None
+    active = getattr(config.parts["template"], "active_constraints", None)
+    return replace(placed, active_constraints=active)
+
+
 _LIMITS = ("max_speed", "max_acceleration")
-_PROGRESS = ("progress", "progress_tolerance", "max_lag")
 _JOINTS = ("joint_margin", "min_singular_value")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
-_CONVERTED_OPTIONS = ("kernel", "length_scale", "kernel_parameters", "via_points", *_LIMITS, *_PROGRESS, *_JOINTS)
+_CONVERTED_OPTIONS = (
+    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag", *_LIMITS,
+    *_JOINTS,
+)  # fmt: skip
 
 
-def _state_progress(task: Task, period: float) -> StateProgress | None:
-    """Return the progress rule from a task's options, or None if the clock drives the motion."""
-    options = task.config.part("primitive")
-    if options.get("progress", "clock") == "clock":
+def _state_progress(config: EnvConfig, period: float) -> StateProgress | None:
+    """Return the progress rule from the options, or None if the clock drives the motion."""
+    options = config.parts["primitive"]
+    if not isinstance(options, PrimitiveOptions) or options.progress == "clock":
         return None
-    return StateProgress(options["progress_tolerance"], round(options["max_lag"] / period))
+    return StateProgress(options.progress_tolerance, round(options.max_lag / period))
 
 
-def _num_steps(task: Task, period: float) -> int:
+def _num_steps(config: EnvConfig, period: float) -> int:
     """Return the number of control steps of an episode, including those for which the motion may wait."""
-    progress = _state_progress(task, period)
-    return task.num_steps + (0 if progress is None else progress.max_lag)
+    progress = _state_progress(config, period)
+    return config.num_steps + (0 if progress is None else progress.max_lag)
 
 
-def _motion_constraints(task: Task, constraints: LinearConstraints, station: Station) -> MotionConstraints | None:
-    """Return a task's motion constraints, extended by the limits in its options; None if there are neither.
-
-    Raises:
-        InputError: If the station has no joints for `joint_margin`, `min_singular_value` is given without
-            `joint_margin`, or the number of limits does not fit the outputs.
-    """
-    motion, options = call_checked(task, "motion_constraints"), task.config.part("primitive")
+def _motion_constraints(
+    motion: MotionConstraints | None, options: Mapping[str, Any], constraints: LinearConstraints, station: Station
+) -> MotionConstraints | None:
+    """Return a task's motion constraints, extended by the limits in its options; None if there are neither."""
     limits: dict[str, Any] = {}
-    if options.get("joint_margin") is not None:
+    if options["joint_margin"] is not None:
         limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    elif options.get("min_singular_value"):
+    elif options["min_singular_value"]:
         raise InputError("min_singular_value has an effect with joint_margin only: give joint_margin=0 as well")
     outputs = constraints.num_outputs
-    limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options.get(name)}
+    limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options[name]}
     if motion is None:
         return MotionConstraints(constraints, **limits) if limits else None
     return replace(motion, **limits)
-
-
-def _check_clock(times: np.ndarray, period: float) -> None:
-    """Raise an `InputError` if the steps between the `times` (N,) [s] of a reference differ from the `period` [s]."""
-    steps = np.diff(times)
-    if np.abs(steps - period).max(initial=0.0) > 1e-6 * period:
-        raise InputError(
-            f"the reference trajectory has steps of {steps.min():g} to {steps.max():g} s, and a control period is "
-            f"{period:g} s: resample it, because the motion would not have the demonstrated speed"
-        )
 
 
 class Signals:
@@ -174,21 +171,22 @@ class Signals:
             raise InputError(f"{user} takes {numbers} as the signal {name!r}, which has {port.size()}")
         return port
 
-    def connect(self, system: Any, terms: Sequence[RewardTerm | TerminationTerm], user: str) -> None:
-        """Connect each signal that a term names to the system's input `get_signal_input_port(name)`.
+    def sizes(self, functions: Iterable[Callable[..., Any]], user: str) -> dict[str, int]:
+        """Return the sizes of the signals that functions name by their parameters."""
+        names = dict.fromkeys(name for function in functions for name in signals_of(function, user))
+        return {name: self.get(name, user).size() for name in names}
 
-        Raises:
-            InputError: If a signal is missing or does not have the size that the term declares.
-        """
-        for name, size in {name: size for term in terms for name, size in term.inputs.items()}.items():
-            self._builder.Connect(self.get(name, user, size), system.get_signal_input_port(name))
+    def connect(self, system: Any, terms: Sequence[RewardTerm | TerminationTerm], user: str) -> None:
+        """Connect each signal that a term names to the system's input `get_signal_input_port(name)`."""
+        for name in dict.fromkeys(name for term in terms for name in term.inputs):
+            self._builder.Connect(self.get(name, user), system.get_signal_input_port(name))
 
 
 class Loop:
     """Control loop without the policy: station, guidance and observation, connected.
 
     Args:
-        task: Task.
+        config: Configuration of the environment.
         station: Station.
         guidance: Diagram with the ports of `Guidance`.
 
@@ -201,13 +199,15 @@ class Loop:
         station: Subsystem "station".
         guidance: Subsystem "guidance".
         signals: Signals that rewards, terminations and observations can name.
+        observed: Observation that the task declares.
         space: Space of observations.
         observation: Port of the observation.
     """
 
-    def __init__(self, task: Task, station: Station, guidance: Diagram):
+    def __init__(self, config: EnvConfig, station: Station, guidance: Diagram):
+        self.config, self.task = config, config.declared
         self.builder = builder = DiagramBuilder()
-        check_guidance_ports(guidance, station.pose_size, station.wrench_size, task.config.guidance)
+        check_guidance_ports(guidance, station.pose_size, station.wrench_size, config.guidance)
         self.station = builder.AddNamedSystem("station", station)
         pose, wrench = station.get_pose_output_port(), station.get_wrench_output_port()
         self.guidance = add_system(builder, "guidance", guidance, pose=pose, wrench=wrench)
@@ -216,26 +216,25 @@ class Loop:
         self.signals.add({"action": guidance.GetOutputPort("held_action")})
         if not station.HasOutputPort("exact_wrench"):
             self.signals.add({"exact_wrench": station.get_wrench_output_port()})
-        signals = call_checked(task, "signals", builder, station)
+        signals = self.task.signals(builder, station)
         self.signals.add(signals)
-        self._connect_max_wrench(task, signals.get("max_wrench"))
-        self.space, self.observation = self._add_observation(task)
+        self._connect_max_wrench(signals.get("max_wrench"))
+        self.observed = Observed.of(self.task.observe())
+        self.space, self.observation = self._add_observation()
         if guidance.HasInputPort("reference_window"):
-            self._add_reference(task)
+            self._add_reference()
 
-    def _connect_max_wrench(self, task: Task, bound: OutputPort | None) -> None:
+    def _connect_max_wrench(self, bound: OutputPort | None) -> None:
         """Connect the station's `max_wrench` to the task's `bound`, lowered to the limits of the template's state."""
-        limit = None
-        if self.guidance.HasOutputPort("state") and "template" in task.provides():
-            impedance = call_checked(task, "impedance") if self.station.HasInputPort("max_wrench") else None
-            limit = make_phase_wrench_limit(
-                call_checked(task, "template").template, impedance, self.station.control_period
-            )
+        limit, placed = None, template_of(self.config) if self.guidance.HasOutputPort("state") else None
+        if placed is not None:
+            impedance = self.task.impedance() if self.station.HasInputPort("max_wrench") else None
+            limit = make_phase_wrench_limit(placed.template, impedance, self.station.control_period)
         if limit is not None:
             if not self.guidance.HasOutputPort("state_max_wrench"):
                 raise InputError(
-                    f"states of the template of {task.name} limit force or torque, and guidance="
-                    f"{task.config.guidance!r} has no output 'state_max_wrench': export max_wrench of its state machine"
+                    f"states of the template of {self.task.name} limit force or torque, and guidance="
+                    f"{self.config.guidance!r} has no output 'state_max_wrench': export max_wrench of its state machine"
                 )
             state_max_wrench = self.guidance.GetOutputPort("state_max_wrench")
             add_system(self.builder, "phase_wrench_limit", limit, state_max_wrench=state_max_wrench)
@@ -246,51 +245,46 @@ class Loop:
         if bound is not None:
             if not self.station.HasInputPort("max_wrench"):
                 raise InputError(
-                    f"station={task.config.station!r} has no input for the signal 'max_wrench' of {task.name}: leave "
-                    "the signal out, or choose a station with a bounded impedance"
+                    f"station={self.config.station!r} has no input for the signal 'max_wrench' of {self.task.name}: "
+                    "leave the signal out, or choose a station with a bounded impedance"
                 )
             self.builder.Connect(bound, self.station.GetInputPort("max_wrench"))
 
-    def _add_reference(self, task: Task) -> None:
-        """Add the system that predicts the guidance's reference window from the observation.
-
-        Raises:
-            InputError: If the observation is an image.
-        """
-        if self.observation.get_data_type() != PortDataType.kVectorValued or task.observation_camera() is not None:
-            raise InputError(f"the guidance of {task.name} takes no images: choose another observation")
+    def _add_reference(self) -> None:
+        """Add the system that predicts the guidance's reference window from the observation."""
+        if self.observed.camera is not None:
+            raise InputError(f"the guidance of {self.task.name} takes no images: choose another observation")
         guidance: Any = self.guidance
         reference = guidance.make_reference(self.observation.size())
         add_system(self.builder, "reference", reference, observation=self.observation)
         self.builder.Connect(reference.GetOutputPort("reference_window"), guidance.GetInputPort("reference_window"))
 
-    def _add_observation(self, task: Task) -> tuple[gymnasium.spaces.Box, OutputPort]:
-        observed = call_checked(task, "observation_terms")
-        camera = observed if isinstance(observed, Camera) else task.observation_camera()
+    def _add_observation(self) -> tuple[gymnasium.spaces.Box, OutputPort]:
+        """Add the observation; return its space and its port."""
+        camera, terms = self.observed.camera, self.observed.terms
         if camera is None:
-            return self.add_terms(task, observed, "observation")
+            return self.add_terms(terms, "observation")
         image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
-        if isinstance(observed, Camera):
+        if not terms:
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
         from guiderail.systems.image_observation import ImageObservation  # most environments have no image
 
-        space, state = self.add_terms(task, observed, "state_observation")
+        space, state = self.add_terms(terms, "state_observation")
         combined = ImageObservation(width, height, state.size())
         add_system(self.builder, "observation", combined, image=image, state=state)
         return ImageAndStateSpace((height, width, 3), space), combined.get_observation_output_port()
 
-    def add_terms(
-        self, task: Task, terms: Sequence[ObservationTerm], name: str
-    ) -> tuple[gymnasium.spaces.Box, OutputPort]:
+    def add_terms(self, terms: Sequence[ObservationTerm], name: str) -> tuple[gymnasium.spaces.Box, OutputPort]:
         """Add the diagram `name` of observation terms; return the space and the port of its output.
 
         Raises:
             InputError: If a term names a signal that does not exist, or as `Observation`.
         """
-        user = f"the {name} of {task.name}"
+        task, user = self.task, f"the {name} of {self.task.name}"
+        check_terms(terms, task.name)
         names = [term.signal for term in terms if term.signal not in CLOCKS]
         ports = {signal: self.signals.get(signal, user) for signal in names}
-        duration = task.num_steps * self.station.control_period
+        duration = self.config.num_steps * self.station.control_period
         sizes = {signal: port.size() for signal, port in ports.items()}
         waits = self.guidance.HasOutputPort(MOTION_TIME) and len(names) < len(terms)
         observation = Observation(terms, sizes, duration, task.clip, task.name, waits=waits)
@@ -299,9 +293,40 @@ class Loop:
         add_system(self.builder, name, observation, **ports)
         return observation.space, observation.get_observation_output_port()
 
+    def add_monitor(self) -> EpisodeMonitor:
+        """Add the monitor of the task's terminations."""
+        task, user = self.task, f"the termination of {self.task.name}"
+        conditions = task.done()
+        check_functions(conditions, "done", task.name)
+        terms = []
+        for reason, given in conditions.items():
+            condition = given if isinstance(given, Condition) else Condition(given)
+            sizes = self.signals.sizes([condition.holds], user)
+            steps = self.config.steps_of(condition.seconds)
+            more = condition.progress, condition.min_progress
+            terms.append(TerminationTerm(reason, sizes, condition.holds, steps, *more))
+        monitor = self.builder.AddNamedSystem("monitor", EpisodeMonitor(terms, self.station.control_period, task.name))
+        self.signals.connect(monitor, terms, user)
+        self.signals.add({"termination": monitor.get_termination_output_port()})
+        return monitor
+
+    def add_reward(self) -> RewardSystem:
+        """Add the sum of the task's reward terms."""
+        task, user = self.task, f"reward {self.task.reward!r} of {self.task.name}"
+        functions = task.rewards()
+        check_functions(functions, "rewards", task.name)
+        repeat = ConstantVectorSource([float(self.config.action_repeat)])
+        if any("action_repeat" in signals_of(function, user) for function in functions.values()):
+            source = self.builder.AddNamedSystem("action_repeat", repeat)
+            self.signals.add({"action_repeat": source.get_output_port()})
+        terms = [RewardTerm(name, self.signals.sizes([each], user), each) for name, each in functions.items()]
+        reward = self.builder.AddNamedSystem("reward", RewardSystem(terms, task.name))
+        self.signals.connect(reward, terms, user)
+        return reward
+
 
 def build_task_diagram(
-    task: Task,
+    config: EnvConfig,
     station: Station,
     guidance: Diagram,
     *,
@@ -311,7 +336,7 @@ def build_task_diagram(
     """Build the diagram of a task: control loop, reward and episode monitor. The policy's `action` is an input port.
 
     Args:
-        task: Task.
+        config: Configuration of the environment.
         station: Station.
         guidance: Diagram with the ports of `Guidance`.
         render_mode: "rgb_array" exports the image of the task's camera; a browser view is not part of the diagram.
@@ -320,21 +345,13 @@ def build_task_diagram(
     Raises:
         InputError: As `Loop`, or if the name of a reward term is reserved, or "rgb_array" is given without a camera.
     """
-    loop = Loop(task, station, guidance)
+    loop, task = Loop(config, station, guidance), config.declared
     builder, signals, period = loop.builder, loop.signals, station.control_period
     builder.ExportInput(guidance.GetInputPort("action"), "action")
 
-    violations = _add_violations(builder, task, station, guidance)
-    termination_terms = call_checked(task, "termination_terms")
-    monitor = builder.AddNamedSystem("monitor", EpisodeMonitor(termination_terms, period, task.name))
-    signals.connect(monitor, termination_terms, f"the termination of {task.name}")
-    signals.add({"termination": monitor.get_termination_output_port()})
-
-    reward_terms = call_checked(task, "reward_terms", guidance.GetInputPort("action").size())
-    reward = builder.AddNamedSystem("reward", RewardSystem(reward_terms, task.name))
-    signals.connect(reward, reward_terms, f"reward {task.config.reward!r} of {task.name}")
-
-    threshold = threshold_of(task)
+    violations = _add_violations(builder, config, station, guidance)
+    monitor, reward = loop.add_monitor(), loop.add_reward()
+    threshold = task.collision or Threshold()
     collision_signal = signals.get(threshold.signal, f"the collision threshold of {task.name}", 1)
     collision = add_system(builder, "collision", affine(np.eye(1), [-threshold.above]), collision_signal)
     exported = {
@@ -359,33 +376,33 @@ def build_task_diagram(
                 f"no reward term of {task.name} can be called {name!r}, which is reserved: give it another name"
             )
         exported[name] = reward.get_term_output_port(name)
-    privileged = call_checked(task, "privileged_terms")
-    if privileged and station.HasOutputPort("body_poses"):
-        exported["privileged"] = loop.add_terms(task, privileged, "privileged")[1]
+    if loop.observed.privileged and station.HasOutputPort("body_poses"):
+        exported["privileged"] = loop.add_terms(loop.observed.privileged, "privileged")[1]
     # Outputs that only this kind of guidance has, such as the state of a template, are exported as well.
     exported = {name: port for name, port in _vector_ports(guidance).items() if name not in OUTPUTS} | exported
     for name, port in exported.items():
         builder.ExportOutput(port, name)
     if render_mode == "rgb_array":
-        add_picture(builder, station, task.camera(), task.name)
+        add_picture(builder, station, task.scene().camera, task.name)
     if before_build is not None:
         before_build(builder)
     diagram = builder.Build()
     diagram.set_name(task.name.replace("/", "_"))
-    displaces = GUIDANCE.get(task.config.guidance).displaces  # symmetries hold only if actions displace outputs
+    symmetry, near_symmetry = _symmetries(config, station) if config.guidance_kind.displaces else (None, None)
     return TaskDiagram(
         diagram=diagram,
         control_period=period,
-        num_steps=_num_steps(task, period),
+        num_steps=_num_steps(config, period),
         observation_space=loop.space,
         reward_terms=reward.term_names,
-        randomize=make_randomize(task, station, guidance),
-        push=_push(station) if task.pushable else None,
+        randomize=make_randomize(config, station, guidance, diagram),
+        push=_push(station) if station.pushable else None,
         query=station.GetOutputPort("query") if station.HasOutputPort("query") else None,
         contact_results=contact_results_of(station),
-        symmetry=task.symmetry() if displaces else None,
-        near_symmetry=task.near_symmetry() if displaces else None,
+        symmetry=symmetry,
+        near_symmetry=near_symmetry,
         task=task,
+        config=config,
     )
 
 
@@ -405,7 +422,7 @@ class SkillDiagram:
 
 
 def build_skill_diagram(
-    task: Task,
+    config: EnvConfig,
     station: Station,
     guidance: Diagram,
     policy: System | Callable[[np.ndarray], np.ndarray],
@@ -416,7 +433,7 @@ def build_skill_diagram(
     """Build the diagram of a learned skill, without reward and episode monitor.
 
     Args:
-        task: Task that the skill was learned on.
+        config: Configuration of the environment that the skill was learned in.
         station: Station.
         guidance: Diagram with the ports of `Guidance`.
         policy: Function from an observation to an action, which a `PolicySystem` calls every `action_repeat` control
@@ -428,14 +445,14 @@ def build_skill_diagram(
         InputError: As `Loop`, or if there is no scene for "human" or no camera for "rgb_array", the policy is neither a
             function nor a system with these ports, or the sizes of the ports do not match.
     """
-    loop = Loop(task, station, guidance)
+    loop, task = Loop(config, station, guidance), config.declared
     builder, action = loop.builder, guidance.GetInputPort("action")
     from guiderail.systems.policy_system import PolicySystem, check_policy_ports
 
     if not isinstance(policy, System):
         port = loop.observation
         model = port.size() if port.get_data_type() == PortDataType.kVectorValued else port.Allocate()
-        policy = PolicySystem(policy, model, action.size(), task.config.action_repeat * station.control_period)
+        policy = PolicySystem(policy, model, action.size(), config.action_repeat * station.control_period)
     check_policy_ports(policy, loop.observation.size(), action.size(), task.name)
     add_system(builder, "policy", policy, observation=loop.observation)
     builder.Connect(policy.GetOutputPort("action"), action)
@@ -447,7 +464,7 @@ def build_skill_diagram(
         builder.ExportOutput(guidance.GetOutputPort(name), name)
     meshcat = add_meshcat(builder, scene_of(station), contact_results_of(station)) if render_mode == "human" else None
     if render_mode == "rgb_array":
-        add_picture(builder, station, task.camera(), task.name)
+        add_picture(builder, station, task.scene().camera, task.name)
     if before_build is not None:
         before_build(builder)
     diagram = builder.Build()
@@ -455,8 +472,8 @@ def build_skill_diagram(
     return SkillDiagram(
         diagram,
         station.control_period,
-        _num_steps(task, station.control_period),
-        make_randomize(task, station, guidance),
+        _num_steps(config, station.control_period),
+        make_randomize(config, station, guidance, diagram),
         meshcat,
     )
 
@@ -467,12 +484,21 @@ def _vector_ports(diagram: Diagram) -> dict[str, OutputPort]:
     return {port.get_name(): port for port in ports if port.get_data_type() == PortDataType.kVectorValued}
 
 
-def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guidance: Diagram) -> dict[str, OutputPort]:
+def _symmetries(config: EnvConfig, station: Station) -> tuple[Symmetry | None, Symmetry | None]:
+    """Return the task's symmetries of the outputs that actions move; the second holds for most of an episode."""
+    outputs = config.action_outputs(station.pose_size)
+    exact, near = (None if each is None else each.restrict(outputs) for each in config.declared.symmetries())
+    return exact, near or exact
+
+
+def _add_violations(
+    builder: DiagramBuilder, config: EnvConfig, station: Station, guidance: Diagram
+) -> dict[str, OutputPort]:
     """Add the checks of the task's constraints, and return the ports of the violations by name.
 
     Without task constraints, ports of the guidance are returned instead, if it has them.
     """
-    constraints = call_checked(task, "constraints")
+    constraints = config.constraints()
     poses = {"commanded_violation": guidance.GetOutputPort("desired_pose")}
     poses["measured_violation"] = station.get_pose_output_port()
     violations = {}
@@ -483,29 +509,27 @@ def _add_violations(builder: DiagramBuilder, task: Task, station: Station, guida
             violations["measured_violation"] = guidance.GetOutputPort("measured_violation")
     for name, port in poses.items():
         if name not in violations:
-            checked = call_checked(task, "motion_constraints") or constraints
+            checked = config.declared.prior().motion or constraints
             violation = add_system(builder, name, ConstraintViolation(checked, station.control_period), pose=port)
             violations[name] = violation.get_violation_output_port()
     return violations
 
 
-def make_randomize(task: Task, station: Station, guidance: Diagram) -> Any:
-    """Return the function `TaskDiagram.randomize`.
+def make_randomize(config: EnvConfig, station: Station, guidance: Diagram, diagram: Diagram) -> Any:
+    """Return the function `TaskDiagram.randomize` of a root diagram, with hidden values of a run of its own.
 
     The returned function raises an `InputError` if a reset option is invalid, or if the task's `reset` does not return
     values by name or returns a value with a reserved name.
-
-    Raises:
-        InputError: If the task's `reset` has other parameters than `Task.reset`.
     """
-    check_takes_arguments(task, "reset")
+    task, run = config.declared, {}
 
     def randomize(context: Context, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, Any]:
-        reset_options = validate_options(task.Reset, options, f"a reset of {task.name}")
-        sampled = task.reset(station, guidance, context, rng, reset_options)
+        given = validate_options(task.Reset, options, f"a reset of {task.name}")
+        returned = task.reset(World(station, guidance, diagram, context, run), rng, given)
+        sampled = {} if returned is None else returned
         if not isinstance(sampled, Mapping):
             raise InputError(
-                f"reset of {task.name} must return the sampled values by name, {{}} if none, not {brief(sampled)}"
+                f"reset of {task.name} must return the sampled values by name, or nothing, not {brief(sampled)}"
             )
         if reserved := [name for name in sampled if name in INFO_KEYS]:
             raise InputError(

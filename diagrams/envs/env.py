@@ -44,6 +44,7 @@ INFO_KEYS = (
     "measured_violation",
     "impedance_force",
     "contact_force",
+    "cost",
     "fallback",
     "control_steps",
     "simulation_failure",
@@ -83,10 +84,10 @@ class DiagramEnv(DrakeGymEnv):
 
     `info` has, at every step and at a reset, `is_success`, `termination` (a `Termination`),
     `constraint_violation` and `measured_violation` (maxima of the step; negative is slack), `impedance_force` and
-    `contact_force` (maxima of the step [N]; the first is 0 without an impedance), `fallback` (True if guidance fell
-    back to a safe command), every reward term by name (summed over the step), and `control_steps` since the
-    reset. Here a step is a call of `step`, with all its control steps. The `info` of a reset also has the values that
-    the task sampled.
+    `contact_force` (maxima of the step [N]; the first is 0 without an impedance), `cost` (number of unsafe control
+    steps of the step, see `EpisodeTrace.unsafe`), `fallback` (True if guidance fell back to a safe command), every
+    reward term by name (summed over the step), and `control_steps` since the reset. Here a step is a call of `step`,
+    with all its control steps. The `info` of a reset also has the values that the task sampled.
 
     An episode that reaches the task's number of control steps is truncated with `termination` "time_limit".
 
@@ -299,7 +300,7 @@ class DiagramEnv(DrakeGymEnv):
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
         info = self._info(
-            0, *self._violations, self._forces(0.0, 0.0), False, dict.fromkeys(self.diagram.reward_terms, 0.0)
+            0, *self._violations, self._forces(0.0, 0.0), 0.0, False, dict.fromkeys(self.diagram.reward_terms, 0.0)
         )
         return self._observation, info | self.sampled
 
@@ -398,7 +399,8 @@ class DiagramEnv(DrakeGymEnv):
             commanded_violation, measured_violation = self._violations
         self._violations = commanded_violation, measured_violation
         forces = self._forces(peak_force, peak_contact_force)
-        info = self._info(termination, commanded_violation, measured_violation, forces, fallback, terms)
+        cost = float(self.trace.unsafe(first_step).sum())
+        info = self._info(termination, commanded_violation, measured_violation, forces, cost, fallback, terms)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -471,6 +473,7 @@ class DiagramEnv(DrakeGymEnv):
         commanded_violation: float,
         measured_violation: float,
         forces: tuple[float, float],
+        cost: float,
         fallback: bool,
         terms: Mapping[str, float],
     ) -> dict[str, Any]:
@@ -482,6 +485,7 @@ class DiagramEnv(DrakeGymEnv):
             "measured_violation": measured_violation,
             "impedance_force": forces[0],
             "contact_force": forces[1],
+            "cost": cost,
             "fallback": fallback,
             "control_steps": self._control_steps,
             **terms,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import multiprocessing
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import replace
 from functools import partial, update_wrapper
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AsyncVectorEnv
 from pydrake.systems.framework import Diagram, DiagramBuilder, System
 
 from guiderail.diagrams.envs.assemble import (
@@ -20,10 +22,10 @@ from guiderail.diagrams.envs.assemble import (
     build_task_diagram,
     make_randomize,
 )
-from guiderail.diagrams.envs.config import EnvConfig, freeze
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.pool import BuiltDiagram, DiagramPool
-from guiderail.diagrams.envs.task_checks import call_checked, turns_near_half, workcell_of
+from guiderail.diagrams.envs.task_checks import check_workcell, turns_near_half
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.diagrams.stations.continuous_station import ContinuousStation
@@ -31,50 +33,40 @@ from guiderail.diagrams.stations.disturbances import disturbed
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
-from guiderail.diagrams.tasks.registry import check_num_steps
-from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.plugins import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
 
 
-def make_station(task: Task) -> Station:
-    """Build the station that a task is configured with, including its workcell.
+def make_station(config: EnvConfig) -> Station:
+    """Build the station of a configuration, including the task's workcell.
 
     Raises:
-        InputError: If the task has no workcell or the wrong kind of workcell, its `num_steps` is not a positive whole
-            number, or the station has a fixed control period other than the option `control_period`.
+        InputError: If the task has no workcell or the wrong kind of workcell, or the station has a fixed control period
+            other than the option `control_period`.
     """
-    config, kind = task.config, task.config.station_kind
-    check_num_steps(task.name, getattr(task, "num_steps", None))
-    workcell = workcell_of(task)
-    arguments = config.part("station")
+    task, kind = config.declared, config.station_kind
+    workcell = task.workcell()
+    check_workcell(workcell, kind, task.name)
+    arguments = dict(config.parts["station"])
     takes_period = "control_period" in inspect.signature(kind.build).parameters
     if config.control_period is not None and takes_period:
-        arguments["control_period"] = task.control_period
+        arguments["control_period"] = config.period
     build, disturbances = _checked_builder(kind, workcell, arguments), config.parts["disturbances"]
-    if task.workcell_kind == "insertion":
-        assert isinstance(disturbances, Disturbances)
-        station = disturbed(build, disturbances, kind.is_simulated, kind.name, call_checked(task, "impedance"))
+    if isinstance(disturbances, Disturbances):
+        station = disturbed(build, disturbances, kind.is_simulated, kind.name, task.impedance())
     else:
         station = build()
     rounding = 1e-9 if arguments.get("time_step") else 0.0  # see `exact_periods`
-    if config.control_period is not None and abs(station.nominal_period - task.control_period) > rounding:
-        if takes_period:
-            raise InputError(
-                f"time_unit of {task.name} is {task.time_unit!r} s, and the period {station.nominal_period!r} s of "
-                f"station={kind.name!r} is no multiple of it: leave time_unit out; its default is the station's time "
-                "step"
-            )
+    if config.control_period is not None and abs(station.nominal_period - config.period) > rounding:
         raise InputError(
             f"station={kind.name!r} has a control period of {station.nominal_period:g} s: leave control_period out, or "
             "let the station's builder take the parameter control_period"
         )
-    if station.wraps_angles and kind.is_simulated and "demonstrations" in task.provides():
-        means = call_checked(task, "reference").means
-        if turns_near_half(means):
-            station = ContinuousStation(station, means[0])
+    reference = config.reference() if station.wraps_angles and kind.is_simulated else None
+    if reference is not None and turns_near_half(reference.means):
+        station = ContinuousStation(station, reference.means[0])
     return station
 
 
@@ -94,20 +86,20 @@ def _checked_builder(kind: StationKind, workcell: Any, arguments: Mapping[str, A
         missing += [name for name in OUTPUTS if not station.HasOutputPort(name)]
         if missing:
             raise InputError(f"station={kind.name!r} lacks the port {', '.join(missing)}: export it")
-        if type(station).set_pose is Station.set_pose:
+        if type(station).set_pose is Station.set_pose and not hasattr(station, "plant"):
             raise InputError(f"station={kind.name!r} lacks the method set_pose, which a reset calls")
         return station
 
     return update_wrapper(checked, build)
 
 
-def make_guidance(task: Task, station: Station) -> Diagram:
-    """Build the guidance that a task is configured with.
+def make_guidance(config: EnvConfig, station: Station) -> Diagram:
+    """Build the guidance of a configuration.
 
     Raises:
         InputError: As `build_prior_knowledge` and `build_guidance`.
     """
-    return build_guidance(task.config.guidance, build_prior_knowledge(task, station), task.name)
+    return build_guidance(config.guidance, build_prior_knowledge(config, station), config.task)
 
 
 def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledge:
@@ -118,8 +110,8 @@ def make_prior_knowledge(task: str | EnvConfig, **options: Any) -> PriorKnowledg
     Raises:
         InputError: If a name is unknown, a value is out of range, or options are incompatible.
     """
-    new_task = _config(task, options).make_task()
-    return build_prior_knowledge(new_task, make_station(new_task))
+    config = _config(task, options)
+    return build_prior_knowledge(config, make_station(config))
 
 
 def make_env(
@@ -152,21 +144,36 @@ def make_env(
             "simulation, and execute the policy by guiderail deploy"
         )
     exported = render_mode if render_mode == "rgb_array" else None
-    new_task = config.make_task()
-    key = None if before_build is not None else _key(new_task, exported)
-    built = _POOL.acquire(key, lambda: _build(new_task, exported, before_build))
-    # Episode constants are systems of the diagram, which a reset sets. The new task therefore uses the constants of the
-    # task that built the diagram. The hidden values of a run belong to the new task alone.
-    assert built.diagram.task is not None
-    new_task.episode_constants = built.diagram.task.episode_constants
-    randomize = make_randomize(new_task, built.station, built.guidance)
-    diagram = replace(built.diagram, randomize=randomize, task=new_task)
+    key = None if before_build is not None else _key(config, exported)
+    built = _POOL.acquire(key, lambda: _build(config, exported, before_build))
+    # The hidden values of a run belong to the environment, not to the diagram.
+    randomize = make_randomize(config, built.station, built.guidance, built.diagram.diagram)
+    diagram = replace(built.diagram, randomize=randomize)
     release = partial(_POOL.release, key, built)
     try:
         return DiagramEnv(diagram, action_repeat=config.action_repeat, render_mode=render_mode, release=release)
     except BaseException:  # for example if the browser view finds no free port
         release()
         raise
+
+
+def make_vector_env(num_envs: int = 1, **arguments: Any) -> AsyncVectorEnv:
+    """Build the environment that `gymnasium.make_vec("guiderail/<Task>-v0", num_envs=..., ...)` returns.
+
+    Each environment runs in a process of its own, which is forked from a new process: forks of this process would copy
+    locks that its threads hold. The script that calls it therefore needs `if __name__ == "__main__":`.
+
+    Args:
+        num_envs: Number of environments.
+        arguments: Arguments of `make_env`.
+
+    Raises:
+        InputError: As `make_env`, or if `num_envs` is not a positive whole number.
+    """
+    if isinstance(num_envs, bool) or not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise InputError(f"num_envs must be a whole number of environments, at least 1, not {brief(num_envs)}")
+    multiprocessing.set_forkserver_preload([__name__])  # imports the module once, not in each process
+    return AsyncVectorEnv([partial(make_env, **arguments)] * num_envs, context="forkserver")
 
 
 def make_skill(
@@ -191,10 +198,10 @@ def make_skill(
             policy's ports do not match the environment.
     """
     check_render_mode(render_mode)
-    new_task = _config(task, options).make_task()
-    station = make_station(new_task)
-    guidance = make_guidance(new_task, station)
-    return build_skill_diagram(new_task, station, guidance, policy, render_mode=render_mode, before_build=before_build)
+    config = _config(task, options)
+    station = make_station(config)
+    guidance = make_guidance(config, station)
+    return build_skill_diagram(config, station, guidance, policy, render_mode=render_mode, before_build=before_build)
 
 
 _POOL = DiagramPool()
@@ -211,15 +218,15 @@ def _config(task: str | EnvConfig, options: dict[str, Any]) -> EnvConfig:
 
 
 def _build(
-    task: Task, render_mode: str | None, before_build: Callable[[DiagramBuilder], object] | None
+    config: EnvConfig, render_mode: str | None, before_build: Callable[[DiagramBuilder], object] | None
 ) -> BuiltDiagram:
-    station = make_station(task)
-    guidance = make_guidance(task, station)
-    diagram = build_task_diagram(task, station, guidance, render_mode=render_mode, before_build=before_build)
+    station = make_station(config)
+    guidance = make_guidance(config, station)
+    diagram = build_task_diagram(config, station, guidance, render_mode=render_mode, before_build=before_build)
     return BuiltDiagram(diagram, station, guidance)
 
 
-def _key(task: Task, render_mode: str | None) -> Hashable:
+def _key(config: EnvConfig, render_mode: str | None) -> Hashable:
     """Return a key that is equal for environments with equal diagrams; None if the diagram is not shared.
 
     Tasks, guidance, stations, kernels and robots of other packages may read files at each construction: a robot's
@@ -227,8 +234,8 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
     these files. For tasks of this package, the key contains the digests of the files that options name and of the files
     in a task folder.
     """
-    config, options = task.config, task.config.options
-    builders = [type(task), config.guidance_kind.build, config.station_kind.build]
+    task, options = type(config.declared), config.options
+    builders = [task, config.guidance_kind.build, config.station_kind.build]
     if "kernel" in options:
         builders.append(KERNELS.get(options["kernel"]))
     # Each construction of a diagram that is not shared takes 20 to 230 ms and 1 to 15 MB, with the shipped stations.
@@ -239,9 +246,24 @@ def _key(task: Task, render_mode: str | None) -> Hashable:
         declared = config.guidance_kind.options
         key = None if declared is None else declared.diagram_key(options)
         files = task.folder_digest(), *map(_digest, options.values())
-        return type(task), config.guidance_kind, config.station_kind, key, render_mode, freeze(options), files
+        return task, config.guidance_kind, config.station_kind, key, render_mode, freeze(options), files
     except (TypeError, OSError, InputError):
         return None  # an option is not comparable, or a file that an option names or of the task folder cannot be read
+
+
+def freeze(value: Any) -> tuple[str, Any]:
+    """Return a hashable pair of a value's type and content, because True, 1 and 1.0 are equal.
+
+    Raises:
+        TypeError: If the value is not None, a bool, int, float or str, or a list, tuple or dict of such values.
+    """
+    if isinstance(value, dict):
+        return "dict", tuple(sorted((name, freeze(entry)) for name, entry in value.items()))
+    if isinstance(value, list | tuple):
+        return "list", tuple(freeze(entry) for entry in value)
+    if value is not None and type(value) not in (bool, int, float, str):
+        raise TypeError
+    return type(value).__name__, repr(value)
 
 
 def _is_packaged(definition: Any) -> bool:

@@ -13,6 +13,7 @@ from pydrake.systems.primitives import AffineSystem, Multiplexer, Saturation, Tr
 from pydrake.trajectories import PiecewisePolynomial
 from scipy.linalg import block_diag
 
+from guiderail.diagrams.envs.scene import Camera
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import is_whole
 from guiderail.models.common.errors import InputError, brief
@@ -38,6 +39,27 @@ class ObservationTerm:
     center: Sequence[float] | np.ndarray | float = 0.0
     scale: Sequence[float] | np.ndarray | float = 1.0
     entries: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Observation of a task: terms, a camera, or an image followed by terms (see `ImageObservation`).
+
+    Attributes:
+        terms: Terms of the policy's observation.
+        camera: Camera of the policy's image.
+        privileged: Terms that only a privileged critic observes in simulation, such as hidden values. In addition to
+            the signals of other terms, they can name `exact_wrench`, the wrench without sensor errors.
+    """
+
+    terms: Sequence[ObservationTerm] = ()
+    camera: Camera | None = None
+    privileged: Sequence[ObservationTerm] = ()
+
+    @classmethod
+    def of(cls, declared: Sequence[ObservationTerm] | Observed) -> Observed:
+        """Return what `Task.observe` declares, which may be a list of terms."""
+        return declared if isinstance(declared, Observed) else cls(declared)
 
 
 class ImageAndStateSpace(gymnasium.spaces.Box):
@@ -101,7 +123,7 @@ class Observation(Diagram):
         rows = [_rows(term, sizes[term.signal], of_task) for term in terms]
         self.size = sum(len(scale) for _, _, scale in rows)
         if not self.size:
-            raise InputError(f"the observation{of_task} is empty: let observation_terms() list a signal")
+            raise InputError(f"the observation{of_task} is empty: let observe() list a signal")
         multiplexer = builder.AddNamedSystem("observed", Multiplexer([sizes[term.signal] for term in terms]))
         clocks: dict[str, OutputPort] = {}
         exported = set()

@@ -42,14 +42,10 @@ class Options(BaseModel):
     Attributes:
         entries: Names of the fields that are entries of a structured option, by field. The field `history_variance`
             with the name "history.variance" is the entry "variance" of the option `history`.
-        rewards: In the options of a task, the values of `Task.rewards`, so that they are known before it is imported.
-        observations: In the options of a task, the values of `Task.observations`.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, arbitrary_types_allowed=True)
     entries: ClassVar[Mapping[str, str]] = {}
-    rewards: ClassVar[tuple[str, ...]] = ()
-    observations: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def diagram_key(cls, options: Mapping[str, Any]) -> Hashable:
@@ -159,13 +155,29 @@ class CommonOptions(Options):
 
     guidance: str = Field("", description="guidance between the policy and the robot")
     station: str = Field("", description="name of the station, a simulated or a real robot")
-    reward: str = Field("", description="one of the rewards that the task declares")
-    observation: str = Field("", description="one of the observations that the task declares")
     difficulty: str = Field(STANDARD, description="one of the difficulties that the task declares")
     action_repeat: Integer = Field(1, ge=1, description="control steps per action")
     control_period: Number | None = Field(
         None, ge=0.005, le=0.5, description="time between commands [s]; default: that of the task's station"
     )
+
+
+def _only(name: str) -> AfterValidator:
+    """Return a validator that accepts only `name`, for tasks that declare no choices."""
+
+    def check(value: str) -> str:
+        if value != name:
+            raise ValueError(f"the task has only {name!r}")
+        return value
+
+    return AfterValidator(check)
+
+
+class TaskOptions(Options):
+    """Options of every task; a task with several rewards or observations declares their names as `Literal`."""
+
+    reward: Annotated[str, _only("sparse")] = Field("sparse", description="name of the reward")
+    observation: Annotated[str, _only("state")] = Field("state", description="name of the observation")
 
 
 class PrimitiveOptions(Options):
@@ -334,6 +346,12 @@ def check_choice(name: str, value: Any, choices: list[str], context: str) -> str
     if value not in choices:
         raise InputError(f"{context} has no {name} {brief(value)}: {did_you_mean(value, choices)}")
     return str(value)
+
+
+def choices_of(model: type[BaseModel], name: str) -> tuple[str, ...]:
+    """Return the values of a field of text: those of its `Literal`, otherwise its default only."""
+    field = model.model_fields[name]
+    return tuple(get_args(field.annotation)) or (field.default,)
 
 
 def describe_options(model: type[BaseModel] | None) -> list[dict[str, Any]]:

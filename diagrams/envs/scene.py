@@ -165,7 +165,9 @@ def add_picture(builder: DiagramBuilder, station: Any, camera: Camera | None, ta
         InputError: If the task has no camera, the station has no scene, or as `add_camera`.
     """
     if camera is None:
-        raise InputError(f"{task} has no camera: leave out render_mode='rgb_array' or --image, or write its camera()")
+        raise InputError(
+            f"{task} has no camera: leave out render_mode='rgb_array' or --image, or give its scene() a camera"
+        )
     query = scene_of(station)
     picture = add_camera(builder, station.scene_graph, query, "picture", camera, is_picture=True)
     builder.ExportOutput(picture, "rgb_image")
@@ -322,6 +324,7 @@ class Scene:
 
     # Function from poses (n, O) of a trace or a demonstration to points (n, 3) in the world [m].
     to_world: Callable[[np.ndarray], np.ndarray]
+    camera: Camera | None = None  # camera of `render_mode="rgb_array"`; None if the task has no picture
     demonstrations: tuple[np.ndarray, ...] = ()  # poses (N, O) of each demonstration
     constraint: tuple[np.ndarray, ...] = ()  # corner points (k, 3) of each line that bounds the allowed region [m]
     viewpoint: Viewpoint | None = None  # viewpoint of a page

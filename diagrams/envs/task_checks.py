@@ -2,60 +2,19 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
-from types import NoneType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from guiderail.diagrams.envs.observation import ObservationTerm
-from guiderail.diagrams.envs.scene import Camera
-from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
-from guiderail.diagrams.stations.station import Impedance
-from guiderail.diagrams.tasks.task import Task, Threshold
-from guiderail.models.common.arrays import as_number
+from guiderail.diagrams.stations.registry import StationKind
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.control.motion_constraints import MotionConstraints
-from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
 
 # Smallest distance of demonstrated angles from ±180° [rad], because actions and contact turn the tool further.
 HALF_TURN_MARGIN = 0.1
 
 
-class _ReturnType(NamedTuple):
-    """Types that a method may return: one of `kinds`, or a list or tuple of `entry`."""
-
-    kinds: tuple[type, ...] = ()
-    entry: type | None = None
-
-    def accepts(self, value: Any) -> bool:
-        entry = self.entry
-        is_list = entry is not None and isinstance(value, list | tuple)
-        return isinstance(value, self.kinds) or (is_list and all(isinstance(each, entry or ()) for each in value))
-
-    def __str__(self) -> str:
-        names = ["None" if kind is NoneType else kind.__name__ for kind in self.kinds]
-        return " or ".join(names + ([] if self.entry is None else [f"a list of {self.entry.__name__}"]))
-
-
-_RETURN_TYPES = {
-    "reference": _ReturnType((ReferenceTrajectory,)),
-    "keep_out": _ReturnType((KeepOut,)),
-    "template": _ReturnType((PlacedTemplate,)),
-    "approach": _ReturnType((ScriptedApproach,)),
-    "constraints": _ReturnType((LinearConstraints, NoneType)),
-    "motion_constraints": _ReturnType((MotionConstraints, NoneType)),
-    "impedance": _ReturnType((Impedance, NoneType)),
-    "signals": _ReturnType((Mapping,)),
-    "observation_terms": _ReturnType((Camera,), ObservationTerm),
-    "privileged_terms": _ReturnType(entry=ObservationTerm),
-    "reward_terms": _ReturnType(entry=RewardTerm),
-    "termination_terms": _ReturnType(entry=TerminationTerm),
-}
 # Attributes that a workcell must have, by its kind; workcells of other kinds are not checked.
 _WORKCELL_ATTRIBUTES = {
     "insertion": ("X_WT", "add_fixture", "add_workpiece", "filter_contacts"),
@@ -64,62 +23,32 @@ _WORKCELL_ATTRIBUTES = {
 }
 
 
-def call_checked(task: Task, method: str, *arguments: Any) -> Any:
-    """Call a method of a task, check the type of the result, and return the result.
+def check_workcell(workcell: Any, kind: StationKind, task: str) -> None:
+    """Check that the workcell of a task has the attributes that stations of a `kind` need.
 
     Raises:
-        InputError: If the method does not take these arguments, or returns another type than `Task` declares.
+        InputError: If there is no workcell, or it lacks an attribute.
     """
-    check_takes_arguments(task, method)
-    value = getattr(task, method)(*arguments)
-    if not _RETURN_TYPES[method].accepts(value):
-        raise InputError(f"{method}() of {task.name} must return {_RETURN_TYPES[method]}, not {brief(value)}")
-    return value
-
-
-def check_takes_arguments(task: Task, method: str) -> None:
-    """Raise an `InputError` if a method of a task does not take the arguments of the same method of `Task`."""
-    signature, base_signature = (inspect.signature(getattr(owner, method)) for owner in (task, Task))
-    names = list(base_signature.parameters)[1:]
-    try:
-        signature.bind(*names)
-    except TypeError:
-        raise InputError(
-            f"{method}() of {task.name} is called with the arguments ({', '.join(names)}), but has the parameters "
-            f"({', '.join(signature.parameters)}): give it those of Task.{method}"
-        ) from None
-
-
-def threshold_of(task: Task) -> Threshold:
-    """Return the attribute `collision` of a task.
-
-    Raises:
-        InputError: If it is not a `Threshold`, or its limit is not a number.
-    """
-    if not isinstance(task.collision, Threshold):
-        raise InputError(f"collision of {task.name} must be a Threshold, not {brief(task.collision)}")
-    if np.isnan(as_number(task.collision.above, f"the limit of the collision threshold of {task.name}")):
-        raise InputError(f"the limit of the collision threshold of {task.name} must be a number, not nan")
-    return task.collision
-
-
-def workcell_of(task: Task) -> Any:
-    """Return the workcell of a task.
-
-    Raises:
-        InputError: If there is no workcell, or it lacks an attribute that the stations for its kind need.
-    """
-    check_takes_arguments(task, "workcell")
-    workcell, station = task.workcell(), task.config.station
     if workcell is None:
-        raise InputError(f"workcell() of {task.name} returns nothing: let it return what station={station!r} works on")
-    missing = [name for name in _WORKCELL_ATTRIBUTES.get(task.workcell_kind, ()) if not hasattr(workcell, name)]
+        raise InputError(f"workcell() of {task} returns nothing: let it return what station={kind.name!r} works on")
+    missing = [name for name in _WORKCELL_ATTRIBUTES.get(kind.workcell_kind, ()) if not hasattr(workcell, name)]
     if missing:
         raise InputError(
-            f"workcell() of {task.name} returns {brief(workcell)}, which has no {missing[0]}: let it return what "
-            f"station={station!r} works on"
+            f"workcell() of {task} returns {brief(workcell)}, which has no {missing[0]}: let it return what "
+            f"station={kind.name!r} works on"
         )
-    return workcell
+
+
+def check_terms(terms: Any, task: str) -> None:
+    """Raise an `InputError` unless the observation of a task is a list of `ObservationTerm`."""
+    if not isinstance(terms, list | tuple) or not all(isinstance(term, ObservationTerm) for term in terms):
+        raise InputError(f"observe() of {task} must return Observed or a list of ObservationTerm, not {brief(terms)}")
+
+
+def check_functions(functions: Any, method: str, task: str) -> None:
+    """Raise an `InputError` unless a `method` of a task returns functions by name."""
+    if not isinstance(functions, Mapping):
+        raise InputError(f"{method}() of {task} must return functions of signals by name, not {brief(functions)}")
 
 
 def turns_near_half(means: np.ndarray) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -65,6 +65,13 @@ class Symmetry:
         observations = np.tile(np.eye(size + count), (len(self.observations), 1, 1))
         observations[:, :size, :size] = self.observations
         return Symmetry(observations, self.actions, self.privileged)
+
+    def restrict(self, outputs: Sequence[int]) -> Symmetry | None:
+        """Return the symmetry for actions that move some `outputs`; None if it moves other outputs as well."""
+        actions = self.actions[:, list(outputs)][:, :, list(outputs)]
+        if (np.abs(actions).sum(axis=1) != 1).any():
+            return None
+        return Symmetry(self.observations, actions, self.privileged)
 
     @classmethod
     def of_signs(cls, observation: ArrayLike, action: ArrayLike, privileged: ArrayLike | None = None) -> Symmetry:
@@ -133,6 +140,7 @@ class TaskDiagram:
         symmetry: Symmetry of task and guidance for data augmentation, if there is one.
         near_symmetry: `symmetry`, extended by symmetries that hold only for most of an episode.
         task: `Task` that the diagram was built from, if there is one.
+        config: Configuration of the environment, if there is one.
 
     Raises:
         InputError: If the diagram lacks a port, the size of the observation does not match its space,
@@ -153,6 +161,7 @@ class TaskDiagram:
     symmetry: Symmetry | None = None
     near_symmetry: Symmetry | None = None
     task: Any = None
+    config: Any = None
 
     @property
     def meshcat(self) -> Meshcat | None:

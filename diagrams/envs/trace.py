@@ -10,6 +10,9 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 
+TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
+QUASI_STATIC_TIME = 0.5  # contact that lasts longer is quasi-static, not transient (ISO/TS 15066) [s]
+
 
 @dataclass(frozen=True)
 class Metric:
@@ -128,15 +131,40 @@ class EpisodeTrace:
             if "contact_force" in self._signals
             else 0.0,
             # Forces are added in the order of the steps, because the order of NumPy's mean rounds differently.
+            "quasi_static_force": self._quasi_static_force(),
             "mean_force": float(np.cumsum(self.force)[-1] / len(self)) if len(self) else 0.0,
             "collisions": float((collision & ~np.append(False, collision[:-1])).sum()),
             "collision_steps": float(collision.sum()),
+            "cost": float(self.unsafe().sum()),
             "saturated_steps": float(self.signals["saturation"].any(axis=1).sum())
             if "saturation" in self._signals
             else 0.0,
             "fallback_steps": float(self._is_positive("fallback").sum()),
             "steps": float(len(self)),
         }
+
+    def unsafe(self, first: int = 0) -> np.ndarray:
+        """Return whether each control step from number `first` on is unsafe, (n − first,).
+
+        A control step is unsafe if the commanded or the measured pose violates a constraint by more than `TOLERANCE`,
+        or the force is above the limit of a collision. A violation that is NaN is unsafe.
+        """
+        unsafe = self._is_positive("collision")[first:]
+        for name in ("commanded_violation", "measured_violation"):
+            if name in self._signals:
+                unsafe = unsafe | ~(self.signals[name][first:, 0] <= TOLERANCE)
+        return unsafe
+
+    def _quasi_static_force(self) -> float:
+        """Return the largest force that the contact never falls below for `QUASI_STATIC_TIME` [N]; 0 if it is shorter.
+
+        Without the signal `contact_force`, the force is that of `force`.
+        """
+        force = self.signals["contact_force"][:, 0] if "contact_force" in self._signals else self.force
+        window = max(round(QUASI_STATIC_TIME / self.period), 1)
+        if len(force) < window:
+            return 0.0
+        return float(np.lib.stride_tricks.sliding_window_view(force, window).min(axis=1).max())
 
     def _largest(self, name: str) -> float:
         return float(self.signals[name].max(initial=-np.inf)) if name in self._signals else -np.inf

@@ -21,8 +21,7 @@ from guiderail.models.control.motion_constraints import MotionConstraintFilter
 from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.systems.command_filter import CommandFilter
 from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.history_buffer import HistoryBuffer
-from guiderail.systems.history_length_schedule import HistoryLengthSchedule
+from guiderail.systems.history import HistoryBuffer, HistoryLengthSchedule
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 from guiderail.systems.progress_clock import ProgressClock
 from guiderail.systems.residual import Residual

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 from pydrake.math import RigidTransform
@@ -224,6 +224,47 @@ class ScriptedApproach:
     heights: tuple[float, float]
     speed: float
     reach: float
+
+
+Known = TypeVar("Known")
+MaybeLazy: TypeAlias = Known | Callable[[], Known]
+"""Value, or function that computes it when it is needed."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior knowledge that a task declares; what takes time may be a function without arguments.
+
+    Attributes:
+        reference: Reference trajectory of demonstrations; it is resampled to the control period.
+        constraints: G y ≥ c on every commanded pose, or a function of the number of control steps that returns them;
+            None if only the guidance has constraints, such as a template's.
+        motion: Nonlinear constraints of the commanded motion, such as shapes to stay outside of, which guidance by a
+            primitive enforces. Their linear part is `constraints`.
+        keep_out: Walls at which safe residual RL stops the robot.
+        template: Shared control template and the poses of its objects.
+        approach: Scripted approach.
+        isotropic_groups: Groups of outputs with the same unit, as indices. In residual RL, an action of 1 displaces all
+            outputs of a group by the same amount. None: one group of all outputs.
+        start_within: Largest start offset of a reset, training or held-out, which certificates assume: the distance
+            from the reference's first pose for each output, (O,), or one number. Starts that are given by the options
+            of a reset are not included.
+    """
+
+    reference: MaybeLazy[ReferenceTrajectory] | None = None
+    constraints: LinearConstraints | Callable[[int], LinearConstraints] | None = None
+    motion: MotionConstraints | None = None
+    keep_out: KeepOut | None = None
+    template: MaybeLazy[PlacedTemplate] | None = None
+    approach: ScriptedApproach | None = None
+    isotropic_groups: tuple[tuple[int, ...], ...] | None = None
+    start_within: np.ndarray | float = 0.0
+
+    @property
+    def provides(self) -> tuple[str, ...]:
+        """Kinds of prior knowledge: keys of `guidance.registry.REQUIREMENTS`."""
+        fields = {name: name for name in ("keep_out", "template", "approach")} | {"demonstrations": "reference"}
+        return tuple(name for name, attribute in fields.items() if getattr(self, attribute) is not None)
 
 
 @dataclass(frozen=True)

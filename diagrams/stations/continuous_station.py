@@ -9,7 +9,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.systems.continuous_pose import ContinuousPose
+from guiderail.systems.body_poses import ContinuousPose
 
 
 class ContinuousStation(Station):

@@ -24,9 +24,8 @@ from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.systems.command_disturbance import CommandDisturbance
-from guiderail.systems.sensor_disturbance import SensorDisturbance
-from guiderail.systems.wrench_tare import WrenchTare
+from guiderail.systems.disturbances import CommandDisturbance, SensorDisturbance
+from guiderail.systems.wrench_signals import WrenchTare
 
 SIMULATION_PORTS = ("query", "body_poses", "contact_results")  # those that a station has
 EXACT_WRENCH = "exact_wrench"

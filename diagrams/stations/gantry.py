@@ -40,7 +40,7 @@ from guiderail.diagrams.stations.workcell import Workcell
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.systems.pose_wrench import PoseWrench
+from guiderail.systems.wrench_signals import PoseWrench
 
 GANTRY_JOINTS = (
     ("x", PrismaticJoint, [1.0, 0.0, 0.0]),

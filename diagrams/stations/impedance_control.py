@@ -19,9 +19,9 @@ from guiderail.models.common.errors import InputError
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.energy_tank import EnergyTank
-from guiderail.systems.force_monitor import ForceMonitor
 from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
 from guiderail.systems.reference_governor import ReferenceGovernor
+from guiderail.systems.wrench_signals import ForceMonitor
 
 if TYPE_CHECKING:
     from guiderail.models.templates import SharedControlTemplate

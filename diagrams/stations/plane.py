@@ -27,7 +27,7 @@ from guiderail.models.common.arrays import as_numbers, round_period
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.mean_force import MeanForce
+from guiderail.systems.wrench_signals import MeanForce
 
 OBSTACLE_Z = -0.035  # height of the visual obstacles [m]; the robot passes above them
 OBSTACLE_COLOR = [0.75, 0.25, 0.15, 1.0]

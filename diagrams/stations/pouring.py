@@ -1,6 +1,6 @@
 """Pouring station: an arm under Cartesian position control with a thermos and balls, and a mug on a table."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -26,10 +26,9 @@ from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel,
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot
+from guiderail.systems.body_poses import MeasuredPose, RelativePoses
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_detector import ContactDetector
-from guiderail.systems.measured_pose import MeasuredPose
-from guiderail.systems.relative_poses import RelativePoses
 from guiderail.systems.wrench_sensor import WrenchSensor
 
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
@@ -148,14 +147,17 @@ class PouringStation(Station):
     """
 
     wraps_angles = True
+    pushable = False  # the balls in the thermos would not move with the robot
 
-    def __init__(self, config: PouringConfig):
-        """Construct the station.
+    def __init__(self, config: PouringConfig, control_period: float | None = None):
+        """Construct the station; a `control_period` [s] replaces that of the `config`.
 
         Raises:
             InputError: If the data of the robot have no drives or no level posture.
         """
         super().__init__()
+        if control_period is not None:
+            config = replace(config, substeps=round(control_period / config.plant_period))
         builder = DiagramBuilder()
         self.config = config
         self.control_period = config.control_period

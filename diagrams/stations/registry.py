@@ -76,10 +76,24 @@ def register_station(
         lines = str(build.__doc__ or "").strip().splitlines()
         description = lines[0] if lines else ""
         periods = time_unit, control_period
-        STATIONS.register(name, StationKind(name, build, workcell_kind, options, description, is_simulated, *periods))
+        kind = StationKind(name, build, workcell_kind, options, description, is_simulated, *periods)
+        STATIONS.register(name, kind)
+        build.kind = kind
         return build
 
     return add
+
+
+def kind_of(station: Any, task: str) -> StationKind:
+    """Return the registered kind of a class or function; error messages name the `task` whose station it is.
+
+    Raises:
+        InputError: If it is not registered.
+    """
+    kind = getattr(station, "kind", None)
+    if not isinstance(kind, StationKind):
+        raise InputError(f"station of {task} is a class that register_station registers, not {brief(station)}")
+    return kind
 
 
 def stations_for(workcell_kind: str) -> list[str]:

@@ -36,7 +36,6 @@ done. T is fixed in the world by the *nominal* fixture; offsets of the fixture d
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -48,6 +47,7 @@ from pydrake.geometry import ProximityProperties, Role, RoleAssign, SceneGraph
 from pydrake.multibody.plant import AddMultibodyPlant, CoulombFriction, MultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import Frame, ModelInstanceIndex
 from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort
+from pydrake.systems.primitives import ConstantVectorSource, MatrixGain, PassThrough
 
 from guiderail.diagrams.stations.options import CONTROL_PERIOD as CONTROL_PERIOD
 from guiderail.diagrams.stations.options import TARE_AVERAGED, TARE_SKIPPED
@@ -173,6 +173,7 @@ class Station(Diagram):
         plant: The simulated plant.
         scene_graph: Its scene graph.
         control_period: Time between commands [s].
+        pushable: True if `DiagramEnv.push` may displace the robot.
         wraps_angles: True if the pose's angles jump at ±π; the angles of a gantry are unbounded.
     """
 
@@ -180,6 +181,7 @@ class Station(Diagram):
     scene_graph: SceneGraph
     control_period: float = CONTROL_PERIOD
     wraps_angles: bool = False
+    pushable: bool = True
 
     @property
     def time_step(self) -> float:
@@ -217,13 +219,28 @@ class Station(Diagram):
         name = "impedance_force"
         return {name: self.GetOutputPort(name)} if self.HasOutputPort(name) else {}
 
-    @abstractmethod
+    def finish(self, builder: DiagramBuilder, desired_pose: InputPort, **ports: Any) -> None:
+        """Export the ports of a station and build this diagram, at the end of its constructor.
+
+        Args:
+            builder: Builder of the station.
+            desired_pose: Input for the desired pose, (O,).
+            ports: `pose` and, where the station has them, the other ports of `export_station_ports` by name.
+        """
+        export_station_ports(builder, desired_pose, **ports)
+        builder.BuildInto(self)
+
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
         """Put the robot at rest with its tool center at `pose`, (O,); `context` is the root context.
+
+        By default, a pose is the positions of the plant.
 
         Raises:
             InputError: If `pose` has another shape or is not finite.
         """
+        positions = check_pose(pose, self.plant.num_positions())
+        plant_context = self.plant.GetMyMutableContextFromRoot(context)
+        self.plant.SetPositionsAndVelocities(plant_context, np.r_[positions, 0.0 * positions])
 
     def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
         """Return constraints that keep the robot's joints within their limits and away from singular postures.
@@ -314,6 +331,18 @@ def add_plant(builder: DiagramBuilder, time_step: float, **config: Any) -> tuple
     return AddMultibodyPlant(MultibodyPlantConfig(time_step=time_step, **shared | config), builder)
 
 
+def add_position_ports(
+    builder: DiagramBuilder, plant: MultibodyPlant, model: ModelInstanceIndex
+) -> tuple[InputPort, OutputPort]:
+    """Return ports of the desired positions (n,), at rest, and of the positions (n,) of joints with PD gains."""
+    n = plant.num_positions(model)
+    desired = builder.AddNamedSystem("desired_state", MatrixGain(np.eye(2 * n, n)))
+    builder.Connect(desired.get_output_port(), plant.get_desired_state_input_port(model))
+    positions = builder.AddNamedSystem("positions", MatrixGain(np.eye(n, 2 * n)))
+    builder.Connect(plant.get_state_output_port(model), positions.get_input_port())
+    return desired.get_input_port(), positions.get_output_port()
+
+
 def plant_period(workcell: Workcell, longest: float = PLANT_PERIOD) -> float:
     """Return the default time step of a plant with a workcell, at most that of the station [s]."""
     return min(getattr(workcell, "time_step", None) or PLANT_PERIOD, longest)
@@ -350,13 +379,22 @@ def to_wrench_order(values: Sequence[float]) -> np.ndarray:
 def export_station_ports(
     builder: DiagramBuilder,
     desired_pose: InputPort,
-    command_time: InputPort,
+    command_time: InputPort | None = None,
     *,
     max_wrench: InputPort | None = None,
     impedance_force: OutputPort | None = None,
     **outputs: OutputPort,
 ) -> None:
-    """Export the `INPUTS` and `OUTPUTS` of a station, and the ports of an impedance if there is one."""
+    """Export the `INPUTS` and `OUTPUTS` of a station, and the ports of an impedance if there is one.
+
+    `pose` is required; without a port, another output is zero, and the time of commands has no effect.
+    """
+    if command_time is None:
+        command_time = builder.AddNamedSystem("command_time", PassThrough(1)).get_input_port()
+    for name in OUTPUTS:
+        if name not in outputs:
+            zero = np.zeros(outputs["pose"].size() if name == "wrench" else 1)
+            outputs[name] = builder.AddNamedSystem(name, ConstantVectorSource(zero)).get_output_port()
     if max_wrench is not None:
         builder.ExportInput(max_wrench, "max_wrench")
     builder.ExportInput(desired_pose, "desired_pose")

@@ -7,10 +7,8 @@ from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE
-from guiderail.systems.pose_from_transform import PoseFromTransform
-from guiderail.systems.spatial_force_from_wrench import SpatialForceFromWrench
+from guiderail.systems.conversions import PoseFromTransform, SpatialForceFromWrench, TransformFromPose
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.transform_from_pose import TransformFromPose
 
 
 class TransformStation(Station):

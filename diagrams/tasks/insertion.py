@@ -15,27 +15,32 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import Field
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import Context, DiagramBuilder, OutputPort
 from scipy.linalg import block_diag
 
-from guiderail.diagrams.envs.observation import ObservationTerm, affine
-from guiderail.diagrams.envs.options import Pair, ResetOptions, satisfies
+from guiderail.diagrams.envs.observation import ObservationTerm, Observed, affine
+from guiderail.diagrams.envs.options import Number, Pair, ResetOptions, satisfies
 from guiderail.diagrams.envs.scene import Camera, look_at
+from guiderail.diagrams.guidance.prior import Prior
+from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import Impedance, Station, max_wrench
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
-from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE, MIN_CONTACT_FORCE
-from guiderail.diagrams.tasks.task import EpisodeConstant, Task, terminal_reward
+from guiderail.diagrams.tasks.options import (
+    CENTER_OF_PRESSURE_SCALE,
+    COMMAND_SCALE,
+    MIN_CONTACT_FORCE,
+    DemonstratedOptions,
+    ForceOptions,
+)
+from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, terminal_reward
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE
-from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.center_of_pressure import CenterOfPressure
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.relative_poses import RelativePoses
-from guiderail.systems.reward_system import RewardTerm
+from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
+from guiderail.systems.body_poses import RelativePoses
+from guiderail.systems.wrench_signals import CenterOfPressure
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 
@@ -48,6 +53,10 @@ LIMIT_CENTER, LIMIT_SCALE = 20.0, 10.0
 HIDDEN_OFFSET_SCALE = (2.0 * MM, 2.0 * MM, 0.1)
 EXACT_WRENCH_SCALE = (5.0, 5.0, 8.0, 0.02, 0.02, 0.2)
 """Scales of a privileged critic's observation: x, y [m] and turn [rad] of the fixture, force [N] and torque [Nm]."""
+PRIVILEGED = (
+    ObservationTerm("hidden_offset", 0.0, HIDDEN_OFFSET_SCALE),
+    ObservationTerm("exact_wrench", 0.0, EXACT_WRENCH_SCALE),
+)
 
 
 GivenOffset = Annotated[
@@ -78,7 +87,7 @@ class HoldTest:
 HOLD_DISTANCE, MAX_HOLD_MOTION = 3.0 * MM, 1.0 * MM
 
 
-class InsertionTask(Task):
+class InsertionTask(ForceOptions, Task):
     """Insertion of a workpiece in the tool into a fixture, with sampled offsets of both and a force limit.
 
     Held-out offsets are sampled from the same range as training offsets, with random numbers that training never uses.
@@ -89,18 +98,25 @@ class InsertionTask(Task):
         simulated_rewards: Rewards that use components of the workpiece's pose that cannot be measured on hardware.
         snaps_in: True if the bounded force cannot pull out an inserted workpiece. On hardware, the operator releases
             such a workpiece after a success.
-        offsets: Sampler of the offsets; it stores the hidden values of a run. A subclass sets it.
-        collision: Signal and limit of the contact force [N]. A subclass sets it.
     """
 
-    Reset: ClassVar[type[ResetOptions]] = InsertionReset
+    station = GantryStation
+    Reset = InsertionReset
     has_held_out_distribution = True
     workpiece: ClassVar[str]
     fixture: ClassVar[str]
     simulated_rewards: ClassVar[tuple[str, ...]] = ()
     snaps_in: ClassVar[bool] = False
 
-    offsets: HiddenOffsets
+    @property
+    @abstractmethod
+    def offsets(self) -> HiddenOffsets:
+        """Sampler of the offsets."""
+
+    @property
+    def collision(self) -> Threshold:
+        """Limit of the impedance's force [N]."""
+        return Threshold("impedance_force", self.largest_force_limit)
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's actual pose in the fixture, (6,): position [m] and rotation vector [rad].
@@ -116,47 +132,40 @@ class InsertionTask(Task):
         return self._add_force_limit(builder, station) | self._add_workpiece_pose(builder, station)
 
     def _add_force_limit(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:
-        sampled = self._force_limit_range
+        """Add the constants of a sampled force limit and return their ports."""
+        sampled = self.force_limit_range
         if sampled is None:
             return {}
         # The smallest force limit applies until a reset samples another one.
-        limit = EpisodeConstant(builder, "force_limit", 1, np.array(sampled[:1]))
-        self.episode_constants["force_limit"] = limit
+        limit = add_constant(builder, "force_limit", sampled[:1])
         if not station.HasInputPort("max_wrench"):
-            impedance = self.impedance()
-            if impedance is not None and impedance.bound is not None and sampled[0] < sampled[1]:
+            if self.bounded_force and sampled[0] < sampled[1]:
                 raise InputError(
-                    f"force_limit_range changes the largest force, and station={self.config.station!r} has no input "
-                    f"'max_wrench' for it: give two equal forces or force_limit, not {brief(sampled)}"
+                    "force_limit_range changes the largest force, and this station has no input 'max_wrench' for it: "
+                    f"give two equal forces or force_limit, not {brief(sampled)}"
                 )
-            return {"force_limit": limit.port}
-        bound = EpisodeConstant(builder, "max_wrench", MAX_WRENCH_SIZE, max_wrench(sampled[0]))
-        self.episode_constants["max_wrench"] = bound
-        return {"force_limit": limit.port, "max_wrench": bound.port}
-
-    @property
-    def _force_limit_range(self) -> tuple[float, ...] | None:
-        return getattr(self.options, "force_limit_range", None)
+            return {"force_limit": limit}
+        return {"force_limit": limit, "max_wrench": add_constant(builder, "max_wrench", max_wrench(sampled[0]))}
 
     def force_limit_terms(self) -> tuple[ObservationTerm, ...]:
         """Return the term of a sampled force limit, or no term; symmetry transformations leave the limit unchanged."""
-        return () if self._force_limit_range is None else (ObservationTerm("force_limit", LIMIT_CENTER, LIMIT_SCALE),)
+        return () if self.force_limit_range is None else (ObservationTerm("force_limit", LIMIT_CENTER, LIMIT_SCALE),)
 
     def _add_workpiece_pose(self, builder: DiagramBuilder, station: Station) -> dict[str, OutputPort]:
+        """Add the workpiece's pose in the fixture, actual or estimated, and return its port."""
         if not station.HasOutputPort("body_poses"):
             observable = self.observable_success()
             if observable is None:
                 return {}
             name, pose = f"{self.workpiece}_estimate", station.get_pose_output_port()
             return {self.workpiece: add_system(builder, name, affine(*observable), pose).get_output_port()}
-        self.episode_constants["hidden_offset"] = EpisodeConstant(builder, "hidden_offset", 3)
         plant = station.plant
         relative = RelativePoses(plant, [plant.GetBodyByName(self.workpiece)], plant.GetBodyByName(self.fixture))
         name, body_poses = f"{self.workpiece}_in_{self.fixture}", station.GetOutputPort("body_poses")
         add_system(builder, name, relative, body_poses=body_poses)
         return {
             self.workpiece: relative.get_relative_poses_output_port(),
-            "hidden_offset": self.episode_constants["hidden_offset"].port,
+            "hidden_offset": add_constant(builder, "hidden_offset", np.zeros(3)),
         }
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray] | None:
@@ -175,54 +184,30 @@ class InsertionTask(Task):
         return [HoldTest((0.0, 0.0, HOLD_DISTANCE), MAX_HOLD_MOTION)]
 
     def impedance(self) -> Impedance | None:
-        """Return an impedance with a force below the force limit; None if the option `bounded_force` is false.
+        """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
+        return Impedance().with_max_force(self.largest_force_limit) if self.bounded_force else None
 
-        Raises:
-            InputError: If the subclass sets no positive force limit, `collision`.
-        """
-        if not getattr(self.options, "bounded_force", True):
-            return None
-        if not self.collision.above > 0.0:
-            raise InputError(
-                f"the force limit of {self.name} must be positive, not {brief(self.collision.above)}: let its "
-                'constructor set collision to Threshold("impedance_force", limit)'
-            )
-        return Impedance().with_max_force(self.collision.above)
+    def exceeds_force_limit(self) -> Callable[..., bool]:
+        """Return the condition of a collision: a force above `force_limit` [N], or above a sampled limit."""
+        if self.force_limit_range is not None:
+            return lambda impedance_force, force_limit: impedance_force[0] > force_limit[0]
+        limit = self.largest_force_limit
+        return lambda impedance_force: impedance_force[0] > limit
 
-    def privileged_terms(self) -> Sequence[ObservationTerm]:
-        """Return the fixture's actual offset and the exact wrench."""
-        return (
-            ObservationTerm("hidden_offset", 0.0, HIDDEN_OFFSET_SCALE),
-            ObservationTerm("exact_wrench", 0.0, EXACT_WRENCH_SCALE),
-        )
-
-    def force_limit(self) -> TerminationTerm:
-        """Return the term that ends an episode as a collision above `collision.above` [N], or above a sampled limit."""
-        if self._force_limit_range is not None:
-            return TerminationTerm(
-                "collision",
-                {"impedance_force": 1, "force_limit": 1},
-                lambda impedance_force, force_limit: impedance_force[0] > force_limit[0],
-            )
-        limit = self.collision.above
-        return TerminationTerm("collision", {"impedance_force": 1}, lambda impedance_force: impedance_force[0] > limit)
-
-    def reset(
-        self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
-    ) -> dict[str, Any]:
+    def reset(self, world: World, rng: np.random.Generator, given: Any) -> dict[str, Any]:
         """Sample the offsets, move fixture and workpiece, and put the tool at its start pose."""
-        fixture, workpiece = self.offsets.draw(rng, options)
-        self.set_part_offsets(station, context, fixture, workpiece)
-        station.set_pose(context, self.start_pose(rng))
-        if "hidden_offset" in self.episode_constants:
-            self.episode_constants["hidden_offset"].set(context, np.resize([*fixture, 0.0], 3))
+        fixture, workpiece = self.offsets.draw(rng, given, world.run)
+        self.set_part_offsets(world.station, world.context, fixture, workpiece)
+        world.set_pose(self.start_pose(rng))
+        if world.has("hidden_offset"):
+            world.set("hidden_offset", np.resize([*fixture, 0.0], 3))
         sampled: dict[str, Any] = {f"{self.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
-        if self._force_limit_range is not None:
-            lowest, highest = self._force_limit_range
+        if self.force_limit_range is not None:
+            lowest, highest = self.force_limit_range
             limit = float(rng.uniform(lowest, highest))
-            self.episode_constants["force_limit"].set(context, np.array([limit]))
-            if "max_wrench" in self.episode_constants:
-                self.episode_constants["max_wrench"].set(context, max_wrench(limit))
+            world.set("force_limit", [limit])
+            if world.has("max_wrench"):
+                world.set("max_wrench", max_wrench(limit))
             sampled["force_limit"] = limit
         return sampled
 
@@ -283,10 +268,8 @@ def _alignment_gained(plug: np.ndarray, last_plug: np.ndarray) -> float:
 
 
 def sides_of_the_rim(
-    observation: str,
-    action_dims: Iterable[int],
-    more: Callable[[np.ndarray], Iterable[np.ndarray]] = lambda across: (),
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    observation: str, more: Callable[[np.ndarray], Iterable[np.ndarray]] = lambda across: ()
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the seven symmetries of a plug on the rim: three turns about the axis, and four reflections.
 
     Vectors across the axis are rotated or reflected. Torques and tilts are axial vectors, so that a reflection also
@@ -295,17 +278,15 @@ def sides_of_the_rim(
 
     Args:
         observation: Name of the observation.
-        action_dims: Indices of the outputs that an action moves.
         more: Function from the transformation of vectors across the axis (2, 2) to the matrices of further entries of
             the observation.
 
     Returns:
-        Matrices of observations (7, n, n), of actions (7, A, A) and of privileged observations (7, 9, 9); None if
-        actions move only one of x and y, or only one of the tilts.
+        Matrices of observations (7, n, n), of outputs (7, 6, 6) and of privileged observations (7, 9, 9).
     """
     quarter, mirror = np.array([[0.0, -1.0], [1.0, 0.0]]), np.diag([1.0, -1.0])
     turns = [np.linalg.matrix_power(quarter, k) for k in range(4)]
-    observations, actions, privileged, outputs = [], [], [], list(action_dims)
+    observations, poses, privileged = [], [], []
     for across in [*turns[1:], *(turn @ mirror for turn in turns)]:
         axial = np.linalg.det(across).round() * across
         # In a pose, Ry comes before Rx.
@@ -313,17 +294,15 @@ def sides_of_the_rim(
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
         contact_terms = () if observation == "state" else (across, across)  # center of pressure, and commanded x and y
         observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms, *more(across)))
-        actions.append(pose[np.ix_(outputs, outputs)])
+        poses.append(pose)
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
-    if any((np.abs(action).sum(0) != 1).any() for action in actions):
-        return None
-    return np.array(observations), np.array(actions), np.array(privileged)
+    return np.array(observations), np.array(poses), np.array(privileged)
 
 
 WRIST_IMAGE_SIZE = (48, 48)  # width and height of the wrist camera's image [pixels]
 
 
-class DemonstratedInsertion(InsertionTask):
+class DemonstratedInsertion(DemonstratedOptions, InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
@@ -334,23 +313,39 @@ class DemonstratedInsertion(InsertionTask):
     This distance is privileged: it is computed from simulation state that the policy does not observe. Depth gained and
     distance gained are differences of potentials.
 
-    The name of the workpiece must be "plug".
-
-    Attributes:
-        insertion_length: Length of the insertion [m]; the distance of the wrist camera is proportional to it.
+    The name of the workpiece must be "plug". A subclass has the option `start_offset_max` [m].
     """
 
-    isotropic_groups = ((0, 1, 2), (3, 4, 5))
-    insertion_length: float
-    options: Any  # must have `start_offset_max`
+    start_offset_max: Number
+
+    @property
+    @abstractmethod
+    def duration(self) -> float:
+        """Duration of an episode [s]."""
+
+    @property
+    @abstractmethod
+    def insertion_length(self) -> float:
+        """Length of the insertion [m]."""
 
     @abstractmethod
-    def constraints(self) -> LinearConstraints:
-        """Return the bounds of every commanded pose."""
+    def reference(self) -> ReferenceTrajectory:
+        """Return the reference trajectory of the demonstrations, in steps of the default control period."""
 
-    def keep_out(self) -> KeepOut:
-        """Return no walls: in safe residual RL, only the constraints limit commands."""
-        return KeepOut(np.empty((0, POSE_SIZE)), np.empty((0, POSE_SIZE)), self.constraints(), margin=0.0)
+    @abstractmethod
+    def constraints(self, num_steps: int = 0) -> LinearConstraints:
+        """Return the bounds of every commanded pose in an episode of `num_steps` control steps."""
+
+    def prior(self) -> Prior:
+        """Return the demonstrations and the constraints; in safe residual RL, only the constraints limit commands."""
+        constraints, nothing = self.constraints(), np.empty((0, POSE_SIZE))
+        return Prior(
+            reference=self.reference,
+            constraints=constraints,
+            keep_out=KeepOut(nothing, nothing, constraints, margin=0.0),
+            isotropic_groups=((0, 1, 2), (3, 4, 5)),
+            start_within=self.start_offset_max,
+        )
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the workpiece's pose in the fixture and the center of pressure."""
@@ -358,45 +353,39 @@ class DemonstratedInsertion(InsertionTask):
         add_system(builder, "center_of_pressure", system, wrench=station.get_wrench_output_port())
         return {**super().signals(builder, station), "center_of_pressure": system.get_center_of_pressure_output_port()}
 
-    def scaled_terms(
-        self, center: np.ndarray, scale: np.ndarray, wrench_scale: np.ndarray
-    ) -> Sequence[ObservationTerm] | Camera:
-        """Return the terms of the observation, for center and scale of the pose (6,) and scale of the wrench (6,)."""
-        if self.config.observation == "image":
-            return self.wrist_camera()
-        half = 0.5 * self.num_steps * self.control_period
+    def observed(self, center: np.ndarray, scale: np.ndarray, wrench_scale: np.ndarray) -> Observed:
+        """Return the observation, for center and scale of the pose (6,) and scale of the wrench (6,)."""
+        camera = self.wrist_camera() if self.has_image else None
+        if self.observation == "image":
+            return Observed((), camera, PRIVILEGED)
+        half = 0.5 * self.duration
         terms = [
             ObservationTerm("time", half, half),
             ObservationTerm("pose", center, scale),
             ObservationTerm("wrench", 0.0, wrench_scale),
         ]
-        if self.config.observation == "center_of_pressure":
+        if self.observation == "center_of_pressure":
             terms.append(ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE))
             terms.append(ObservationTerm("desired_pose", 0.0, COMMAND_SCALE, (0, 1)))
-        return *terms, *self.force_limit_terms()
+        return Observed((*terms, *self.force_limit_terms()), camera, PRIVILEGED)
 
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+    def rewards(self) -> dict[str, Callable[..., float]]:
         """Return costs of actions and forces, the terminal reward, and the additions of "shaped" and "aligned"."""
-        plug = {"plug": POSE_SIZE, "last_plug": POSE_SIZE}
-        terms = [
-            RewardTerm("action_cost", {"action": num_actions}, lambda action: -ACTION_WEIGHT * float(action @ action)),
-            RewardTerm("force_cost", {"wrench": 6}, _force_cost),
-            terminal_reward(TERMINAL),
-        ]
-        if self.config.reward in ("shaped", "aligned"):
-            terms.append(RewardTerm("depth", plug, _depth_gained))
-        if self.config.reward == "aligned":
-            terms.append(RewardTerm("alignment", plug, _alignment_gained))
+        terms: dict[str, Callable[..., float]] = {
+            "action_cost": lambda action: -ACTION_WEIGHT * float(action @ action),
+            "force_cost": _force_cost,
+            "terminal_reward": terminal_reward(TERMINAL),
+        }
+        if self.reward in ("shaped", "aligned"):
+            terms["depth"] = _depth_gained
+        if self.reward == "aligned":
+            terms["alignment"] = _alignment_gained
         return terms
 
     @property
     def has_image(self) -> bool:
         """True if the observation is or contains the image of the wrist camera."""
-        return self.config.observation.startswith("image")
-
-    def observation_camera(self) -> Camera | None:
-        """Return the wrist camera of the observation "image_and_state"."""
-        return self.wrist_camera() if self.config.observation == "image_and_state" else None
+        return self.observation.startswith("image")
 
     def wrist_camera(self) -> Camera:
         """Return a camera on the tool that looks at the workpiece's lower end and the fixture below it.
@@ -414,11 +403,6 @@ class DemonstratedInsertion(InsertionTask):
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return the demonstrations' start plus a sampled offset, inside the constraints."""
         start = self._demonstrated_start.copy()
-        if self.options.start_offset_max > 0.0:
-            start[:2] += in_ring(rng, 0.0, self.options.start_offset_max)
+        if self.start_offset_max > 0.0:
+            start[:2] += in_ring(rng, 0.0, self.start_offset_max)
         return self.constraints().nearest(start)
-
-    def action_dims(self) -> list[int]:
-        """Return the indices of the outputs that an action moves."""
-        chosen = self.config.options["action_dims"]
-        return list(range(POSE_SIZE) if chosen is None else chosen)

@@ -80,19 +80,21 @@ class HiddenOffsets(ABC):
     def __init__(self, kind: str = "per_run"):
         """Construct the sampler; `kind` is "per_run", "per_episode" or "none", as the option `fixture_offset`."""
         self.kind = kind
-        self._run: Any = None
 
-    def draw(self, rng: np.random.Generator, options: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the offsets of fixture and workpiece, (2,) or longer; `options` is an instance of `InsertionReset`."""
+    def draw(self, rng: np.random.Generator, given: Any, run: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the offsets of fixture and workpiece, (2,) or longer.
+
+        `given` is an instance of `InsertionReset`; the hidden values of a run are stored in `run`.
+        """
         # Every reset takes equally many numbers from `rng`, used or not, so that the options of a reset do not change
         # the samples of later resets.
         hidden = self._draw_run(rng)
-        episode = episode_stream(rng, options.held_out)
-        if self._run is None or options.new_run:
-            self._run = hidden
-        if options.offset is not None:
-            return self._offsets_of(np.array(options.offset))
-        return self._draw_episode(episode, self._run)
+        episode = episode_stream(rng, given.held_out)
+        if "hidden" not in run or given.new_run:
+            run["hidden"] = hidden
+        if given.offset is not None:
+            return self._offsets_of(np.array(given.offset))
+        return self._draw_episode(episode, run["hidden"])
 
     @abstractmethod
     def _draw_run(self, rng: np.random.Generator) -> Any:

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
-from guiderail.diagrams.envs.options import Number, Numbers, Options, Pair, increases, satisfies
+from guiderail.diagrams.envs.options import Number, Numbers, Pair, TaskOptions, increases, satisfies
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.primitives.reference import interpolate_prior
 
@@ -25,10 +25,6 @@ HISTORY_VARIANCE = 1e-11
 # Repeatability of a demonstrator's hand, as a standard deviation: x y z [m] and Rz Ry Rx [rad]. Its square is added to
 # fitted variances.
 REPEATABILITY_STD = (0.05 * MM, 0.05 * MM, 0.1 * MM, 0.2 * DEGREE, 0.05 * DEGREE, 0.05 * DEGREE)
-
-# Observations and rewards of `DemonstratedInsertion`.
-OBSERVATIONS = ("state", "center_of_pressure", "image", "image_and_state")
-REWARDS = ("sparse", "shaped", "aligned")
 
 NEGLIGIBLE_OFFSET = 0.3 * MM  # largest fixture offset with fixture_offset=none [m]
 LARGEST_OFFSET = 4.0 * MM  # largest fixture offset [m]; beyond it the plug misses the rim of its socket
@@ -55,7 +51,16 @@ ForceRange = Annotated[
 ]
 
 
-class FixtureOffsetOptions(Options):
+class DemonstratedOptions(TaskOptions):
+    """Options of `DemonstratedInsertion`."""
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
+        "state", description="name of the observation"
+    )
+
+
+class FixtureOffsetOptions(TaskOptions):
     """Options of a task whose fixture is offset from its nominal position."""
 
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
@@ -76,7 +81,7 @@ class FixtureOffsetOptions(Options):
         return value
 
 
-class PriorOptions(Options):
+class PriorOptions(TaskOptions):
     """Options of a task with recorded demonstrations of poses: several, or only one."""
 
     prior_std: PriorStd | None = Field(
@@ -87,7 +92,7 @@ class PriorOptions(Options):
     )
 
 
-class ForceOptions(Options):
+class ForceOptions(TaskOptions):
     """Options of a task with a force limit."""
 
     force_limit: Number = Field(

@@ -8,10 +8,9 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import gymnasium
-import numpy as np
 
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.plugins import load_plugin
@@ -71,7 +70,8 @@ def check_task_name(name: object) -> None:
 
 def _check(name: str, task: type[Task]) -> None:
     """Raise an `InputError` if a task class lacks a method, or an attribute has the wrong type."""
-    from guiderail.diagrams.envs.options import STANDARD, Options, ResetOptions, check_options_class
+    from guiderail.diagrams.envs.options import ResetOptions, check_options_class
+    from guiderail.diagrams.stations.registry import kind_of
     from guiderail.diagrams.tasks.task import Task
 
     if not (isinstance(task, type) and issubclass(task, Task)):
@@ -79,17 +79,8 @@ def _check(name: str, task: type[Task]) -> None:
     if inspect.isabstract(task):
         missing = ", ".join(f"{method}()" for method in sorted(task.__abstractmethods__))
         raise InputError(f"{name} lacks {missing}: every task must define these methods")
-    for attribute, kind in (("Options", Options), ("Reset", ResetOptions)):
-        check_options_class(name, attribute, getattr(task, attribute), kind)
-    for attribute in ("rewards", "observations"):
-        given = getattr(task, attribute)
-        if isinstance(given, str) or not given:
-            raise InputError(f"{attribute} of {name} must be a tuple of names, such as ('sparse',), not {brief(given)}")
-    if STANDARD not in task.difficulties:
-        raise InputError(f"difficulties of {name} must have {STANDARD!r}, not only {brief(list(task.difficulties))}")
-    num_steps = getattr(task, "num_steps", None)  # a constructor or a property may set it instead
-    if isinstance(num_steps, int | float | complex | str | np.number):
-        check_num_steps(name, num_steps)
+    kind_of(getattr(task, "station", None), name)
+    check_options_class(name, "Reset", task.Reset, ResetOptions)
     if not isinstance(task.clip, int | float) or not task.clip > 0:
         raise InputError(f"clip of {name} must be a positive number, not {brief(task.clip)}")
     if not isinstance(inspect.getattr_static(task, "scripted_policies"), classmethod | staticmethod):
@@ -97,16 +88,6 @@ def _check(name: str, task: type[Task]) -> None:
             f"scripted_policies of {name} is called without an instance: make it a @classmethod with the arguments "
             "(cls, difficulty)"
         )
-
-
-def check_num_steps(name: str, num_steps: Any) -> None:
-    """Check a task's number of control steps in an episode.
-
-    Raises:
-        InputError: If it is not a whole number of at least 1.
-    """
-    if isinstance(num_steps, bool) or not isinstance(num_steps, int | np.integer) or num_steps < 1:
-        raise InputError(f"num_steps of {name} must be a whole number of at least 1, not {brief(num_steps)}")
 
 
 def is_task_folder(name: str | Path) -> bool:
@@ -157,5 +138,8 @@ def register_envs() -> None:
 def _register_env(name: str) -> None:
     if environment_id(name) not in gymnasium.registry:
         gymnasium.register(
-            id=environment_id(name), entry_point="guiderail.diagrams.envs.make:make_env", kwargs={"task": name}
+            id=environment_id(name),
+            entry_point="guiderail.diagrams.envs.make:make_env",
+            vector_entry_point="guiderail.diagrams.envs.make:make_vector_env",
+            kwargs={"task": name},
         )

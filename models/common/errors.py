@@ -79,6 +79,7 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "parts": {"trimesh": "trimesh", "manifold3d": "manifold3d", "igl": "libigl", "cascadio": "cascadio"},
     "repair": {"pytetwild": "pytetwild", "pyvista": "PyVista"},
     "bags": {"rosbags": "rosbags"},
+    "minari": {"minari": "Minari"},
     "fci": {"franky": "franky"},
     "rtde": {"rtde_control": "ur-rtde", "rtde_receive": "ur-rtde", "dashboard_client": "ur-rtde"},
     "ros2": {"cyclonedds": "Cyclone DDS"},
@@ -86,10 +87,11 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "ray": {"ray": "Ray"},
     "onnx": {"onnxruntime": "ONNX Runtime"},
     "wandb": {"wandb": "Weights & Biases"},
-    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot")},
+    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot", "calibration")},
 }
 _SOFTWARE["mujoco"]["guiderail_mujoco"] = "guiderail-mujoco"
 _SOFTWARE["parts"]["guiderail_parts"] = "guiderail-parts"
+_SOFTWARE["calibration"]["sbi"] = "sbi"
 EXTRAS = {module: (name, extra) for extra, modules in _SOFTWARE.items() for module, name in modules.items()}
 """Software and the name of the extra that installs it, by the name of a module."""
 

@@ -22,11 +22,12 @@ GROUP = "guiderail"  # group of the entry points of all plug-ins
 SIBLINGS = {
     "hardware": ("deploy", "train-on-robot", "teleoperate", "sim-driver", "safety-monitor"),
     "parts": ("create-task", "create-tasks"),
-    "studies": ("study", "robustness", "converge", "certify", "report"),
+    "studies": ("study", "robustness", "converge", "certify", "report", "benchmark"),
     "data": ("dataset",),
     "lerobot": (),
     "mujoco": (),
     "cpp": (),
+    "calibration": ("calibrate", "probe"),
 }
 """Commands of each sibling distribution guiderail-NAME, by NAME, to name the distribution if it is not installed."""
 
@@ -71,13 +72,13 @@ BUILT_IN = {
     "learner:td3": f"{_LEARNING}.off_policy:Td3Learner",
     "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
     "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
-    "learner_config:bc": f"{_LEARNING}.config:BcConfig",
-    "learner_config:crossq": f"{_LEARNING}.config:CrossQConfig",
-    "learner_config:ppo": f"{_LEARNING}.config:PpoConfig",
-    "learner_config:sac": f"{_LEARNING}.config:OffPolicyConfig",
-    "learner_config:td3": f"{_LEARNING}.config:Td3Config",
-    "learner_config:tqc": f"{_LEARNING}.config:OffPolicyConfig",
-    "learner_config:trpo": f"{_LEARNING}.config:TrpoConfig",
+    "learner_config:bc": f"{_LEARNING}.learner_config:BcConfig",
+    "learner_config:crossq": f"{_LEARNING}.learner_config:CrossQConfig",
+    "learner_config:ppo": f"{_LEARNING}.learner_config:PpoConfig",
+    "learner_config:sac": f"{_LEARNING}.learner_config:OffPolicyConfig",
+    "learner_config:td3": f"{_LEARNING}.learner_config:Td3Config",
+    "learner_config:tqc": f"{_LEARNING}.learner_config:OffPolicyConfig",
+    "learner_config:trpo": f"{_LEARNING}.learner_config:TrpoConfig",
 }
 """Plug-ins of this package: "module:attribute" by "kind:name"."""
 

@@ -180,20 +180,21 @@ class Registry(Generic[Entry]):
         return [] if self._plugin is None else list(find_plugins(self._plugin))
 
 
-def find_class(kind: str, name: str, registry: Registry[Any], attribute: str) -> Any:
+def find_class(kind: str, name: str, registry: Registry[Any], attribute: str = "") -> Any:
     """Return the class of an entry's options, from the plug-in `kind` without importing the entry if there is one.
 
     Args:
         kind: Kind of the plug-in, such as "learner_config".
         name: Name of the entry.
         registry: Registry of the entry.
-        attribute: Attribute of the entry that has this class.
+        attribute: Attribute of the entry that has this class; by default, the entry is the class.
     """
     if name not in registry._entries:
         for found, point in find_plugins(kind):
             if found == name:
                 return point.load()
-    return getattr(registry.get(name), attribute)
+    entry = registry.get(name)
+    return getattr(entry, attribute) if attribute else entry
 
 
 def check_callable(name: str, value: object) -> None:

@@ -4,6 +4,7 @@ Vectors of six are [translational, rotational], and all quantities are expressed
 """
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -19,6 +20,24 @@ _REGULARIZATION = 1e-9 * np.eye(6)  # added to Λ⁻¹, so that the inertia of a
 LIGHT, HEAVY = 300.0, 3000.0
 _ROUNDING = 1e-9  # a wrench that a bound changes by more than this is saturated [N, Nm]
 _SCALE = np.repeat([1.0, LEVER], 3)
+
+
+class ArmImpedance(NamedTuple):
+    """Arm and impedance at an instant, the arguments of the law: floats or, for derivatives, `AutoDiffXd`."""
+
+    K: np.ndarray  # stiffness (6, 6) [N/m, Nm/rad] in the axes of the stiffness frame
+    damping_ratio: Any  # damping ratio ζ of every mode
+    wrench_limits: np.ndarray  # limits (6,) along the axes of the stiffness frame [N, Nm]
+    R_axes: np.ndarray | None  # rotation (3, 3) from the stiffness frame to the frame of all other quantities, or None
+    p_error: np.ndarray  # position error (3,) [m], as in `spring_wrench`
+    eta: Any  # scalar part of the orientation error, as in `spring_wrench`
+    epsilon: np.ndarray  # vector part (3,) of the orientation error, as in `spring_wrench`
+    J: np.ndarray  # geometric Jacobian of the tool center (6, n)
+    M: np.ndarray  # mass matrix (n, n), including the reflected rotor inertia
+    v: np.ndarray  # joint velocities (n,) [rad/s]
+    posture_torque: np.ndarray  # torque (n,) that pulls the joints to their preferred posture [Nm]
+    gravity_torque: np.ndarray  # gravity compensation (n,) [Nm]
+    torque_limits: np.ndarray  # torque limits (n,) [Nm]
 
 
 @dataclass(frozen=True)
@@ -97,67 +116,37 @@ def reachable_inertia(Lambda_inverse: np.ndarray) -> np.ndarray:
     return (scaled * (masses * (1.0 - x * x * (3.0 - 2.0 * x)))) @ scaled.T
 
 
-def impedance_torques(
-    *,
-    K: np.ndarray,
-    damping_ratio: float,
-    wrench_limits: np.ndarray,
-    R_axes: np.ndarray | None,
-    p_error: np.ndarray,
-    eta: float,
-    epsilon: np.ndarray,
-    J: np.ndarray,
-    M: np.ndarray,
-    v: np.ndarray,
-    posture_torque: np.ndarray,
-    gravity_torque: np.ndarray,
-    torque_limits: np.ndarray,
-    bound: WrenchBound | None = None,
-) -> JointTorques:
+def impedance_torques(law: ArmImpedance, bound: WrenchBound | None = None) -> JointTorques:
     """Compute τ = Jᵀ clip(K e − D J v) + N (posture torque) + gravity compensation, clipped to the torque limits.
 
     Without a bound, the sum of spring and damper is clipped per axis. The tool never pushes beyond the limits, but can
-    follow a fast command, for which spring and damper cancel. With a bound, `bounded_wrench` limits the sum.
-    N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the tool.
-
-    Args:
-        K: Stiffness (6, 6) [N/m, Nm/rad] in the axes of the stiffness frame.
-        damping_ratio: Damping ratio ζ of every mode.
-        wrench_limits: Limits (6,) along the axes of the stiffness frame [N, Nm].
-        R_axes: Rotation (3, 3) from the stiffness frame to the frame of all other quantities; None if they are equal.
-        p_error: Position error (3,) [m], as in `spring_wrench`.
-        eta: Scalar part of the orientation error, as in `spring_wrench`.
-        epsilon: Vector part (3,) of the orientation error, as in `spring_wrench`.
-        J: Geometric Jacobian of the tool center (6, n).
-        M: Mass matrix (n, n), including the reflected rotor inertia.
-        v: Joint velocities (n,) [rad/s].
-        posture_torque: Torque (n,) that pulls the joints to their preferred posture [Nm].
-        gravity_torque: Gravity compensation (n,) [Nm].
-        torque_limits: Torque limits (n,) [Nm].
-        bound: Bound of the wrench along the axes of the stiffness frame, in place of `wrench_limits`.
+    follow a fast command, for which spring and damper cancel. With a bound along the axes of the stiffness frame,
+    `bounded_wrench` limits the sum. N = I − Jᵀ Λ J M⁻¹ removes the part of the posture's torque that accelerates the
+    tool.
 
     Raises:
         LinAlgError: If the mass matrix or the inertia at the tool is not positive definite.
     """
+    K, J, R_axes = law.K, law.J, law.R_axes
     if R_axes is not None:
         R = np.zeros((6, 6))
         R[:3, :3] = R[3:, 3:] = R_axes
-        K = R @ K @ R.T
+        K = R @ law.K @ R.T
 
-    _, M_inverse_JT, failed = lapack.dposv(M, J.T, lower=1)
+    _, M_inverse_JT, failed = lapack.dposv(law.M, J.T, lower=1)
     if failed:
         raise np.linalg.LinAlgError("the arm's mass matrix is not positive definite")
     Lambda_inverse = regularized(J @ M_inverse_JT)
     R_inverse = _root_of_inverse(Lambda_inverse)
     L_modes, eigenvalues = _modes(K, R_inverse)
-    velocity = J @ v
-    damping = L_modes @ (_dampings(eigenvalues, damping_ratio) * (L_modes.T @ velocity))
-    spring = spring_wrench(K, p_error, eta, epsilon)
+    velocity = J @ law.v
+    damping = L_modes @ (_dampings(eigenvalues, law.damping_ratio) * (L_modes.T @ velocity))
+    spring = spring_wrench(K, law.p_error, law.eta, law.epsilon)
     unlimited_wrench = spring - damping
     along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
     if bound is None:
-        wrench = _clipped(along_axes, wrench_limits)
-        is_limited = bool((np.abs(along_axes) >= wrench_limits).any())
+        wrench = _clipped(along_axes, law.wrench_limits)
+        is_limited = bool((np.abs(along_axes) >= law.wrench_limits).any())
     else:
         mass = _mass_along(velocity[:3], Lambda_inverse)
         if R_axes is not None:
@@ -166,13 +155,13 @@ def impedance_torques(
         is_limited = bool(np.abs(wrench - along_axes).max() > _ROUNDING)
     if R_axes is not None:
         wrench = R @ wrench
-    tool_acceleration = M_inverse_JT.T @ posture_torque
+    tool_acceleration = M_inverse_JT.T @ law.posture_torque
     if _is_regular(R_inverse):
         leak = R_inverse.T @ (R_inverse @ tool_acceleration)  # tool wrench of the posture's torque
     else:
         leak = reachable_inertia(Lambda_inverse) @ tool_acceleration
-    unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
-    torque = _clipped(unlimited_torque, torque_limits)
+    unlimited_torque = J.T @ (wrench - leak) + law.posture_torque + law.gravity_torque
+    torque = _clipped(unlimited_torque, law.torque_limits)
     return JointTorques(torque, wrench, is_limited or bool((torque != unlimited_torque).any()))
 
 

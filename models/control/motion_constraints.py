@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_number, as_numbers, is_finite
+from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.control.damped_inverse import LEVER
 from guiderail.models.control.shapes import CLEARANCE, ConvexShape
@@ -145,9 +145,6 @@ class MotionConstraintFilter:
         constraints: Constraints.
         period: Time between two commands h [s], positive.
 
-    Raises:
-        InputError: If the constraints have another type, or the period is not positive and finite.
-
     Attributes:
         num_outputs: Number of outputs O.
         constraints: Constraints.
@@ -156,10 +153,6 @@ class MotionConstraintFilter:
     needs_pose = False
 
     def __init__(self, constraints: MotionConstraints, period: float):
-        if not isinstance(constraints, MotionConstraints):
-            raise InputError(f"a filter needs MotionConstraints, not {brief(constraints)}")
-        if not 0.0 < as_number(period, "the period of commands") < math.inf:
-            raise InputError(f"the period of commands must be positive, not {period} s")
         self.constraints, self.num_outputs = constraints, constraints.num_outputs
         self._max_step = period * np.asarray(constraints.max_speed)
         self._max_change = period**2 * np.asarray(constraints.max_acceleration)
@@ -335,18 +328,17 @@ def _finite(bounds: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class MotionLimits:
-    """Largest norms of velocity, acceleration and jerk of a pose."""
+    """Largest norms of velocity, acceleration and jerk of a pose.
+
+    Raises:
+        InputError: If a limit is not positive and finite, or the angular limits leave no acceleration or jerk for the
+            rotation vector (`rotation_vector_limits`).
+    """
 
     linear: tuple[float, float, float]  # velocity [m/s], acceleration [m/s²] and jerk [m/s³] of the position
     angular: tuple[float, float, float]  # velocity [rad/s], acceleration [rad/s²] and jerk [rad/s³] of the orientation
 
     def __post_init__(self) -> None:
-        """Check the limits.
-
-        Raises:
-            InputError: If a limit is not positive and finite, or the angular limits leave no acceleration or jerk for
-                the rotation vector (`rotation_vector_limits`).
-        """
         if not all(np.isfinite(limit) and limit > 0.0 for limit in (*self.linear, *self.angular)):
             raise InputError(f"limits of a motion must be positive and finite, not {self.linear} and {self.angular}")
         if min(self.rotation_vector_limits()) <= 0.0:

@@ -91,9 +91,6 @@ class Sphere(ConvexShape):
         center: Center (D,).
         radius: Radius, positive.
         margin: Distance by which the shape is enlarged, not negative.
-
-    Raises:
-        InputError: If an argument is out of range.
     """
 
     def __init__(self, center: ArrayLike, radius: float, margin: float = 0.0):
@@ -203,15 +200,10 @@ def linearize(
             touches the nearest point of the surface. A path through the middle of a shape therefore does not determine
             the side on which commands pass.
         linear: Further constraints; none by default.
-
-    Raises:
-        InputError: If a shape has more dimensions than the path, or the constraints of a step contradict each other.
     """
     steps, outputs = path.shape
     rows = [] if linear is None else [linear.window(np.arange(steps))]
     for shape in shapes:
-        if shape.num_dims > outputs:
-            raise InputError(f"a shape in {shape.num_dims} dimensions cannot constrain {outputs} outputs")
         G, c = np.zeros((steps, 1, outputs)), np.zeros((steps, 1))
         for n, point in enumerate(path[:, : shape.num_dims]):
             G[n, 0, : shape.num_dims], c[n, 0] = shape.half_space(point)

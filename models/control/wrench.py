@@ -62,9 +62,6 @@ class WrenchBound:
         """Return the element-wise minimum of this bound and `max_wrench` (8,), with 0 for negative and NaN entries.
 
         A bound that arrives at run time can therefore only lower the configured bound.
-
-        Raises:
-            InputError: If `max_wrench` is not eight numbers.
         """
         return _lowered(self, np.asarray(max_wrench, dtype=float).tobytes())
 
@@ -72,8 +69,6 @@ class WrenchBound:
 @lru_cache(maxsize=16)  # several systems request the same bound at every plant step
 def _lowered(bound: WrenchBound, max_wrench: bytes) -> WrenchBound:
     requested = np.frombuffer(max_wrench)
-    if requested.shape != (MAX_WRENCH_SIZE,):
-        raise InputError(f"max_wrench must be {MAX_WRENCH_SIZE} numbers, not {len(requested)}")
     lowest = np.minimum(bound.numbers, np.where(requested > 0.0, requested, 0.0))
     lowest.setflags(write=False)
     return replace(bound, axes=lowest[:6], force=float(lowest[6]), torque=float(lowest[7]))

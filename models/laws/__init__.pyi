@@ -4,4 +4,4 @@ from .law import Stepper as Stepper
 from .primitive import PrimitiveLaw as PrimitiveLaw
 from .primitive import StateProgress as StateProgress
 from .skill import load_law as load_law
-from .template import TemplateLaw as TemplateLaw
+from .template_law import TemplateLaw as TemplateLaw

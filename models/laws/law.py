@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, is_finite, is_whole
+from guiderail.models.common.arrays import as_numbers, is_finite
 from guiderail.models.common.errors import InputError, brief
 
 
@@ -35,9 +35,6 @@ class Law:
         num_actions: Size A of the action, at least 1; O by default.
         known: Prior knowledge of the task in a Drake diagram; None elsewhere.
 
-    Raises:
-        InputError: If a size is not a whole number of at least 1.
-
     Attributes:
         num_outputs, num_actions, known: Arguments.
         needs_pose: True if the law uses poses that are measured after the start.
@@ -47,10 +44,7 @@ class Law:
 
     def __init__(self, num_outputs: int, num_actions: int | None = None, known: Any = None):
         num_actions = num_outputs if num_actions is None else num_actions
-        for name, size in (("num_outputs", num_outputs), ("num_actions", num_actions)):
-            if not is_whole(size, 1):
-                raise InputError(f"{name} of a law must be a whole number of at least 1, not {brief(size)}")
-        self.num_outputs, self.num_actions, self.known = int(num_outputs), int(num_actions), known
+        self.num_outputs, self.num_actions, self.known = num_outputs, num_actions, known
 
     def start(self, pose: np.ndarray) -> Any:
         """Return the state at the start of an episode at a measured pose (O,)."""

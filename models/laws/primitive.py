@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import is_finite, is_whole
+from guiderail.models.common.arrays import is_finite
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import POSE_SIZE, angle_between, nearest_pose
 from guiderail.models.control.command_filters import CommandLaw
@@ -79,7 +79,7 @@ class StateProgress:
     should cover the deviations that contact and tracking cause while nothing blocks the robot.
 
     Raises:
-        InputError: If an argument is out of range.
+        InputError: If a tolerance is not positive and finite.
     """
 
     tolerance: tuple[float, float]  # tolerances of the position [unit of the output] and the rotation [rad], positive
@@ -90,8 +90,6 @@ class StateProgress:
     def __post_init__(self) -> None:
         if len(self.tolerance) != 2 or not all(0.0 < value < np.inf for value in self.tolerance):
             raise InputError(f"the tolerance of progress is two positive numbers, not {brief(self.tolerance)}")
-        if not is_whole(self.max_lag, 0):
-            raise InputError(f"max_lag must be a whole number of steps, at least 0, not {brief(self.max_lag)}")
 
     def next_step(self, step: int, clock: int, command: np.ndarray, pose: np.ndarray) -> int:
         """Return the step of the next command.
@@ -150,7 +148,7 @@ class PrimitiveLaw(Law):
         clip: Constraints to which the command is moved, at the nearest point; none by default.
 
     Raises:
-        InputError: If an argument has the wrong type or shape or is not finite.
+        InputError: If `history_source` is unknown, or a gain is not finite or has the wrong shape.
 
     Attributes:
         primitive, gain, residual, outputs, history_source, near, command_filter, progress, checked, clip: Arguments.
@@ -170,17 +168,11 @@ class PrimitiveLaw(Law):
         checked: LinearConstraints | MotionConstraints | None = None,
         clip: LinearConstraints | None = None,
     ):
-        if not isinstance(primitive, LcNsKmp):
-            raise InputError(f"the primitive of a law is an LcNsKmp, not {brief(primitive)}")
         num_outputs = primitive.num_outputs
         self.outputs = list(range(num_outputs)) if outputs is None else list(outputs)
         super().__init__(num_outputs, len(self.outputs))
         if history_source not in HISTORY_SOURCES:
             raise InputError(f"history_source is commanded or measured, not {brief(history_source)}")
-        if command_filter is not None and not (
-            hasattr(command_filter, "apply") and command_filter.num_outputs == num_outputs
-        ):
-            raise InputError(f"command_filter is a filter of {num_outputs} outputs, not {brief(command_filter)}")
         self.primitive, self.history_source, self.near = primitive, history_source, near
         self.gain = np.ones(num_outputs) if gain is None else checked_vector(gain, "gain", num_outputs)
         self.residual = None if residual is None else checked_vector(residual, "residual", num_outputs)

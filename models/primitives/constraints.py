@@ -26,8 +26,8 @@ class LinearConstraints:
         c: Lower bounds, (F,) or (N, F), finite.
 
     Raises:
-        InputError: If shapes do not match or have no output or no step, a number is not finite, a bound divided by its
-            row's norm is not finite, or no output satisfies all constraints of a step, up to rounding.
+        InputError: If shapes do not match, a number is not finite, a bound divided by its row's norm is not finite, or
+            no output satisfies all constraints of a step, up to rounding.
 
     Attributes:
         G, c: Rows of unit norm (or zero) and their bounds [unit of the output], read-only; a row whose norm is one up
@@ -41,8 +41,6 @@ class LinearConstraints:
                 f"constraints need G of shape (F, O) with c of shape (F,), or (N, F, O) with (N, F), "
                 f"not {self.G.shape} with {self.c.shape}"
             )
-        if 0 in (self.G.shape[0] if self.G.ndim == 3 else 1, self.G.shape[-1]):
-            raise InputError(f"constraints need at least one output and one step, not G of shape {self.G.shape}")
         if not (np.isfinite(self.G).all() and np.isfinite(self.c).all()):
             raise InputError("constraints must be finite: leave out the rows that do not constrain anything")
         self._normalize()
@@ -59,28 +57,10 @@ class LinearConstraints:
             upper: Upper bounds, (O,) or (N, O); inf at every step for none.
 
         Raises:
-            InputError: If shapes do not match, a lower bound exceeds its upper bound, a bound is NaN or infinite at
-                some steps only, a lower bound is inf, or an upper bound is −inf.
+            InputError: If a lower bound exceeds its upper bound, a bound is NaN or infinite at some steps only, a lower
+                bound is inf, or an upper bound is −inf.
         """
-        lower, upper = as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound")
-        try:
-            lower, upper = np.broadcast_arrays(lower, upper)
-        except ValueError as error:
-            raise InputError(f"box bounds must have the same shape, not {lower.shape} and {upper.shape}") from error
-        if lower.ndim not in (1, 2):
-            raise InputError(f"box bounds must be numbers of shape (O,) or (N, O), not of shape {lower.shape}")
-        for name, bounds in (("lower", lower), ("upper", upper)):
-            if np.isnan(bounds).any():
-                at = tuple(np.argwhere(np.isnan(bounds))[0].tolist())
-                where = f"of output {at[0]}" if len(at) == 1 else f"of output {at[1]} at step {at[0]}"
-                raise InputError(f"the {name} bound {where} is NaN: give a number, or infinity for no bound")
-        if lower.size == 0:
-            raise InputError(f"box bounds need at least one output and one step, not the shape {lower.shape}")
-        if (lower > upper).any():
-            where = f" at step {np.argwhere(lower > upper)[0, 0]}" if lower.ndim == 2 else ""
-            raise InputError(
-                f"the constraints{where} contradict each other: a lower bound exceeds its upper bound; loosen a bound"
-            )
+        lower, upper = np.broadcast_arrays(as_numbers(lower, "a lower bound"), as_numbers(upper, "an upper bound"))
         # Rows y_0 ≥ lower_0, −y_0 ≥ −upper_0, y_1 ≥ lower_1, …, without those that are infinite at every step.
         c = np.stack([lower, -upper], axis=-1).reshape(*lower.shape[:-1], -1)
         is_finite = (np.atleast_2d(c) != -np.inf).any(axis=0)
@@ -147,12 +127,9 @@ class LinearConstraints:
         the constraints. A result therefore exists for every finite output.
 
         Raises:
-            InputError: If `output` does not have the shape (O,).
             UnsolvableError: If `output` is not finite.
         """
         output = as_numbers(output, "an output")
-        if output.shape != (self.num_outputs,):
-            raise InputError(f"an output must be of shape ({self.num_outputs},), not {output.shape}")
         if not np.isfinite(output).all():
             raise UnsolvableError(f"an output must be finite to have a nearest one within constraints, not {output}")
         if self.violation(output, step) <= 0:

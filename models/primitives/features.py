@@ -39,9 +39,6 @@ def window_features(
         history_inputs: Inputs of the history, (P,) or (P, I), possibly none.
         future_inputs: Inputs of the window, (H+1,) or (H+1, I).
         history_noise: ħρ with ħ = λ + β and the variance ρ of the history, positive if there is a history.
-
-    Raises:
-        InputError: If `history_noise` is too small for the length of the history.
     """
     history_map, K = _conditioned(kernel, history_inputs, future_inputs, history_noise)
     return WindowFeatures(history_map.astype(float), _pivoted_cholesky(K).astype(float))

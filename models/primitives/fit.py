@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from guiderail.models.common.arrays import is_whole
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import Demonstrations
 from guiderail.models.primitives.deviation import outputs_at, squared_distances
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL, Kernel, make_kernel
@@ -111,12 +110,8 @@ def fit(
         log: Function that receives sentences on the progress.
 
     Raises:
-        InputError: If there are fewer than three demonstrations, they cannot be fitted, the horizon is not a whole
-            number of at least 0, or another argument is out of range.
+        InputError: If there are fewer than three demonstrations, they cannot be fitted, or an argument is out of range.
     """
-    if not is_whole(horizon, 0):
-        raise InputError(f"the horizon must be a whole number of steps, at least 0, not {brief(horizon)}")
-    horizon = int(horizon)
     if demonstrations.num_demonstrations < MIN_DEMONSTRATIONS:
         raise InputError(
             f"cross-validation needs at least three demonstrations, and there are {demonstrations.num_demonstrations}: "
@@ -128,8 +123,7 @@ def fit(
         raise InputError(f"a mixture needs at least {4 * _COMPONENTS[0]} steps, not {len(times)}")
     mixture_steps = None
     if len(times) > LONG:
-        is_given = components is not None and is_whole(components, 1)
-        mixture_steps = max(_MIXTURE_STEPS, 4 * int(components or 0)) if is_given else _MIXTURE_STEPS
+        mixture_steps = max(_MIXTURE_STEPS, 4 * (components or 0))
     at = thinned(len(times), mixture_steps)
     counts = [components] if components is not None else [c for c in _COMPONENTS if c <= len(at) // 4]
     say = log or (lambda text: None)

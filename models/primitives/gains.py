@@ -13,7 +13,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_numbers, is_whole
+from guiderail.models.common.arrays import as_numbers
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.primitives.lc_ns_kmp import LcNsKmp
 from guiderail.models.primitives.reference import ReferenceTrajectory
@@ -24,9 +24,6 @@ def unit_authority(primitive: LcNsKmp, outputs: np.ndarray | None = None) -> np.
 
     The displacement [unit of the output] is the RMS over the motion. `outputs` are indices or a mask of the explored
     outputs, all by default. The result is zero for the outputs that are not explored.
-
-    Raises:
-        InputError: If there is no explored output, an index does not exist, or a mask does not have O entries.
     """
     explored = _explored_mask(primitive, outputs)
     # Displacement of output i by a constant raw action of one in output j, (N, O, O).
@@ -75,8 +72,7 @@ def rms_gains(
         outputs: Indices or mask of the explored outputs, all by default; the others get a gain of zero.
 
     Raises:
-        InputError: As `authority_gains`; also if `action_repeat` is out of range, or the outputs are so correlated that
-            no gains reach κ in all of them.
+        InputError: As `authority_gains`; also if the outputs are so correlated that no gains reach κ in all of them.
     """
     check_action_scale(action_scale)
     explored = np.flatnonzero(_explored_mask(primitive, outputs))
@@ -94,21 +90,14 @@ def exploration_rms(primitive: LcNsKmp, gains: np.ndarray, action_repeat: int = 
     """Compute the RMS displacement (O,) by white actions times gains (O,), in demonstration standard deviations.
 
     The actions are uniform in ±1. Each action lasts `action_repeat` control steps.
-
-    Raises:
-        InputError: If `action_repeat` is not a whole number of at least 1, or `gains` are not O numbers.
     """
-    power = _white_power(primitive, action_repeat) @ _checked_gains(primitive, gains) ** 2
+    power = _white_power(primitive, action_repeat) @ np.square(gains)
     return np.sqrt(power) / deviation(primitive.reference)
 
 
 def authority(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
-    """Compute the displacement (O,), in demonstration standard deviations, by a constant action of ±1 times `gains`.
-
-    Raises:
-        InputError: If `gains` are not O numbers.
-    """
-    return unit_authority(primitive) * _checked_gains(primitive, gains) / deviation(primitive.reference)
+    """Compute the displacement (O,), in demonstration standard deviations, by a constant action of ±1 times `gains`."""
+    return unit_authority(primitive) * np.asarray(gains, dtype=float) / deviation(primitive.reference)
 
 
 def residual_gains(
@@ -125,9 +114,6 @@ def residual_gains(
         action_scale: κ, positive.
         groups: Indices of the outputs of each group; one group of all outputs by default. An output in no group gets a
             displacement of zero.
-
-    Raises:
-        InputError: If κ is not positive, or a group is empty or has an index that does not exist.
     """
     check_action_scale(action_scale)
     variances = np.mean(reference.standard_deviations**2, axis=0)
@@ -179,13 +165,6 @@ def _checked_outputs(outputs: ArrayLike | Sequence[int], num_outputs: int, what:
     return indices.astype(int)
 
 
-def _checked_gains(primitive: LcNsKmp, gains: np.ndarray) -> np.ndarray:
-    checked = as_numbers(gains, "gains")
-    if checked.shape != (primitive.num_outputs,):
-        raise InputError(f"gains must be {primitive.num_outputs} numbers, one for each output, not {brief(gains)}")
-    return checked
-
-
 def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
     """Compute the displacements (N, O, B) that raw actions (N, O, B) cause; the history consists of past commands."""
     steps, outputs, batch = actions.shape
@@ -201,9 +180,6 @@ def _closed_loop(primitive: LcNsKmp, actions: np.ndarray) -> np.ndarray:
 
 def _white_power(primitive: LcNsKmp, action_repeat: int) -> np.ndarray:
     """Compute the mean square displacement (O, O) of output i by uniform white raw actions in ±1 in output j."""
-    if not is_whole(action_repeat, 1):
-        raise InputError(f"action_repeat is a number of control steps, at least 1, not {brief(action_repeat)}")
-    action_repeat = int(action_repeat)
     steps, outputs = primitive.num_steps, primitive.num_outputs
     num_actions = -(-steps // action_repeat)
     pulses = np.repeat(np.eye(num_actions), action_repeat, axis=0)[:steps]

@@ -165,9 +165,6 @@ class SquaredExponential(_StationaryKernel):
 
     Args:
         length_scale: Length scale ℓ, in the unit of the input, positive.
-
-    Raises:
-        InputError: If the length scale is not in [1e-100, 1e100].
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -185,9 +182,6 @@ class Matern52(_StationaryKernel):
 
     Args:
         length_scale: Length scale ℓ, in the unit of the input, positive.
-
-    Raises:
-        InputError: If the length scale is not in [1e-100, 1e100].
     """
 
     def __call__(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:

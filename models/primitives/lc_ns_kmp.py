@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from guiderail.models.common.arrays import as_doubles, as_number, as_numbers, as_whole, is_whole
+from guiderail.models.common.arrays import as_doubles, as_numbers, as_whole
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.files import digest
 from guiderail.models.primitives.constraints import TOLERANCE, LinearConstraints
@@ -27,10 +27,6 @@ from guiderail.models.primitives.kernels import Kernel, SquaredExponential, chec
 from guiderail.models.primitives.qp import UnsolvableError, find_solver
 from guiderail.models.primitives.reference import ReferenceTrajectory
 from guiderail.models.primitives.window import BatchPrediction, Modification, Prediction, StepFactor, Window
-
-if TYPE_CHECKING:
-    pass
-
 
 HISTORY, HORIZON = 10, 40
 """Default numbers of past outputs P of sKGRL, and of future points H with constraints."""
@@ -56,8 +52,8 @@ class LcNsKmp:
         max_deviation: Largest accepted `deviation` of a motion that is not within `MAX_MISS` (`check_deviation`).
 
     Raises:
-        InputError: If an argument is out of range, sizes do not match, or the history's variance is too small for its
-            length; also as `check_kernel`, `check_deviation` and `check_constraints`.
+        InputError: If an argument is out of range, or the history's variance is too small for its length; also as
+            `check_kernel`, `check_deviation` and `check_constraints`.
 
     Warns:
         UserWarning: If `deviation` exceeds one.
@@ -83,23 +79,15 @@ class LcNsKmp:
         max_deviation: float = MAX_DEVIATION,
     ):
         for name, value in (("lambda_", lambda_), ("beta", beta)):
-            if not 0.0 <= as_number(value, name) < math.inf:
+            if not 0.0 <= value < math.inf:
                 raise InputError(f"{name} must be finite and not negative, not {value}")
         if not lambda_ + beta > 0:
             raise InputError("lambda_ + beta must be positive: without any regularization problem 4.5 has no solution")
-        if not (is_whole(horizon, 0) and is_whole(history, 0)):
-            raise InputError(f"horizon and history are numbers of steps, not {brief(horizon)} and {brief(history)}")
-        if history and not 0.0 < as_number(history_variance, "history_variance") < math.inf:
+        if history and not 0.0 < history_variance < math.inf:
             raise InputError(f"history_variance must be positive, not {history_variance}")
-        if not (as_number(cache_bytes, "cache_bytes") >= 0 and as_number(max_deviation, "max_deviation") >= 0.0):
-            raise InputError(f"cache_bytes and max_deviation must not be negative: {cache_bytes} and {max_deviation}")
-        if not isinstance(reference, ReferenceTrajectory):
-            raise InputError(f"a primitive needs a ReferenceTrajectory (from_demonstrations), not {brief(reference)}")
         self.kernel: Kernel = kernel if kernel is not None else SquaredExponential()
         check_kernel(self.kernel, reference.inputs(np.arange(-history, reference.num_steps + min(horizon, 10**6))))
         constraints = constraints if constraints is not None else LinearConstraints.none(reference.num_outputs)
-        if not isinstance(constraints, LinearConstraints):
-            raise InputError(f"constraints of a primitive are LinearConstraints, not {brief(constraints)}")
         constraints.check_sizes(reference.num_outputs, reference.num_steps)
         check_constraints(reference, constraints, max_deviation)
         self.reference = reference
@@ -139,7 +127,8 @@ class LcNsKmp:
             history: Outputs at step−P … step−1, oldest first, (P, O); None if P = 0.
 
         Raises:
-            InputError: If an argument has the wrong shape or is not finite, or the step is negative or not whole.
+            InputError: If the history has the wrong shape, an argument is not finite, or the step is negative or not
+                whole.
             UnsolvableError: If no window within the constraints was found. Repeat the last safe command.
         """
         factor = (self._cache.get(step) if type(step) is int else None) or self._factor(step)
@@ -156,9 +145,6 @@ class LcNsKmp:
             steps: Steps n ≥ 0 (B,), or one step for all; past the end, the last step.
             null_space_actions: ξ̂ (B, O), as in `predict`; zero by default, with B from `histories` or `steps`.
             histories: (B, P, O), as in `predict`; None if P = 0.
-
-        Raises:
-            InputError: If an argument has the wrong shape or is not finite, or a step is negative or not whole.
         """
         x, at = self._stack_batch(steps, null_space_actions, histories)
         outputs = np.empty((len(x), self.num_outputs))
@@ -197,20 +183,16 @@ class LcNsKmp:
             history_inputs: Inputs of the history, (P,) or (P, I); None if P = 0.
 
         Raises:
-            InputError: As `predict`; also if shapes do not match, the window is empty, a covariance is not symmetric
-                and positive definite, or the constraints differ from step to step and therefore need a clock.
+            InputError: As `predict`; also if a covariance is not symmetric and positive definite, or the constraints
+                differ from step to step and therefore need a clock.
             UnsolvableError: As `predict`.
         """
         if self.constraints.num_steps is not None:
             raise InputError("constraints that differ from step to step need a clock: use predict")
         x = self._stack(null_space_action, history)
         inputs = as_numbers(inputs, "inputs")
-        if inputs.ndim not in (1, 2) or not inputs.size:
-            raise InputError(f"inputs must be of shape (H+1,) or (H+1, I), not {inputs.shape}")
         past = inputs[:0] if history_inputs is None else as_numbers(history_inputs, "history_inputs")
         window = Window.checked(means, covariances, *self.constraints.window(np.arange(len(inputs))))
-        if past.shape != (shape := (self.history, *inputs.shape[1:])):
-            raise InputError(f"history_inputs must be of shape {shape}, not {past.shape}")
         if not (np.isfinite(inputs).all() and np.isfinite(past).all()):
             raise InputError("inputs, means and covariances must be finite")
         features = window_features(self.kernel, past, inputs, self._history_noise)
@@ -234,8 +216,7 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`; also if shapes do not match, or a covariance is not symmetric and positive
-                definite.
+            InputError: As `predict`; also if a covariance is not symmetric and positive definite.
             UnsolvableError: As `predict`.
         """
         step = self._checked_step(step)
@@ -272,8 +253,8 @@ class LcNsKmp:
             history: (P, O), as in `predict`.
 
         Raises:
-            InputError: As `predict`; also if a step in `at` is repeated or outside of the window, or the steps are so
-                close to each other that their kernel matrix is singular.
+            InputError: As `predict`; also if a step in `at` is outside of the window, or the steps are so close to each
+                other, or equal, that their kernel matrix is singular.
             UnsolvableError: If no window within the constraints was found.
         """
         factor, step = self._factor(step), min(int(step), self.num_steps - 1)
@@ -316,15 +297,9 @@ class LcNsKmp:
         points = as_numbers(at, "the steps of null-space actions")
         if points.ndim != 1 or not np.isin(points, np.arange(step, step + horizon + 1)).all():
             raise InputError(f"null-space actions must be at steps among {step} … {step + horizon}: {brief(at)}")
-        if len(np.unique(points)) < len(points):
-            raise InputError(f"null-space actions must be at different steps, not {brief(at)}")
-        actions = np.atleast_2d(as_numbers(null_space_actions, "null-space actions"))
-        shape = (len(points), self.num_outputs)
-        if actions.shape != shape and actions.size + len(points) > 0:
-            raise InputError(f"null-space actions at {len(points)} steps have shape {shape}, not {actions.shape}")
+        actions = as_numbers(null_space_actions, "null-space actions").reshape(len(points), self.num_outputs)
         if not np.isfinite(actions).all():
             raise InputError("null-space actions must be finite")
-        actions = actions.reshape(shape)
         past, future = self._inputs(step, horizon)
         indices = points.astype(int) - step
         action = window_interpolation(self.kernel, past, future, self._history_noise, indices) @ actions
@@ -362,8 +337,6 @@ class LcNsKmp:
     def _stack(self, null_space_action: np.ndarray | None, history: np.ndarray | None) -> np.ndarray:
         """Check the arguments and return x = [history, null-space action]."""
         action = self._no_action if null_space_action is None else as_doubles(null_space_action, "a null-space action")
-        if action.shape != (self.num_outputs,):
-            raise InputError(f"a null-space action has shape ({self.num_outputs},), not {action.shape}")
         if self.history == 0:
             if history is not None and np.size(history):
                 raise InputError("this primitive has no history (P = 0): pass None")
@@ -389,15 +362,11 @@ class LcNsKmp:
         past = np.zeros(0) if histories is None else as_doubles(histories, "histories")
         batched = [values for values in (actions, past if self.history else None) if values is not None and values.ndim]
         size = len(batched[0]) if batched else at.size
-        if actions is not None and actions.shape != (size, self.num_outputs):
-            raise InputError(f"null-space actions have shape ({size}, {self.num_outputs}), not {actions.shape}")
         if self.history == 0:
             if past.size:
                 raise InputError("this primitive has no history (P = 0): pass None")
         elif past.shape != (size, *self._history_shape):
             raise InputError(f"histories have shape {(size, *self._history_shape)}, not {past.shape}")
-        if at.ndim and len(at) != size:
-            raise InputError(f"there are {len(at)} steps for {size} predictions")
         x = np.zeros((size, (self.history + 1) * self.num_outputs))
         if self.history:
             x[:, : -self.num_outputs] = past.reshape(size, -1)
@@ -474,9 +443,6 @@ def get_shared_primitive(
         constraints: As in `LcNsKmp`.
         kernel: As in `LcNsKmp`; kernels that compare equal share a primitive.
         arguments: Further arguments of `LcNsKmp`, numbers or strings.
-
-    Raises:
-        InputError: As `LcNsKmp`.
     """
     arrays = {name: getattr(reference, name) for name in ("times", "means", "covariances")}
     arrays |= {"G": constraints.G, "c": constraints.c}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from guiderail.models.common.arrays import as_whole
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 
 # Importing scikit-learn takes over a second, and reading a file does not need it.
 if TYPE_CHECKING:
@@ -79,10 +79,6 @@ def fit_new_mixture(times: np.ndarray, outputs: np.ndarray, components: int | No
             Bayesian information criterion, at most 20; the search stops after two consecutive numbers that are worse
             than the best earlier one.
         seed: Seed of scikit-learn's generator, from 0 to 2^32 − 1.
-
-    Raises:
-        InputError: If there are fewer than two steps for each component, less than one component, or the number of
-            components or the seed is not a whole number in its range.
     """
     _, center, scale = _standardize(times, outputs)
     candidates = [components] if components is not None else range(1, min(_MAX_COMPONENTS, len(times) // 2) + 1)
@@ -113,8 +109,6 @@ def _fit_candidates(
 ) -> dict[int, tuple[GaussianMixture, float]]:
     """Return mixtures and their criteria by number of components; see `information_criteria`."""
     candidates, seed = [as_whole(count, "components") for count in candidates], as_whole(seed, "seed")
-    if not 0 <= seed < 2**32:
-        raise InputError(f"seed must be from 0 to 2^32 − 1, not {brief(seed)}")
     for count in candidates:
         if not 1 <= count <= len(times) // 2:
             raise InputError(f"components must be between 1 and half the number of steps, {len(times) // 2}: {count}")

@@ -58,24 +58,15 @@ def pose_outputs(
             the mean of outputs that differ by full turns is meaningless.
 
     Raises:
-        InputError: If shapes do not match, a quaternion is zero, a number is not finite, or Euler angles are singular.
+        InputError: If a quaternion is zero, a number is not finite, or Euler angles are singular.
     """
     from scipy.spatial.transform import Rotation
 
     check_orientation(orientation)
     positions, quaternions = np.asarray(positions, dtype=float), np.asarray(quaternions_wxyz, dtype=float)
-    number = len(positions)
-    if number == 0 or positions.shape != (number, 3) or quaternions.shape != (number, 4):
-        raise InputError(
-            f"poses need positions (N, 3) and quaternions (N, 4), not {positions.shape} and {quaternions.shape}"
-        )
     p_WT, q_WT = np.asarray(target_position, dtype=float), np.asarray(target_quaternion_wxyz, dtype=float)
-    if p_WT.shape != (3,) or q_WT.shape != (4,):
-        raise InputError(f"the target needs a position (3,) and a quaternion (4,), not {p_WT.shape} and {q_WT.shape}")
-    if not (np.isfinite(positions).all() and np.isfinite(quaternions).all()):
+    if not all(np.isfinite(values).all() for values in (positions, quaternions, p_WT, q_WT)):
         raise InputError("poses contain NaN or infinity: cut those samples out")
-    if not (np.isfinite(p_WT).all() and np.isfinite(q_WT).all()):
-        raise InputError("the target's pose must be finite")
     if np.linalg.norm(quaternions, axis=1).min() < 1e-6 or np.linalg.norm(q_WT) < 1e-6:
         raise InputError("a quaternion of length zero has no orientation")
     R_WT = Rotation.from_quat(q_WT, scalar_first=True)
@@ -94,9 +85,6 @@ def pose_rotation(orientation_numbers: np.ndarray, orientation: Orientation = "e
     Args:
         orientation_numbers: Orientation outputs, (3,) or (N, 3) [rad].
         orientation: As in `pose_outputs`.
-
-    Raises:
-        InputError: If there is no such orientation.
     """
     from scipy.spatial.transform import Rotation
 
@@ -122,16 +110,9 @@ def pose_demonstrations(
         target_position: p_WT (3,) [m]; each demonstration's last position by default (thesis, section 4.4.2).
         target_quaternion_wxyz: R_WT (4,); each demonstration's last orientation by default.
         orientation: As in `pose_outputs`.
-
-    Raises:
-        InputError: As `pose_outputs` and `Demonstrations`.
     """
-    if len(positions) != len(quaternions_wxyz):
-        raise InputError(f"there are {len(positions)} arrays of positions and {len(quaternions_wxyz)} of quaternions")
     outputs: list[np.ndarray] = []
     for p, q in zip(positions, quaternions_wxyz, strict=True):
-        if len(p) == 0 or len(q) == 0:
-            raise InputError(f"demonstration {len(outputs)} has no poses")
         target_p = p[-1] if target_position is None else target_position
         target_q = q[-1] if target_quaternion_wxyz is None else target_quaternion_wxyz
         near = outputs[0][0, 3:] if outputs else None

@@ -75,14 +75,12 @@ class ProMp:
             covariance: Covariance (O, O) of that output, symmetric and positive definite.
 
         Raises:
-            InputError: If the phase is out of range, shapes do not match, a number is not finite, or the covariance is
-                not symmetric or not positive definite.
+            InputError: If the phase is out of range, a number is not finite, or the covariance is not symmetric or not
+                positive definite.
         """
         output, covariance = as_numbers(output, "a via-point"), as_numbers(covariance, "a via-point's covariance")
         if not 0.0 <= phase <= 1.0:
             raise InputError(f"a via-point's phase is in [0, 1], not {phase}")
-        if output.shape != (self.num_outputs,) or covariance.shape != self.noise.shape:
-            raise InputError(f"a via-point has {self.num_outputs} outputs and their covariance, not {output.shape}")
         if not (np.isfinite(output).all() and np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
             raise InputError("a via-point must be finite, and its covariance positive definite")
         if find_asymmetric(covariance[None]) is not None:

@@ -80,9 +80,6 @@ def add_end_effector(
         end_effector: End effector to mount.
         as_rigid: If True, add the opened gripper as one rigid body, for a controller's plant; no effect on a rigid
             tool.
-
-    Raises:
-        InputError: If the model file is missing, cannot be read, or does not match the end effector's data.
     """
     X_FlangeMount = RigidTransform(RotationMatrix.MakeZRotation(robot.tool_turn), [0.0, 0.0, 0.0])
     X_FlangeMount = X_FlangeMount @ end_effector.X_FlangeMount

@@ -6,9 +6,8 @@ it by `register_robot`; `find_robot(name)` returns it. An installed package adds
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Real
 from pathlib import Path
 
 from pydrake.math import RigidTransform
@@ -19,22 +18,11 @@ from guiderail.models.common.registry import Registry
 
 @dataclass(frozen=True)
 class JointDrives:
-    """Position control of joints by springs and dampers; the values are in the order of the joints.
-
-    Raises:
-        InputError: If the numbers of values differ, or a value is not a positive and finite number.
-    """
+    """Position control of joints by springs and dampers; the values are in the order of the joints."""
 
     stiffness: tuple[float, ...]  # stiffness of each joint, (n,) [Nm/rad], or [N/m] for a prismatic joint
     # Typical inertia of each joint including its rotor, (n,) [kg m²] or [kg], for critical damping.
     inertia: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        if len(self.stiffness) != len(self.inertia):
-            raise InputError("joint drives need as many inertias as stiffnesses")
-        values = (*self.stiffness, *self.inertia)
-        if not _are_numbers(values, len(values)) or not all(value > 0.0 for value in values):
-            raise InputError(f"the stiffness and the inertia of a joint's drive must be positive, not {brief(values)}")
 
     @property
     def damping(self) -> tuple[float, ...]:
@@ -68,9 +56,8 @@ class Robot:
         source: Source of the model's numbers.
 
     Raises:
-        InputError: If there are fewer than six joints, a joint occurs twice, the number of joint positions or drives
-            differs from the number of joints, a position or `tool_turn` is not a finite number, or
-            `apparent_rotor_inertia` is not in (0, 1].
+        InputError: If there are fewer than six joints, a joint occurs twice, or `apparent_rotor_inertia` is not in (0,
+            1].
     """
 
     name: str
@@ -89,15 +76,8 @@ class Robot:
     def __post_init__(self) -> None:
         if len(self.joints) < 6 or len(set(self.joints)) != len(self.joints):
             raise InputError(f"robot {self.name!r} must name six joints or more, each once, not {self.joints}")
-        for what, values in (("home", self.home), ("level_posture", self.level_posture)):
-            if values is not None and not _are_numbers(values, self.num_joints):
-                raise InputError(f"robot {self.name!r}: {what} must be {self.num_joints} joint positions, not {values}")
-        if not _are_numbers((self.tool_turn,), 1):
-            raise InputError(f"robot {self.name!r}: tool_turn must be a finite angle, not {brief(self.tool_turn)}")
-        if not (_are_numbers((self.apparent_rotor_inertia,), 1) and 0.0 < self.apparent_rotor_inertia <= 1.0):
+        if not 0.0 < self.apparent_rotor_inertia <= 1.0:
             raise InputError(f"robot {self.name!r}: apparent_rotor_inertia must be more than 0 and at most 1")
-        if self.drives is not None and len(self.drives.stiffness) != self.num_joints:
-            raise InputError(f"robot {self.name!r} needs a drive for each of its {self.num_joints} joints")
 
     @property
     def num_joints(self) -> int:
@@ -110,8 +90,7 @@ class EndEffector:
     """End effector: a rigid tool or a gripper.
 
     Raises:
-        InputError: If there are no bodies, a position in `opening` is not finite, `opening` lacks an actuated joint, or
-            the number of drives differs from the number of actuated joints.
+        InputError: If `opening` lacks a finite position of an actuated joint.
     """
 
     name: str  # name in the registry
@@ -131,13 +110,8 @@ class EndEffector:
     source: str = ""  # source of the model's numbers
 
     def __post_init__(self) -> None:
-        if not self.bodies:
-            raise InputError(f"end effector {self.name!r} must name its bodies, the mount's first")
-        missing = [name for name in self.joints if name not in self.opening]
-        if missing or not _are_numbers(tuple(self.opening.values()), len(self.opening)):
+        if not all(math.isfinite(self.opening.get(name, math.nan)) for name in self.joints):
             raise InputError(f"end effector {self.name!r} needs a finite opening position for each of its joints")
-        if len(self.drives.stiffness if self.drives else ()) != len(self.joints):
-            raise InputError(f"end effector {self.name!r} needs a drive for each of its {len(self.joints)} joints")
 
     @property
     def is_gripper(self) -> bool:
@@ -156,55 +130,25 @@ def _check_end_effector(name: str, end_effector: object) -> None:
 
 
 ROBOTS: Registry[Robot] = Registry("robot", plugin="robot", check=_check_robot)
-END_EFFECTORS: Registry[EndEffector] = Registry(
-    "end effector",
-    plugin="end_effector",
-    check=_check_end_effector,
-)
+END_EFFECTORS: Registry[EndEffector] = Registry("end effector", plugin="end_effector", check=_check_end_effector)
 robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot to the registry and return it.
-
-    Args:
-        robot: Robot with a name that is not registered yet.
-
-    Raises:
-        InputError: If `robot` is not a `Robot`, or its name is taken.
-    """
+    """Add a robot, whose name is not registered yet, to the registry and return it."""
     return ROBOTS.register(getattr(robot, "name", "?"), robot)
 
 
 def find_robot(name: str | Robot) -> Robot:
-    """Return the robot with a name; a `Robot` is returned unchanged.
-
-    Raises:
-        InputError: If no entry has this name; the message suggests a similar name or lists all.
-    """
+    """Return the robot with a name; a `Robot` is returned unchanged."""
     return name if isinstance(name, Robot) else ROBOTS.get(name)
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Add an end effector to the registry and return it.
-
-    Args:
-        end_effector: End effector with a name that is not registered yet.
-
-    Raises:
-        InputError: If `end_effector` is not an `EndEffector`, or its name is taken.
-    """
+    """Add an end effector, whose name is not registered yet, to the registry and return it."""
     return END_EFFECTORS.register(getattr(end_effector, "name", "?"), end_effector)
 
 
 def find_end_effector(name: str | EndEffector) -> EndEffector:
-    """Return the end effector with a name; an `EndEffector` is returned unchanged.
-
-    Raises:
-        InputError: If no entry has this name; the message suggests a similar name or lists all.
-    """
+    """Return the end effector with a name; an `EndEffector` is returned unchanged."""
     return name if isinstance(name, EndEffector) else END_EFFECTORS.get(name)
-
-
-def _are_numbers(values: Sequence[float], count: int) -> bool:
-    return len(values) == count and all(isinstance(value, Real) and math.isfinite(value) for value in values)

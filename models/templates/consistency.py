@@ -19,7 +19,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from guiderail.models.templates.constraints import (
+from guiderail.models.templates.active_constraints import (
     UNBOUNDED,
     ActiveConstraint,
     Arc,
@@ -29,14 +29,15 @@ from guiderail.models.templates.constraints import (
     FrameConstraint,
     Funnel,
     HalfSpace,
+    InsideSphere,
     KeepAbove,
+    Outside,
     Sector,
     TiltByDistance,
     TiltConstraint,
     TiltLimits,
 )
 from guiderail.models.templates.geometry import chord_angle, matrix_deg
-from guiderail.models.templates.shape_constraints import InsideSphere, Outside
 
 CLEAR = 1e-6  # smallest violation that counts as a contradiction, far above rounding [m or rad]
 STEPS = 400  # largest number of gradient steps to the point nearest to all sets

@@ -7,7 +7,6 @@ import operator
 import re
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache, partial
-from os import PathLike
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -31,7 +30,7 @@ from pydantic import (
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.yaml import load_yaml, parse_yaml
-from guiderail.models.templates.constraints import ActiveConstraint
+from guiderail.models.templates.active_constraints import ActiveConstraint
 from guiderail.models.templates.geometry import WORLD
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
 from guiderail.models.templates.mappings import TOOL, InputMapping
@@ -67,8 +66,6 @@ def load_template(source: str | Path, **parameters: float) -> SharedControlTempl
     Raises:
         InputError: If the file cannot be read or is not a valid template.
     """
-    if not isinstance(source, str | PathLike):
-        raise InputError(f"a template is read from a file or by its name, not from {brief(source)}")
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         return _read(load_yaml(path, "template"), path.name, parameters)
@@ -86,9 +83,6 @@ def parse_template(text: str, where: str = "template", **parameters: float) -> S
         text: Content of a template file.
         where: Name of the text, for messages.
         **parameters: As in `load_template`.
-
-    Raises:
-        InputError: If the text is not a valid template.
     """
     return _read(parse_yaml(text, where), where, parameters)
 

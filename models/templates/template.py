@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
-from numbers import Real
 
 import numpy as np
 
@@ -12,11 +11,10 @@ from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.control.wrench import norm_limits
+from guiderail.models.templates.active_constraints import ActiveConstraint, ConstraintGroup, Outside, group_constraints
 from guiderail.models.templates.consistency import describe, find_contradiction
-from guiderail.models.templates.constraints import ActiveConstraint, ConstraintGroup, group_constraints
 from guiderail.models.templates.geometry import WORLD, Frames, StatePart, angle_between, between, largest
 from guiderail.models.templates.mappings import InputMapping
-from guiderail.models.templates.shape_constraints import Outside
 from guiderail.models.templates.transitions import TransitionDistance
 
 INSIDE = 1e-9  # largest violation of a pose that counts as inside the constraints [m or rad]
@@ -181,18 +179,8 @@ class SharedControlTemplate:
     def map(
         self, state: int, inputs: np.ndarray, X_WE: RigidTransform, frames: Frames, period_s: float
     ) -> RigidTransform:
-        """Return the displacement ΔH of one period [s] for inputs (n,): map_q (equation 2.19).
-
-        Inputs are clipped to [−1, 1].
-
-        Raises:
-            InputError: If the number of inputs is wrong, `state` is not the number of a state, a frame is missing, or
-                the period is not positive.
-        """
-        self._check_arguments(state, frames, period_s)
+        """Return the displacement ΔH of one period [s] for inputs (n,), clipped to [−1, 1]: map_q (equation 2.19)."""
         inputs = np.clip(inputs, -1.0, 1.0)
-        if inputs.shape != (self.inputs,):
-            raise InputError(f"the template {self.name} has {self.inputs} inputs, not an array of shape {inputs.shape}")
         parts = [m.displacement(inputs, X_WE, frames, period_s) for m in self.states[state].input_mapping]
         return reduce(self.displace, parts, RigidTransform())
 
@@ -231,11 +219,7 @@ class SharedControlTemplate:
         last command, so that the line to the new command is outside too.
 
         If the pose of an object is not finite, the returned pose is not finite either; callers check it.
-
-        Raises:
-            InputError: If `state` is not the number of a state, a frame is missing, or the period is not positive.
         """
-        self._check_arguments(state, frames, period_s)
         # Scaled before the first projection, because projecting a distant request would change its direction.
         fraction = 1.0 / max(1.0, self._speed_ratio(state, X_WLast, X_WRequest, period_s))
         constraints = self._constraints_at(state, X_WLast, frames)
@@ -254,17 +238,6 @@ class SharedControlTemplate:
             X_WE = constraint.project(X_WE, frames)
         ratio = self._speed_ratio(state, X_WLast, X_WE, period_s)
         return Command(X_WE if ratio <= 1.0 else between(X_WLast, X_WE, 1.0 / ratio), 0.0)
-
-    def _check_arguments(self, state: int, frames: Frames, period_s: float) -> None:
-        """Raise an InputError for an unknown state, a missing frame, or a period that is not positive."""
-        if not (isinstance(state, int | np.integer) and 0 <= state < len(self.states)):
-            last = len(self.states) - 1
-            raise InputError(f"a state of the template {self.name} is a number from 0 to {last}, not {brief(state)}")
-        for name in self.frames:
-            if name not in frames:
-                raise InputError(f"the template {self.name} needs the frame {name}: give its pose")
-        if not period_s > 0.0:
-            raise InputError(f"a period must be positive, not {period_s} s")
 
     def _constraints_at(
         self, state: int, X_WLast: RigidTransform, frames: Frames
@@ -342,16 +315,8 @@ class SharedControlTemplate:
         return state
 
     def distance(self, state: int, X_WE: RigidTransform, frames: Frames) -> float:
-        """Return the transition distance d_t of a state, [m] or [rad].
-
-        Raises:
-            InputError: If the kind of distance returns something other than a number.
-        """
-        distance = self.states[state].transition_distance
-        value = distance.value(X_WE, frames)
-        if not isinstance(value, Real):
-            raise InputError(f"the transition distance {type(distance).__name__} must be a number, not {brief(value)}")
-        return float(value)
+        """Return the transition distance d_t of a state, [m] or [rad]."""
+        return float(self.states[state].transition_distance.value(X_WE, frames))
 
     @cached_property
     def _initial_progress(self) -> tuple[float, ...]:
@@ -382,14 +347,9 @@ class SharedControlTemplate:
         return self._initial_progress[state] + phase.weight * (phase.starts_at - self.distance(state, X_WE, frames))
 
 
-def check_template(template: object, frames: object) -> None:
-    """Raise an InputError unless `template` is a template and `frames` contains poses by name.
-
-    Poses of other objects are accepted. A pose of the world is refused, because it would have no effect.
-    """
+def check_template(template: object, frames: Frames) -> None:
+    """Raise an InputError unless `template` is a template, or if `frames` has a pose of the world, without effect."""
     if not isinstance(template, SharedControlTemplate):
         raise InputError(f"a template is a SharedControlTemplate, as load_template returns, not {brief(template)}")
-    if not isinstance(frames, Mapping):
-        raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
     if WORLD in frames:
         raise InputError(f"the frame {WORLD} of a template can't be moved: leave its pose out, or add a frame")

@@ -12,10 +12,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
+from guiderail.models.templates.active_constraints import (
+    ActiveConstraint,
+    Cylinder,
+    HalfSpace,
+    InsideSphere,
+    TiltLimits,
+)
 from guiderail.models.templates.consistency import find_contradiction
-from guiderail.models.templates.constraints import ActiveConstraint, Cylinder, HalfSpace, TiltLimits
 from guiderail.models.templates.geometry import Frames, pose_distance
-from guiderail.models.templates.shape_constraints import InsideSphere
 from guiderail.models.templates.template import SharedControlTemplate, TemplateState
 from guiderail.models.templates.transitions import AxisDistance, Distance, Height, TiltToGo
 

@@ -17,7 +17,8 @@ import numpy as np
 import pandas as pd
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.tasks.task import Task
+from guiderail.diagrams.envs.assemble import template_of
+from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform
 from guiderail.tools.environments import check_environment, make_environment
@@ -84,22 +85,21 @@ class RecomputedViolation(EnvCallback):
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return `recomputed_violation`."""
-        task: Task | None = getattr(self.base.diagram, "task", None)
-        if task is None or not len(self.base.trace):
+        config: EnvConfig | None = getattr(self.base.diagram, "config", None)
+        if config is None or not len(self.base.trace):
             return {"recomputed_violation": -np.inf}
-        return {"recomputed_violation": float(self._violations(task).max())}
+        return {"recomputed_violation": float(self._violations(config).max())}
 
-    def _violations(self, task: Task) -> np.ndarray:
+    def _violations(self, config: EnvConfig) -> np.ndarray:
         """Return the violation of every control step, (n,)."""
         poses = self.base.trace.commanded
-        constraints = task.constraints()
+        constraints, placed = config.constraints(), template_of(config)
         if constraints is not None:
             # Command n of the trace (from zero) has to satisfy the constraints of step n.
             G, c = constraints.window(np.arange(len(poses)))
             return (c - np.einsum("nfo,no->nf", G, poses)).max(axis=1, initial=-np.inf)
-        if self._frames is None or "template" not in task.provides():
+        if self._frames is None or placed is None:
             return np.full(len(poses), -np.inf)
-        placed = task.template()
         frames = {**placed.frames, **self._frames(self.base.sampled)}
         states = self.base.trace.signals["state"][:, 0].astype(int)
         return np.array(

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from guiderail.diagrams.envs.config import prior_of
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
@@ -71,7 +72,7 @@ def campaign_of(task: str) -> Campaign:
     """
     cases = [
         Case(name, {"guidance": name}, constrained=name in CONSTRAINED, may_wait=name not in ("kgrl", "skgrl"))
-        for name in possible_guidance(TASKS.get(task).provides())
+        for name in possible_guidance(prior_of(TASKS.get(task)).provides)
     ]
     return Campaign(task, cases, {}, frames=None)
 

@@ -15,9 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.learning.trainer import Observers, run_training
 from research.benchmarks import with_progress
 
 EPISODES, SKIPPED = 12, 5  # number of episodes of a run, and number of the first ones, which are not timed
@@ -65,16 +64,14 @@ def measure(task: str = "BncConnector", environment: Mapping[str, Any] | None = 
 
 def _run(task: str, environment: Mapping[str, Any], cores: int, num_envs: int) -> dict[str, float]:
     """Train a run; return the wall-clock time and the processor times of learner and actors, per episode [s]."""
-    config = configure(
-        task, environment, **with_defaults(task, {"episodes": EPISODES, "settings": _settings(num_envs)})
-    )
+    config = configure(task, environment, **{"episodes": EPISODES, "settings": _settings(num_envs)})
     clocks: list[tuple[float, float]] = []
     before = _time_of_children()
     with _cores(cores), tempfile.TemporaryDirectory() as folder:
         run_training(
             RunFolder(Path(folder) / "run"),
             config,
-            report=lambda row: clocks.append((time.perf_counter(), time.process_time())),
+            observers=Observers(lambda row: clocks.append((time.perf_counter(), time.process_time()))),
         )
     timed = EPISODES - SKIPPED
     wall, own = ((clocks[-1][i] - clocks[SKIPPED - 1][i]) / timed for i in range(2))

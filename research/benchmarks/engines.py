@@ -21,7 +21,7 @@ from guiderail.models.objects.bnc_connector.demonstrations import poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.systems.recorder import Recording
-from guiderail.tools.visualization.style import legend, new_figure, save_figure
+from guiderail.tools.visualization.figures import legend, new_figure, save_figure
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 
@@ -32,7 +32,7 @@ OFFSETS = (0.8, 1.25, 2.0, 3.0)  # offsets of a plug on the rim [mm]
 MODULI = (0.01, 0.1, 1.0, 10.0)  # factors of the contact modulus, in Drake
 PRESSED = 7.8 * MM  # commanded height [m]: 2.7 mm below the rim, which presses with 4 N
 MIN_CONTACT_FORCE = 0.5  # smallest force at which the center of pressure is used [N]
-NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+NARROW = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 CONTACTS = {  # station and time step [s]
     "Drake, 5 ms": ("gantry", PLANT_PERIOD / 2),  # the default of the connector
     "Drake, 2.5 ms": ("gantry", PLANT_PERIOD / 4),

@@ -29,8 +29,8 @@ from sb3_contrib import TQC
 from stable_baselines3 import SAC
 
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import register_learner
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 from research.benchmarks import with_progress
 

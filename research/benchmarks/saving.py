@@ -16,8 +16,7 @@ from unittest.mock import patch
 
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.learning import trainer
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from research.benchmarks import with_progress
 
 TASKS = {"NarrowPassage": 10, "BncConnector": 6}  # number of episodes
@@ -42,11 +41,11 @@ def timed(owner: Any, name: str) -> Iterator[list[float]]:
 
 def saving_share(task: str, episodes: int, seed: int = 0) -> dict[str, float]:
     """Train a run in a temporary folder; return its duration [s], and the shares and numbers of saving."""
-    config = configure(task, {}, **with_defaults(task, {"episodes": episodes, "seed": seed}))
+    config = configure(task, {}, **{"episodes": episodes, "seed": seed})
     with (
         tempfile.TemporaryDirectory() as folder,
         timed(StepLog, "on_episode_end") as step_log,
-        timed(trainer, "_save") as checkpoints,
+        timed(trainer.TrainingLoop, "write_checkpoint") as checkpoints,
     ):
         rows = trainer.run_training(RunFolder(Path(folder) / "run"), config)
     seconds = sum(row["wall_time"] for row in rows) + sum(checkpoints)

@@ -20,7 +20,7 @@ from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, PLANT_PERIOD
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.transforms import MM
-from guiderail.tools.visualization.style import new_figure, save_figure
+from guiderail.tools.visualization.figures import new_figure, save_figure
 from research.benchmarks import with_progress
 from research.benchmarks.simulation import scripted_motion
 

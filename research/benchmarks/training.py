@@ -25,10 +25,9 @@ from pydrake.systems.framework import InputPort, OutputPort
 
 import guiderail.systems
 from guiderail.diagrams.envs.env import DiagramEnv
-from guiderail.tools.learning import checkpoint, fast_sb3, off_policy, trainer
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
+from guiderail.tools.learning import checkpoint, episodes, fast_sb3, off_policy, trainer
+from guiderail.tools.learning.networks import DemonstrationReplayBuffer
+from guiderail.tools.learning.run_folder import RunFolder, configure
 
 TASK = "BncConnector"
 EPISODES = 6
@@ -37,8 +36,8 @@ LEARNING_STARTS = 40  # transitions before the first gradient step
 # Owner and name of each measured function, and its part.
 PARTS: tuple[tuple[Any, str, str], ...] = (
     (trainer, "make_run_environment", "building the environment"),
-    (trainer, "rollout", "rollout"),
-    (trainer, "_save", "checkpoint"),
+    (episodes, "rollout", "rollout"),
+    (trainer.TrainingLoop, "write_checkpoint", "checkpoint"),
     (DiagramEnv, "reset", "reset"),
     (DiagramEnv, "step", "environment"),
     (Simulator, "AdvanceTo", "Drake"),
@@ -142,7 +141,7 @@ def measure(
         episodes: Number of training episodes.
     """
     task = task or TASK
-    settings = with_defaults(task, {"settings": {"learning_starts": LEARNING_STARTS}})
+    settings = {"settings": {"learning_starts": LEARNING_STARTS}}
     config = configure(task, environment or {}, episodes=episodes, **settings)
     with tempfile.TemporaryDirectory() as folder, timed_parts() as profiler:
         start = time.perf_counter()

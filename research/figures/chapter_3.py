@@ -16,7 +16,7 @@ from guiderail.models.templates.drawing import draw, state_lines
 from guiderail.systems.support.drake_multibody import pose_to_transform
 from guiderail.tools.environments import make_environment
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import draw_runs, legend, new_figure
+from guiderail.tools.visualization.figures import draw_runs, legend, new_figure
 from guiderail_studies.job import Job
 from guiderail_studies.study import ratio, run_study
 from research.figures.runs import (
@@ -63,7 +63,7 @@ def figure_3_4(out: Path) -> dict[str, Any]:
     rows = []
     for name, X_WF in frames.items():
         tips = [X_WF.translation() + 0.06 * X_WF.rotation().col(i) for i in range(3)]
-        (u, v), *ends = task.camera().project(np.stack([X_WF.translation(), *tips]))
+        (u, v), *ends = task.scene().camera.project(np.stack([X_WF.translation(), *tips]))
         for (x, y), color in zip(ends, ("red", "green", "blue"), strict=True):
             axis.annotate("", (x, y), (u, v), arrowprops={"arrowstyle": "->", "color": color, "linewidth": 1.6})
         axis.annotate(name, (u, v), xytext=(8, 10), textcoords="offset points", color="black", fontsize=9)

@@ -14,8 +14,7 @@ from guiderail.models.primitives.mixture import fit_mixture
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
-from guiderail.tools.visualization.curves import draw_passage
-from guiderail.tools.visualization.style import color, label, new_figure
+from guiderail.tools.visualization.figures import color, draw_passage, label, new_figure
 from guiderail_studies.study import each, run_study
 from research.figures.runs import figure_study, learning_curves, numbers_of_seeds, save_results, settings_table
 from research.figures.thesis import TABLE_4_1

@@ -23,8 +23,7 @@ from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
 from guiderail.tools.visualization.camera import draw_frames, record_frames
-from guiderail.tools.visualization.curves import draw_passage
-from guiderail.tools.visualization.style import color, label, new_figure
+from guiderail.tools.visualization.figures import color, draw_passage, label, new_figure
 from guiderail_studies.declaration import LearnerChoice
 from guiderail_studies.study import each, run_study
 from research.figures.chapter_4 import ACTION_REPEAT, CONNECTOR, FORCE, LEARNED, TASK, figure_4_3, random_episodes

@@ -124,8 +124,7 @@ def train(
     from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
     from guiderail.tools.learning.fast_sb3 import FastTqc
-    from guiderail.tools.learning.networks import NormalizedReLU, asymmetric_policy
-    from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
+    from guiderail.tools.learning.networks import DemonstrationReplayBuffer, NormalizedReLU, asymmetric_policy
 
     rows: list[Row] = []
     first, last = settings.entropy_per_action

@@ -12,12 +12,12 @@ import pandas as pd
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.subject import has_constant_offset
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.tables import read_table
 from guiderail_studies.declaration import load_study
 from guiderail_studies.job import Job
+from guiderail_studies.statistics import Scores, bootstrap_interval, interquartile_mean, probability_of_improvement
 from research.results.sections import BASELINES, SECTIONS, Row, Section
-from research.results.statistics import Scores, bootstrap_interval, interquartile_mean, probability_of_improvement
 from research.studies import study_path
 
 COLUMNS = (

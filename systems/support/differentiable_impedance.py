@@ -9,6 +9,7 @@ from scipy.linalg import solve_continuous_lyapunov
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import (
+    ArmImpedance,
     JointTorques,
     damping_matrix,
     has_regular_inertia,
@@ -49,44 +50,30 @@ def _derivatives(numbers: np.ndarray) -> np.ndarray:
     return np.array(padded).reshape(*np.shape(numbers), size)
 
 
-def differentiable_torques(
-    *,
-    K: np.ndarray,
-    damping_ratio: Any,
-    wrench_limits: np.ndarray,
-    R_axes: np.ndarray | None,
-    p_error: np.ndarray,
-    eta: Any,
-    epsilon: np.ndarray,
-    J: np.ndarray,
-    M: np.ndarray,
-    v: np.ndarray,
-    posture_torque: np.ndarray,
-    gravity_torque: np.ndarray,
-    torque_limits: np.ndarray,
-) -> JointTorques:
-    """Compute the joint torques of `impedance_torques` without bound; the arguments are those of that function.
+def differentiable_torques(law: ArmImpedance) -> JointTorques:
+    """Compute the joint torques of `impedance_torques` without bound.
 
     Raises:
         InputError: If the arm is near a singular posture.
     """
+    K, J, R_axes = law.K, law.J, law.R_axes
     if R_axes is not None:
         R = np.zeros((6, 6), dtype=object)
         R[:3, :3] = R[3:, 3:] = R_axes
         K = R @ K @ R.T
-    M_inverse_JT = inv(M) @ J.T
+    M_inverse_JT = inv(law.M) @ J.T
     Lambda_inverse = regularized(J @ M_inverse_JT)
     if not has_regular_inertia(values_of(Lambda_inverse)):
         raise InputError("an impedance has derivatives in regular postures only: move the arm away from this posture")
-    damping = differentiable_damping(K, Lambda_inverse, damping_ratio) @ (J @ v)
-    unlimited_wrench = spring_wrench(K, p_error, eta, epsilon) - damping
+    damping = differentiable_damping(K, Lambda_inverse, law.damping_ratio) @ (J @ law.v)
+    unlimited_wrench = spring_wrench(K, law.p_error, law.eta, law.epsilon) - damping
     along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
-    wrench = np.minimum(np.maximum(along_axes, -wrench_limits), wrench_limits)
-    is_limited = bool((np.abs(values_of(along_axes)) >= values_of(wrench_limits)).any())
+    wrench = np.minimum(np.maximum(along_axes, -law.wrench_limits), law.wrench_limits)
+    is_limited = bool((np.abs(values_of(along_axes)) >= values_of(law.wrench_limits)).any())
     if R_axes is not None:
         wrench = R @ wrench
-    leak = inv(Lambda_inverse) @ (M_inverse_JT.T @ posture_torque)
-    unlimited_torque = J.T @ (wrench - leak) + posture_torque + gravity_torque
-    torque = np.minimum(np.maximum(unlimited_torque, -torque_limits), torque_limits)
-    is_clipped = bool((np.abs(values_of(unlimited_torque)) > torque_limits).any())
+    leak = inv(Lambda_inverse) @ (M_inverse_JT.T @ law.posture_torque)
+    unlimited_torque = J.T @ (wrench - leak) + law.posture_torque + law.gravity_torque
+    torque = np.minimum(np.maximum(unlimited_torque, -law.torque_limits), law.torque_limits)
+    is_clipped = bool((np.abs(values_of(unlimited_torque)) > law.torque_limits).any())
     return JointTorques(torque, wrench, is_limited or is_clipped)

@@ -8,7 +8,7 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import Frame, RigidBody
 from pydrake.systems.framework import Context
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 
 
 class JointDynamics:
@@ -31,24 +31,8 @@ class JointDynamics:
 
 
 def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Frame) -> None:
-    """Check the arguments of a system: a plant and frames of the plant.
-
-    Args:
-        plant: Plant, which must be finalized.
-        fixed: Frame that must be fixed in the world, or None.
-        **frames: Frames by argument name.
-
-    Raises:
-        InputError: If the plant or a frame has another type, the plant is not finalized, a frame belongs to another
-            plant, or `fixed` can move.
-    """
-    if not isinstance(plant, MultibodyPlant):
-        raise InputError(f"a plant is a MultibodyPlant, not {brief(plant)}")
-    if not plant.is_finalized():
-        raise InputError("the plant of a system must be finalized: call Finalize() first")
+    """Raise an `InputError` if one of the frames is of another plant, or `fixed` is not fixed in the world."""
     for name, frame in frames.items():
-        if not isinstance(frame, Frame):
-            raise InputError(f"{name} is a frame of the plant, such as body.body_frame(), not {brief(frame)}")
         if frame.GetParentPlant() is not plant:
             raise InputError(f"{name} is the frame {frame.name()} of another plant: give a frame of this plant")
     if fixed is not None and fixed.body() not in plant.GetBodiesWeldedTo(plant.world_body()):
@@ -56,17 +40,8 @@ def check_plant(plant: MultibodyPlant, fixed: Frame | None = None, **frames: Fra
 
 
 def check_bodies(plant: MultibodyPlant, what: str, bodies: Sequence[RigidBody]) -> None:
-    """Check the arguments of a system: a plant and a list of its bodies; `what` is the list's name in messages.
-
-    Raises:
-        InputError: If `check_plant` refuses the plant, or `bodies` is not a list of at least one body of the plant.
-    """
-    check_plant(plant)
-    if not isinstance(bodies, Sequence) or not bodies:
-        raise InputError(f"{what} is a list of at least one body of the plant, not {brief(bodies)}")
+    """Raise an `InputError` if one of the bodies is of another plant; `what` is their name in messages."""
     for body in bodies:
-        if not isinstance(body, RigidBody):
-            raise InputError(f"{what} has bodies of the plant, as plant.GetBodyByName returns, not {brief(body)}")
         if body.GetParentPlant() is not plant:
             raise InputError(f"{what} has the body {body.name()} of another plant: give a body of this plant")
 

@@ -25,9 +25,6 @@ class LastValidBound:
 
     Attributes:
         sources: Sources of `eval`, for the declaration of outputs and cache entries.
-
-    Raises:
-        InputError: If the period is out of range.
     """
 
     def __init__(self, system: LeafSystem, bound: WrenchBound, max_wrench: InputPort, *, period: float):

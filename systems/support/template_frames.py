@@ -7,7 +7,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import BasicVector, Context, DependencyTicket, LeafSystem
 
 from guiderail.models.common.arrays import is_finite
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, pose_to_transform, transform_to_pose
 from guiderail.models.templates.template import SharedControlTemplate, check_template
 from guiderail.systems.support import declarations as declare
@@ -31,8 +31,7 @@ class TemplateFrames:
         names: Names of the frames.
 
     Raises:
-        InputError: If the template is not a `SharedControlTemplate`, `frames` are not transforms by name, a frame is
-            missing, a pose is not finite, or a pose of the world is given.
+        InputError: If a frame is missing, a pose is not finite, or a pose of the world is given.
     """
 
     def __init__(self, system: LeafSystem, template: SharedControlTemplate, frames: Mapping[str, RigidTransform]):
@@ -67,9 +66,8 @@ class TemplateFrames:
             InputError: If the context is another system's, the template has no such frame, or a pose is not finite.
         """
         declare.check_own_context(self._system, context)
-        for name in frames:
-            if name not in self.names:
-                raise InputError(f"the template has no frame {name}, only {', '.join(self.names)}")
+        if unknown := [name for name in frames if name not in self.names]:
+            raise InputError(f"the template has no frame {unknown[0]}, only {', '.join(self.names)}")
         poses = {name: _checked_pose(name, X_WF) for name, X_WF in frames.items()}
         for name, pose in poses.items():
             index = self._indices[self.names.index(name)]
@@ -87,8 +85,6 @@ class TemplateFrames:
 
 
 def _checked_pose(name: str, X_WF: RigidTransform) -> np.ndarray:
-    if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
-        raise InputError(f"the frame {name} is a RigidTransform, not {brief(X_WF)}")
     pose = transform_to_pose(X_WF)
     if not np.isfinite(pose).all():
         raise InputError(f"the frame {name} must be at a finite pose, not at {X_WF.translation()}")

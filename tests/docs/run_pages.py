@@ -120,9 +120,9 @@ def run(page: Path, shell: Shell | None) -> str:
 
 def shorten_pictures() -> None:
     """Omit the layout of labels and show one episode on a training's page, which saves time in tests."""
-    from guiderail.tools.visualization import replay, style
+    from guiderail.tools.visualization import figures, replay
 
-    style.LAYOUT, replay.EPISODES = None, 1
+    figures.LAYOUT, replay.EPISODES = None, 1
 
 
 def main(pages: list[Path]) -> None:

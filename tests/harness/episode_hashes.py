@@ -27,6 +27,7 @@ import gymnasium
 import numpy as np
 
 import guiderail
+from guiderail.diagrams.envs.config import prior_of, stations_of
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, environment_id
@@ -79,8 +80,8 @@ def all_cases() -> list[tuple[str, dict[str, Any]]]:
     cases = []
     for task in ("NarrowPassage", "BncConnector", "GridClamp", "Pouring"):
         declared = TASKS.get(task)
-        stations = [name for name in declared.stations() if STATIONS.get(name).is_simulated]
-        for guidance in possible_guidance(declared.provides()):
+        stations = [name for name in stations_of(declared) if STATIONS.get(name).is_simulated]
+        for guidance in possible_guidance(prior_of(declared).provides):
             for options in _station_options(task, stations):
                 for difficulty in ("standard", "hard"):
                     common = {"guidance": guidance, "difficulty": difficulty, "action_repeat": 5}

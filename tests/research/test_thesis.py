@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.config import option_models
-from guiderail.diagrams.envs.options import option_fields
+from guiderail.diagrams.envs.config import option_models, prior_of, stations_of
+from guiderail.diagrams.envs.options import choices_of, option_fields
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.stations.disturbances import Disturbances
 from guiderail.diagrams.tasks.registry import TASKS
-from guiderail.tools.learning.configure import configure, with_defaults
+from guiderail.tools.learning.run_folder import configure
 from guiderail_lerobot.base_policy import BASE_POLICIES
 from research.thesis import HISTORY, NEUTRAL, THESIS, describe_differences
 
 
 def differences_of(task, environment=None, **given):
     """Return the described differences of a configuration from the thesis."""
-    return describe_differences(configure(task, environment or {}, **with_defaults(task, given)))
+    return describe_differences(configure(task, environment or {}, **given))
 
 
 def test_thesis_options_exist_and_accept_the_thesis_values():
@@ -98,7 +98,9 @@ def other_value(task, name, field, default):
         return OTHER_VALUES[name]
     thesis_values = THESIS[task].options.get(name, (default,))
     excluded = thesis_values if default in thesis_values else (default,)
-    choices = {"reward": TASKS.get(task).rewards, "observation": TASKS.get(task).observations, "difficulty": ("hard",)}
+    choices = {name: choices_of(TASKS.get(task), name) for name in ("reward", "observation")} | {
+        "difficulty": ("hard",)
+    }
     choices["history.source"], choices["impedance_control"] = ("commanded", "measured"), ("joint", "cartesian")
     choices["fixture_offset"] = ("per_run", "per_episode", "none")
     choices["kernel"], choices["sensing"] = ("squared_exponential", "matern52"), ("exact", "robot")
@@ -121,8 +123,8 @@ def all_options():
     """Yield every option of every task, guidance and station."""
     for task in THESIS:
         declared = TASKS.get(task)
-        for guidance in possible_guidance(declared.provides()):
-            for station in declared.stations():
+        for guidance in possible_guidance(prior_of(declared).provides):
+            for station in stations_of(declared):
                 for model in option_models(declared, guidance, station).values():
                     for name, field in option_fields(model).items():
                         yield task, guidance, station, name, model.model_fields[field]

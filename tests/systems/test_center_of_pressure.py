@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.center_of_pressure import CenterOfPressure
+from guiderail.systems.wrench_signals import CenterOfPressure
 
 
 def center_of_pressure(wrench, min_force=0.5):

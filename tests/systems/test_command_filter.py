@@ -148,11 +148,6 @@ def test_system_repeats_its_command_when_desired_is_not_finite(law, number):
     np.testing.assert_allclose(system.get_safe_pose_output_port().Eval(context), [0.0, 0.2], atol=1e-3)
 
 
-def test_system_refuses_a_period_of_zero():
-    with pytest.raises(InputError):
-        CommandFilter(LAWS["tangent"], 0.0)
-
-
 def test_system_stores_the_velocity_of_a_motion_filter():
     motion = MotionConstraints(BOX, max_speed=[0.8, 0.8], max_acceleration=[1.6, 1.6])
     system = CommandFilter(MotionConstraintFilter(motion, PERIOD), PERIOD)

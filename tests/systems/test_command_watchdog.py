@@ -241,7 +241,14 @@ def test_outputs_are_computed_once_per_check():
 
 @pytest.mark.parametrize(
     "arguments",
-    [(0.0, 0.1), (0.01, 0.0), (np.nan, 0.1), (np.inf, 0.1), (0.01, np.nan), (0.01, np.inf), (0.01, 0.1, 0)],
+    [
+        (0.0, 0.1),
+        (0.01, 0.0),
+        (np.nan, 0.1),
+        (np.inf, 0.1),
+        (0.01, np.nan),
+        (0.01, np.inf),
+    ],
 )
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):

@@ -1,8 +1,6 @@
 import numpy as np
-import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.constraint_violation import ConstraintViolation
 
@@ -50,8 +48,3 @@ def test_violation_uses_the_constraints_of_the_control_step():
 def test_system_has_no_state_when_constraints_are_constant():
     system = ConstraintViolation(LinearConstraints.box([0.0], [1.0]), 0.1)
     assert system.CreateDefaultContext().num_discrete_state_groups() == 0
-
-
-def test_constructor_refuses_a_period_out_of_range():
-    with pytest.raises(InputError):
-        ConstraintViolation(LinearConstraints.none(2), 0.0)

@@ -16,7 +16,6 @@ from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.contact_detector import ContactDetector
 
 STEP = 2.0**-9  # of the plant and of the detector [s]
@@ -122,14 +121,3 @@ def test_force_is_the_weight_of_a_ball_at_rest(hydroelastic, mass, body, obstacl
 def test_contact_with_a_body_in_neither_set_is_no_collision(hydroelastic, body, obstacle):
     outputs = drop(0.0, 0.0, hydroelastic=hydroelastic, duration=0.05, bodies=[body], obstacles=[obstacle])
     np.testing.assert_array_equal(outputs, 0.0)
-
-
-def test_constructor_refuses_arguments_out_of_range():
-    builder = DiagramBuilder()
-    plant, _ = AddMultibodyPlant(MultibodyPlantConfig(time_step=STEP), builder)
-    body = plant.AddRigidBody("ball", SpatialInertia.SolidSphereWithMass(0.1, RADIUS))
-    plant.Finalize()
-    with pytest.raises(InputError, match="overlap"):
-        ContactDetector(plant, [body], [body], STEP)
-    with pytest.raises(InputError, match="period"):
-        ContactDetector(plant, [body], [plant.world_body()], 0.0)

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import (
     angle_between,
     axis_angle_rotation,
@@ -11,7 +10,7 @@ from guiderail.models.common.transforms import (
     rpy_angles,
     transform_to_pose,
 )
-from guiderail.systems.continuous_pose import ContinuousPose
+from guiderail.systems.body_poses import ContinuousPose
 
 PERIOD = 0.02
 STEPS = 60
@@ -102,9 +101,3 @@ def test_each_initialization_begins_at_the_given_pose():
     context.SetTime(0.0)
     simulator.Initialize()
     assert system.get_continuous_pose_output_port().Eval(context)[3] == pytest.approx(9.5 - 4 * np.pi)
-
-
-@pytest.mark.parametrize("near", [np.zeros(5), np.full(6, np.nan), None])
-def test_near_is_refused_when_it_is_no_pose(near):
-    with pytest.raises(InputError, match="near"):
-        ContinuousPose(near, PERIOD)

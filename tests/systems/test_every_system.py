@@ -1,6 +1,6 @@
 """Rules that every LeafSystem of the project satisfies.
 
-A file defines one exported system with the name of the file, and the system has a test file. `oracles.systems` has
+The systems of a file are exported, and each has a test file. `oracles.systems` has
 the rules of ports, outputs and errors.
 """
 
@@ -111,11 +111,11 @@ def system(request, system_by_name):
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_file_has_one_exported_and_tested_system(path):
-    (name,) = system_names(path)
-    assert re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() == path.stem
-    assert issubclass(getattr(systems, name), LeafSystem)
-    assert (TESTS / f"test_{path.stem}.py").is_file()
+def test_systems_of_a_file_are_exported_and_tested(path):
+    assert system_names(path)
+    for name in system_names(path):
+        assert issubclass(getattr(systems, name), LeafSystem)
+        assert (TESTS / f"test_{re.sub(r'(?<!^)(?=[A-Z])', '_', name).lower()}.py").is_file()
 
 
 def test_support_modules_define_no_system():
@@ -171,6 +171,25 @@ def test_system_satisfies_the_rules(rule, system):
 def test_changes_of_sources_have_an_effect(system_by_name, name, source, output):
     """Without an effect, the comparison above could not notice a missing prerequisite."""
     assert (source, output) in changed_outputs(system_by_name[name])[1]
+
+
+@pytest.mark.parametrize(
+    ("name", "output"),
+    [
+        ("ActiveConstraintProjector", "last_desired_pose"),
+        ("CartesianPositionController", "joint_positions"),
+        ("HistoryBuffer", "history"),
+        ("JointTorqueWrench", "wrench"),
+        ("LawSystem", "desired_pose"),
+        ("PolicySystem", "action"),
+        ("SctStateMachine", "state"),
+        ("WrenchSensor", "wrench"),
+    ],
+)
+def test_output_has_no_direct_feedthrough(system_by_name, name, output):
+    """Feedback of these outputs causes no algebraic loop."""
+    port = system_by_name[name].GetOutputPort(output)
+    assert not system_by_name[name].HasDirectFeedthrough(port.get_index())
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.rglob("*.py")), ids=lambda path: path.stem)

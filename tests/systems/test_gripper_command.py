@@ -73,10 +73,8 @@ def test_reset_restores_the_initial_opening(is_initialized):
 @pytest.mark.parametrize(
     "arguments",
     [
-        {"lower": np.zeros(1)},
         {"opening": np.array([0.05, 0.0])},
         {"opening": np.array([np.nan, 0.0])},
-        {"upper": np.array([[0.04, 1.0]]), "lower": LOWER[None], "opening": OPENING[None]},
         {"period": 0.0},
     ],
 )
@@ -95,23 +93,6 @@ def test_opening_may_be_at_a_limit_but_not_beyond(limit, outside, joint):
     opening[joint] = np.nextafter(limit[joint], outside)
     with pytest.raises(InputError, match="opening must be within"):
         GripperCommand(LOWER, UPPER, opening, period=0.01)
-
-
-def test_arguments_are_copied_and_may_be_lists():
-    GripperCommand(LOWER.tolist(), UPPER.tolist(), OPENING.tolist(), period=0.01)
-    lower, upper = LOWER.copy(), UPPER.copy()
-    system = GripperCommand(lower, upper, OPENING, period=0.01)
-    lower[:], upper[:] = 0.0, 0.0
-    context = system.CreateDefaultContext()
-    system.get_position_input_port().FixValue(context, [-5.0, 5.0])
-    np.testing.assert_array_equal(system.get_desired_state_output_port().Eval(context), [0.0, 1.0, 0.0, 0.0])
-
-
-def test_gripper_command_has_its_ports():
-    system = GripperCommand(LOWER, UPPER, OPENING, period=0.01)
-    assert system.get_position_input_port().get_name() == "position"
-    assert system.get_desired_state_output_port().get_name() == "desired_state"
-    assert system.get_desired_state_output_port().size() == 4
 
 
 def test_force_limit_is_the_last_valid_request():

@@ -3,7 +3,7 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.history_length_schedule import HistoryLengthSchedule
+from guiderail.systems.history import HistoryLengthSchedule
 
 PERIOD = 0.125
 
@@ -82,8 +82,6 @@ def test_initialization_restores_the_longest_length():
         {"contact_threshold": np.nan},
         {"release_threshold": np.nan},
         {"release_threshold": -0.1},
-        {"dwell_steps": 0},
-        {"wrench_size": 0},
         {"lengths": []},
         {"lengths": [0, 3]},
         {"lengths": [1, 2.5]},
@@ -94,8 +92,3 @@ def test_initialization_restores_the_longest_length():
 def test_constructor_refuses_arguments_out_of_range(arguments):
     with pytest.raises(InputError):
         HistoryLengthSchedule(arguments.pop("lengths", [1, 2]), PERIOD, **arguments)
-
-
-def test_constructor_accepts_arguments_at_their_limits():
-    HistoryLengthSchedule([1], PERIOD, contact_threshold=0.0, release_threshold=0.0, dwell_steps=1, wrench_size=1)
-    HistoryLengthSchedule([1], PERIOD, contact_threshold=1.0, release_threshold=1.0)

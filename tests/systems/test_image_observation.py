@@ -1,8 +1,6 @@
 import numpy as np
-import pytest
 from pydrake.systems.sensors import ImageRgba8U
 
-from guiderail.models.common.errors import InputError
 from guiderail.systems.image_observation import ImageObservation
 
 
@@ -15,8 +13,3 @@ def test_observation_is_the_channels_of_the_image_and_the_state():
     observation = system.get_observation_output_port().Eval(context)
     np.testing.assert_array_equal(observation[12:24], (np.arange(12) * 4 + 1) / 255)
     np.testing.assert_array_equal(observation[36:], [0.5, -2.0])
-
-
-def test_constructor_refuses_an_image_without_pixels():
-    with pytest.raises(InputError, match="at least 1"):
-        ImageObservation(0, 3, 2)

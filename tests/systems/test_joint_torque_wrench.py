@@ -50,10 +50,6 @@ def estimate(arm, wrench, **options):
     return Rig(arm, jacobian(arm).T @ np.concatenate([wrench[3:], wrench[:3]]), **options).wrench_at(0.005)
 
 
-def test_estimator_has_no_direct_feedthrough(arm):
-    assert not Rig(arm, np.zeros(7)).system.HasAnyDirectFeedthrough()
-
-
 def test_wrench_is_estimated_from_its_joint_torques(arm):
     wrench = np.array([5.0, -3.0, 12.0, 0.2, -0.1, 0.3])
     np.testing.assert_allclose(estimate(arm, wrench, damping=0.0), wrench, atol=1e-9)

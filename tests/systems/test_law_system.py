@@ -127,21 +127,9 @@ def test_function_cannot_modify_the_inputs():
     assert read("held_action") == [0.5]
 
 
-def test_system_has_no_direct_feedthrough():
-    assert not LawSystem(Integrator(2, 1), 3, PERIOD).HasAnyDirectFeedthrough()
-
-
-def test_constructor_refuses_arguments_out_of_range():
-    for sizes in ((0, 1), (1, 0), (1, 1.5)):
-        with pytest.raises(InputError, match="must be a whole number of at least 1"):
-            Integrator(*sizes)
-    for law, wrench_size, period, message in (
-        (Integrator(1), 0, PERIOD, "wrench_size must be a whole number of at least 1"),
-        (5, 1, PERIOD, "guidance needs a Law"),
-        (Integrator(1), 1, 0.0, "period"),
-    ):
-        with pytest.raises(InputError, match=message):
-            LawSystem(law, wrench_size, period)
+def test_constructor_refuses_what_is_not_a_law():
+    with pytest.raises(InputError, match="guidance needs a Law"):
+        LawSystem(5, 1, PERIOD)
 
 
 @pytest.mark.parametrize(("name", "method"), [("command", lambda self, action, pose: pose), ("next", lambda self: 0)])

@@ -6,7 +6,7 @@ from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink, Zero
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
-from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 from oracles.prerequisites import changed_outputs
 
@@ -42,19 +42,6 @@ def names(system, kind):
     """Return the names of the input or output ports of a system."""
     count = getattr(system, f"num_{kind}_ports")()
     return [getattr(system, f"get_{kind}_port")(i).get_name() for i in range(count)]
-
-
-def test_system_has_its_ports():
-    system = LcNsKmpSystem(primitive(), None, PERIOD)
-    assert names(system, "input") == ["null_space_action", "history", "motion_time", "reference_window"]
-    assert names(system, "output") == ["command", "constraint_violation", "fallback"]
-    assert system.get_history_input_port().size() == 6
-    assert system.get_command_output_port().size() == 2
-    assert system.get_reference_window_input_port().size() == 9 * (2 + 4)
-    without_history = LcNsKmpSystem(primitive(history=0), None, PERIOD)
-    assert names(without_history, "input") == ["null_space_action", "motion_time", "reference_window"]
-    with pytest.raises(InputError, match="history"):
-        without_history.get_history_input_port()
 
 
 def test_window_of_three_outputs_has_covariances_of_nine_entries():
@@ -277,35 +264,17 @@ def test_history_length_selects_the_primitive():
         system.get_history_length_input_port().FixValue(context, [float(p.history)])
         expected = p.predict(0, gains[p.history] * action, past[-p.history :]).output
         np.testing.assert_array_equal(system.get_command_output_port().Eval(context), expected)
-    with pytest.raises(InputError, match="one primitive"):
-        LcNsKmpSystem(longest, None, PERIOD).get_history_length_input_port()
-
-
-@pytest.mark.parametrize("history", [0, 3, 4])
-def test_constructor_refuses_an_additional_history_out_of_range(history):
-    with pytest.raises(InputError, match="shorter history has 1 to 2"):
-        LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(primitive(history), np.ones(2))])
 
 
 @pytest.mark.parametrize(
     ("shorter", "words"),
-    [([primitive(1, upper=0.4)], "other constraints"), ([primitive(1), primitive(1)], "have the same length")],
+    [
+        ([primitive(1, upper=0.4)], "other constraints"),
+    ],
 )
 def test_constructor_refuses_inconsistent_primitives(shorter, words):
     with pytest.raises(InputError, match=words):
         LcNsKmpSystem(primitive(), None, PERIOD, shorter=[(p, np.ones(2)) for p in shorter])
-
-
-def test_window_is_refused_when_primitives_differ_in_horizon():
-    longest = primitive(history=2)
-    other = LcNsKmp(longest.reference, horizon=3, history=1, constraints=longest.constraints)
-    system = LcNsKmpSystem(longest, None, PERIOD, shorter=[(other, np.ones(2))])
-    simulator = Simulator(system)
-    simulator.Initialize()
-    port = system.get_reference_window_input_port()
-    port.FixValue(simulator.get_mutable_context(), np.zeros(port.size()))
-    with pytest.raises(InputError, match=r"must have one horizon, not \[3, 8\]"):
-        simulator.Initialize()
 
 
 @pytest.mark.parametrize("time", [np.nan, np.inf])

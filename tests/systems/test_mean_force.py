@@ -1,9 +1,7 @@
 import numpy as np
-import pytest
 from pydrake.systems.analysis import Simulator
 
-from guiderail.models.common.errors import InputError
-from guiderail.systems.mean_force import MeanForce
+from guiderail.systems.wrench_signals import MeanForce
 
 
 def test_force_is_the_mean_of_the_last_control_step():
@@ -20,17 +18,3 @@ def test_force_is_the_mean_of_the_last_control_step():
         simulator.AdvanceTo((n + 1) * 0.1)
         np.testing.assert_allclose(system.get_force_output_port().Eval(context), np.array(added) / 4)
         np.testing.assert_allclose(system.get_magnitude_output_port().Eval(context), np.hypot(*added) / 4)
-
-
-@pytest.mark.parametrize("arguments", [(0, 4, 0.1), (2, 0, 0.1), (1.5, 4, 0.1), (2, 2.5, 0.1), (2, 4, 0.0)])
-def test_constructor_refuses_arguments_out_of_range(arguments):
-    with pytest.raises(InputError):
-        MeanForce(*arguments)
-
-
-def test_constructor_accepts_one_component_and_one_substep():
-    system = MeanForce(1, 1, 0.1)
-    context = system.CreateDefaultContext()
-    system.get_force_sum_input_port().FixValue(context, [-3.0])
-    assert system.get_force_output_port().Eval(context) == [-3.0]
-    assert system.get_magnitude_output_port().Eval(context) == [3.0]

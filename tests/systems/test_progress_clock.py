@@ -97,11 +97,6 @@ def test_motion_time_is_zero_at_each_initialization():
     assert times == [0, 1, 2, 2, 2, 2, 3, 4] * 2
 
 
-def test_constructor_refuses_a_period_of_zero():
-    with pytest.raises(InputError):
-        ProgressClock(RULE, 2, 0.0)
-
-
 @pytest.mark.parametrize(("pose", "lag"), [([0.0, 0.0], 0), ([1.0, 0.0], 4)])
 def test_steps_are_exact_when_the_period_is_inexact_in_binary(pose, lag):
     period = 0.02  # in floating point, 29 * period / period < 29

@@ -4,8 +4,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import SpatialInertia
 
-from guiderail.models.common.errors import InputError
-from guiderail.systems.relative_poses import RelativePoses
+from guiderail.systems.body_poses import RelativePoses
 
 X_WA = RigidTransform(RotationMatrix.MakeZRotation(0.5), [1.0, 0.0, 0.2])
 X_WB = RigidTransform(RotationMatrix.MakeXRotation(-2.1), [0.0, 0.3, 0.0])
@@ -33,8 +32,3 @@ def test_poses_are_relative_to_the_reference_body(plant):
     rotation = X_AB.rotation().ToAngleAxis()
     np.testing.assert_allclose(poses[0], [*X_AB.translation(), *(rotation.angle() * rotation.axis())], atol=1e-12)
     np.testing.assert_allclose(poses[1], np.zeros(6), atol=1e-12)
-
-
-def test_constructor_refuses_an_empty_list_of_bodies(plant):
-    with pytest.raises(InputError, match="at least one"):
-        RelativePoses(plant, [], plant.world_body())

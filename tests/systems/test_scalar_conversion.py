@@ -10,7 +10,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from guiderail import systems
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.cartesian_impedance import impedance_torques
+from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance_torques
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.support.differentiable_impedance import differentiable_torques
 from oracles.prerequisites import changed_outputs
@@ -116,8 +116,8 @@ def test_torque_at_its_limit_is_not_saturated(share, is_saturated):
     arguments = {"p_error": zero[:3], "eta": 1.0, "epsilon": zero[:3], "J": np.eye(6), "M": np.eye(6), "v": zero}
     arguments |= {"K": np.eye(6), "damping_ratio": 1.0, "wrench_limits": LIMITS, "R_axes": None}
     arguments |= {"posture_torque": zero, "gravity_torque": share * limits, "torque_limits": limits}
-    assert impedance_torques(**arguments).is_saturated == is_saturated
-    assert differentiable_torques(**arguments).is_saturated == is_saturated
+    assert impedance_torques(ArmImpedance(**arguments)).is_saturated == is_saturated
+    assert differentiable_torques(ArmImpedance(**arguments)).is_saturated == is_saturated
 
 
 def test_closed_loop_has_derivatives_of_its_motion():

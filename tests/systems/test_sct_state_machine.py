@@ -50,20 +50,6 @@ class Rig:
         return int(self.system.get_state_output_port().Eval(self.context)[0])
 
 
-def test_state_machine_has_its_ports(template):
-    system = SctStateMachine(template, FRAMES, PERIOD)
-    names = [system.get_output_port(i).get_name() for i in range(system.num_output_ports())]
-    assert names == ["state", "transition_distance", "progress", "max_wrench"]
-
-
-def test_state_has_no_direct_feedthrough(template):
-    system = SctStateMachine(template, FRAMES, PERIOD)
-    state = system.get_state_output_port().get_index()
-    assert not any(system.HasDirectFeedthrough(i, state) for i in range(2))
-    progress = system.get_progress_output_port().get_index()
-    assert not system.HasDirectFeedthrough(system.get_initial_pose_input_port().get_index(), progress)
-
-
 @pytest.mark.parametrize(("start", "state"), [(0.4, 0), (0.2, 1), (0.05, 2)])
 def test_state_machine_begins_in_the_state_of_the_initial_pose(template, start, state):
     assert Rig(template, start).state() == state
@@ -193,10 +179,3 @@ def test_limit_of_a_nested_diagram_is_read_by_a_phase_wrench_limit(template):
     simulator.AdvanceTo(4 * PERIOD)
     context = limit.GetMyContextFromRoot(simulator.get_context())
     assert limit.get_phase_max_wrench_output_port().Eval(context)[6] < 12.0
-
-
-def test_state_machine_refuses_invalid_arguments(template):
-    with pytest.raises(InputError, match="period"):
-        SctStateMachine(template, FRAMES, 0.0)
-    with pytest.raises(InputError, match="mug_tip"):
-        SctStateMachine(template, {}, PERIOD)

@@ -199,7 +199,7 @@ def test_task_in_a_file_works_without_installation(lab):
     (lab.folder / "local_task.py").write_text(
         "from guiderail import register_task\n"
         "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n\n"
-        "@register_task('local/Passage')\nclass LocalPassage(NarrowPassage):\n    num_steps = 40\n"
+        "@register_task('local/Passage')\nclass LocalPassage(NarrowPassage):\n    duration = 0.8\n"
     )
     guiderail(
         lab, "train", "local/Passage", "--import", "local_task.py", "--episodes", "2", "--guidance", "kgrl",

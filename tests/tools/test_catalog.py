@@ -3,7 +3,7 @@ from pydantic import Field
 from guiderail.diagrams.envs.options import Options, option_fields
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.tools.catalog import BASIC, describe_task_groups, describe_task_options
-from guiderail.tools.learning.config import OffPolicyConfig
+from guiderail.tools.learning.learner_config import OffPolicyConfig
 
 
 class LabOptions(Options):

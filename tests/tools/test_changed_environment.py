@@ -9,8 +9,7 @@ from guiderail.tools.environments import changed_environment, check_environment,
 from guiderail.tools.evaluation import evaluate
 from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_studies.certify import _find_subject
 from guiderail_studies.declaration import Study
 from guiderail_studies.job import Job, run_job

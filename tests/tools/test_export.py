@@ -123,7 +123,7 @@ def test_law_is_refused_without_an_exported_skill(content, tmp_path):
 
 
 def test_target_of_missing_sibling_names_the_line_that_installs_it(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("guiderail.tools.cli.export.find_plugins", lambda kind: iter(()))
+    monkeypatch.setattr("guiderail.tools.cli.commands.find_plugins", lambda kind: iter(()))
     with pytest.raises(SystemExit) as ended:
         main(["export", "pretrained:connector", "--target", "cpp", "--out", str(tmp_path / "skill")])
     line = 'guiderail export --target cpp needs guiderail-cpp, which is not installed: pip install "guiderail[cpp]"'

@@ -14,8 +14,7 @@ from guiderail.models.primitives import Demonstrations
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.visualization import camera
 from guiderail.tools.visualization.replay import default_page, tube, write_page

@@ -1,31 +1,29 @@
 """Task that a user declares: effects of the declaration, and messages about mistakes in it."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, prior_of
 from guiderail.diagrams.envs.env import INFO_KEYS, RECORDED_SIGNALS
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.observation import ObservationTerm, affine
+from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.guidance.registry import possible_guidance
+from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
-from guiderail.tools.catalog import describe_task_options
+from guiderail.tools.catalog import describe_task_options, describe_template
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.train import train
-from guiderail.tools.validate_template import validate_template
 from research.action_fuzzing.tasks import fuzz
 
 NUM_STEPS = 10
@@ -34,35 +32,21 @@ NUM_STEPS = 10
 class Own(Task):
     """Task whose reference moves straight up through a wide gap."""
 
-    workcell_kind = "plane"
-    num_steps = NUM_STEPS
-    reward = staticmethod(lambda pose: -float(pose[1]))
+    station = PlaneStation
 
     def workcell(self):
         return PassageGeometry(start=(0.35, 0.1), goal=(0.35, 0.9), goal_radius=0.05, gap_x=(0.2, 0.5))
 
-    def reference(self):
+    def prior(self):
         means = np.column_stack([np.full(NUM_STEPS, 0.35), np.linspace(0.1, 0.2, NUM_STEPS)])
-        return ReferenceTrajectory(0.02 * np.arange(NUM_STEPS), means, np.tile(1e-4 * np.eye(2), (NUM_STEPS, 1, 1)))
+        times, covariances = 0.02 * np.arange(NUM_STEPS), np.tile(1e-4 * np.eye(2), (NUM_STEPS, 1, 1))
+        return Prior(ReferenceTrajectory(times, means, covariances))
 
-    def observation_terms(self):
-        return (ObservationTerm("phase"),)
+    def rewards(self):
+        return {"a": lambda pose: -float(pose[1])}
 
-    def reward_terms(self, num_actions):
-        return [RewardTerm("a", {"pose": 2}, self.reward)]
-
-    def termination_terms(self):
-        return [TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
-
-    def reset(self, station, guidance, context, rng, options):
-        return {}
-
-
-class TaskWithoutReference(Task):
-    """Task that provides nothing to guidance."""
-
-    workcell, observation_terms, reward_terms = Own.workcell, Own.observation_terms, Own.reward_terms
-    termination_terms, reset = Own.termination_terms, None
+    def done(self):
+        return {"success": self.workcell().at_goal}
 
 
 @pytest.fixture(autouse=True)
@@ -79,26 +63,20 @@ def first_step(**options):
 
 
 def declare(of=Own, **attributes):
-    return register_task("lab/Own")(type("Declared", (of,), attributes))
+    return register_task("lab/Own")(type("Declared", (of,), {**attributes, "__module__": __name__}))
 
 
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"Options": dict}, "Options of lab/Own must be a subclass of Options"),
         ({"Reset": None}, "Reset of lab/Own must be a subclass of ResetOptions"),
         ({"clip": None}, "clip of lab/Own must be a positive number"),
-        ({"num_steps": 0}, "num_steps of lab/Own must be a whole number of at least 1, not 0"),
-        ({"num_steps": 1.5}, "num_steps of lab/Own must be a whole number of at least 1, not 1.5"),
-        ({"num_steps": True}, "num_steps of lab/Own must be a whole number of at least 1, not True"),
-        ({"num_steps": "80"}, "num_steps of lab/Own must be a whole number of at least 1, not '80'"),
-        ({"rewards": ()}, "rewards of lab/Own must be a tuple of names"),
         (
             {"scripted_policies": lambda self, difficulty: {}},
             r"^scripted_policies of lab/Own is called without an instance: make it a @classmethod with the arguments "
             r"\(cls, difficulty\)$",
         ),
-        ({"difficulties": {"hard": {}}}, "difficulties of lab/Own must have 'standard'"),
+        ({"station": dict}, "station of lab/Own is a class that register_station registers"),
     ],
 )
 def test_declaration_of_the_wrong_type_is_refused(attributes, message):
@@ -109,12 +87,8 @@ def test_declaration_of_the_wrong_type_is_refused(attributes, message):
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"workcell_kind": "planes"}, "a workcell of the kind 'planes', which lab/Own has: did you mean plane"),
-        (
-            {"of": TaskWithoutReference, "workcell_kind": "plane"},
-            "no guidance can be built for lab/Own: write its reference",
-        ),
-        ({"difficulties": {"standard": {}, "hard": {"gapp": 1}}}, "hard of lab/Own sets the unknown option 'gapp'"),
+        ({"prior": lambda self: Prior()}, r"no guidance can be built for lab/Own: let its prior\(\) have a reference"),
+        ({"presets": {"hard": {"gapp": 1}}}, "hard of lab/Own sets the unknown option 'gapp'"),
         ({"defaults": {"histroy": 5}}, "defaults of lab/Own sets the unknown option 'histroy': did you mean history"),
     ],
 )
@@ -125,14 +99,14 @@ def test_task_without_a_possible_environment_is_refused(attributes, message):
 
 
 def test_task_that_lacks_methods_is_refused_with_their_names():
-    message = r"lab/Own lacks reset\(\), workcell\(\): every task must define these methods"
+    message = r"lab/Own lacks done\(\), rewards\(\), workcell\(\): every task must define these methods"
     with pytest.raises(InputError, match=message):
-        declare(of=Task, observation_terms=None, reward_terms=None, termination_terms=None)
+        declare(of=Task, station=PlaneStation)
 
 
 def test_default_guidance_has_an_effect():
     declare()
-    assert possible_guidance(TASKS.get("lab/Own").provides())[0] == "base_policy"
+    assert possible_guidance(prior_of(TASKS.get("lab/Own")).provides)[0] == "base_policy"
     assert EnvConfig.resolve("lab/Own", {}).guidance == "kgrl"
 
 
@@ -145,130 +119,59 @@ def test_scripted_policies_without_an_instance_are_accepted(kind):
     assert find_scripted_policy("lab/Own", "scripted") is hold
 
 
-@pytest.mark.parametrize("returned", [None, [np.zeros], {"hold": 3}])
-def test_scripted_policies_that_are_no_functions_are_refused(returned):
-    declare(scripted_policies=staticmethod(lambda difficulty: returned))
-    with pytest.raises(InputError, match="scripted_policies of lab/Own must return functions of an observation by"):
-        find_scripted_policy("lab/Own", "scripted")
-
-
 def test_settings_of_another_guidance_are_accepted():
-    declare(difficulties={"standard": {}, "hard": {"history": 4}}, defaults={"guidance": "kmp"})
+    declare(presets={"hard": {"history": 4}}, defaults={"guidance": "kmp"})
     assert EnvConfig.resolve("lab/Own", {"difficulty": "hard"}).options["guidance"] == "kmp"
+
+
+HUGE = {name: lambda pose: 1e308 for name in "ab"}
+
+
+def returning(value):
+    return lambda self, *arguments: value
 
 
 @pytest.mark.parametrize(
     ("attributes", "message"),
     [
-        ({"reward": lambda self, pose: np.nan}, "reward term 'a' of lab/Own is not finite, but nan"),
-        ({"reward": lambda self, pose: pose}, "reward term 'a' of lab/Own must be one number, and it is array"),
-        ({"reward": lambda self, pose: None}, "reward term 'a' of lab/Own must be one number, and it is None"),
+        ({"rewards": returning({"a": lambda pose: np.nan})}, "reward term 'a' of lab/Own is not finite, but nan"),
+        ({"rewards": returning({"a": lambda pose: pose})}, "reward term 'a' of lab/Own must be one number, and it is"),
+        ({"rewards": returning({"a": lambda place: 0.0})}, "reward 'sparse' of lab/Own needs the signal 'place'"),
+        ({"rewards": returning({"a": 3.0})}, "reward 'sparse' of lab/Own is a function of signals, .*, not 3.0"),
+        ({"rewards": returning({"a": max})}, "reward 'sparse' of lab/Own "),
+        ({"rewards": returning([max])}, r"rewards\(\) of lab/Own must return functions of signals by name, not \["),
+        ({"rewards": returning(HUGE)}, "the sum of the reward terms of lab/Own is not finite, but inf"),
+        ({"done": returning({"success": lambda place: False})}, "termination of lab/Own needs the signal 'place'"),
+        ({"done": returning({"won": lambda pose: False})}, "an episode can't end as 'won', only as success"),
+        ({"done": returning(None)}, r"done\(\) of lab/Own must return functions of signals by name, not None"),
+        ({"observe": returning(ObservationTerm("pose"))}, "must return Observed or a list of ObservationTerm, not Obs"),
+        ({"observe": returning(("pose",))}, r"must return Observed or a list of ObservationTerm, not \('pose',\)"),
+        ({"reset": returning(3)}, "reset of lab/Own must return the sampled values by name, or nothing, not 3"),
         (
-            {"reward": lambda self, place: 0.0},
-            "reward term 'a' of lab/Own is called with .*pose.*, but its .* parameters .place",
+            {"workcell": returning(5)},
+            r"workcell\(\) of lab/Own returns 5, which has no robot_radius: .* station='plane'",
         ),
+        ({"workcell": returning(None)}, r"workcell\(\) of lab/Own returns nothing: let it return what station='plane'"),
         (
-            {"termination_terms": lambda self: [TerminationTerm("success", {"pose": 2}, lambda position: False)]},
-            "the condition 'success' of lab/Own is called with .*pose.*, but its .* parameters .position",
+            {"collision": property(returning(Threshold("wrench")))},
+            "threshold of lab/Own takes one number as the signal 'wrench', which has 2",
         ),
+        ({"duration": property(returning(0.0))}, "the duration of lab/Own must be positive, not 0.0 s"),
         (
-            {"reset": lambda self, *arguments: None},
-            "reset of lab/Own must return the sampled values by name, {} .*, not None",
+            {"reset": lambda self, world, rng, given: world.set_pose(np.full(2, 100.0))},
+            r"reset of lab/Own puts the robot at \[100\. 100\.\] m, and at most 10 m are allowed: give poses in meters",
         ),
     ],
 )
-def test_wrong_term_or_reset_is_named_at_the_first_step(attributes, message):
+def test_wrong_declaration_is_named_at_the_first_step(attributes, message):
     declare(**attributes)
-    with pytest.raises(InputError, match=message):
-        first_step()
-
-
-HUGE_TERMS = [RewardTerm(name, {"pose": 2}, lambda pose: 1e308) for name in "ab"]
-TERM = RewardTerm("a", {"pose": 2}, lambda pose: 0.0)
-
-
-@pytest.mark.parametrize(
-    ("method", "returned", "message"),
-    [
-        ("reference", None, r"reference\(\) of lab/Own must return ReferenceTrajectory, not None"),
-        ("reference", np.zeros((10, 2)), r"reference\(\) of lab/Own must return ReferenceTrajectory, not array"),
-        ("reference", "demos.npz", r"reference\(\) of lab/Own must return ReferenceTrajectory, not 'demos.npz'"),
-        (
-            "constraints",
-            [[1, 0]],
-            r"constraints\(\) of lab/Own must return LinearConstraints or None, not \[\[1, 0\]\]",
-        ),
-        ("motion_constraints", 1, r"motion_constraints\(\) of lab/Own must return MotionConstraints or None, not 1"),
-        ("signals", None, r"signals\(\) of lab/Own must return Mapping, not None"),
-        ("observation_terms", ObservationTerm("pose"), "must return Camera or a list of ObservationTerm, not Obs"),
-        ("observation_terms", ("pose",), r"must return Camera or a list of ObservationTerm, not \('pose',\)"),
-        ("privileged_terms", "pose", r"privileged_terms\(\) of lab/Own must return a list of ObservationTerm, not 'p"),
-        ("reward_terms", [np.zeros], r"reward_terms\(\) of lab/Own must return a list of RewardTerm, not \[<"),
-        ("reward_terms", TERM, r"reward_terms\(\) of lab/Own must return a list of RewardTerm, not RewardTerm\("),
-        (
-            "reward_terms",
-            [replace(TERM, inputs=["pose"])],
-            "reward term 'a' of lab/Own needs the sizes .*, not .'pose'",
-        ),
-        ("reward_terms", [replace(TERM, value=3.0)], "reward term 'a' of lab/Own needs a function .*, not 3.0"),
-        ("reward_terms", [replace(TERM, name=3)], r"a reward of lab/Own needs terms of different names, .*, not \[3\]"),
-        ("reward_terms", HUGE_TERMS, "the sum of the reward terms of lab/Own is not finite, but inf"),
-        (
-            "termination_terms",
-            None,
-            r"termination_terms\(\) of lab/Own must return a list of TerminationTerm, not None",
-        ),
-        ("workcell", 5, r"workcell\(\) of lab/Own returns 5, which has no robot_radius: .* what station='plane' works"),
-    ],
-)
-def test_method_that_returns_another_type_is_refused(method, returned, message):
-    declare(**{method: lambda self, *arguments: returned})
     with pytest.raises(InputError, match=message) as error:
         first_step()
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("attributes", "message"),
-    [
-        ({"collision": 3.0}, "collision of lab/Own must be a Threshold, not 3.0"),
-        (
-            {"collision": Threshold("contact_force", np.nan)},
-            "the limit of the collision threshold of lab/Own must be a",
-        ),
-        ({"collision": Threshold("contact_force", "a")}, "the limit of the collision threshold of lab/Own must be a"),
-        (
-            {"collision": Threshold("wrench")},
-            "threshold of lab/Own takes one number as the signal 'wrench', which has 2",
-        ),
-        ({"workcell_kind": "insertion"}, r"workcell\(\) of lab/Own returns PassageGeometry\(.*, which has no X_WT"),
-        (
-            {"reset": lambda self, station: {}},
-            r"^reset\(\) of lab/Own is called with the arguments \(station, guidance, context, rng, options\), but has "
-            r"the parameters \(station\): give it those of Task.reset$",
-        ),
-        (
-            {"reward_terms": lambda self: []},
-            r"reward_terms\(\) of lab/Own is called with the arguments \(num_actions\)",
-        ),
-        (
-            {
-                "reset": lambda self, station, guidance, context, *rest: (
-                    station.set_pose(context, np.full(2, 100.0)) or {}
-                )
-            },
-            r"reset of lab/Own puts the robot at \[100\. 100\.\] m, and at most 10 m are allowed: give poses in meters",
-        ),
-    ],
-)
-def test_wrong_attribute_or_parameters_are_refused(attributes, message):
-    declare(**attributes)
-    with pytest.raises(InputError, match=message):
-        first_step()
-
-
 def test_reward_that_overflows_in_a_step_is_refused():
-    declare(reward_terms=lambda self, num_actions: HUGE_TERMS[:1])
+    declare(rewards=returning({"a": HUGE["a"]}))
     with pytest.raises(InputError, match="the reward of 5 control steps overflows: scale it down"):
         first_step(action_repeat=5)
 
@@ -276,7 +179,7 @@ def test_reward_that_overflows_in_a_step_is_refused():
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
-        ((), "the observation of lab/Own is empty: let observation_terms"),
+        ((), "the observation of lab/Own is empty: let observe"),
         ((ObservationTerm("pose", entries=()),), "the observation of lab/Own is empty"),
         (
             (ObservationTerm("pose", scale=0.0),),
@@ -301,13 +204,13 @@ def test_reward_that_overflows_in_a_step_is_refused():
     ],
 )
 def test_invalid_observation_term_is_refused(terms, message):
-    declare(observation_terms=lambda self: terms)
+    declare(observe=returning(terms))
     with pytest.raises(InputError, match=message):
         make_env("lab/Own", guidance="kmp")
 
 
 def test_observation_is_centered_and_scaled_by_entry():
-    declare(observation_terms=lambda self: (ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),))
+    declare(observe=returning((ObservationTerm("pose", 0.5, [-1.0, 2.0], entries=(-1, 0)),)))
     env = make_env("lab/Own", guidance="kmp")
     observation, _ = env.reset(seed=0)
     x, y = env.diagram.diagram.GetOutputPort("pose").Eval(env.simulator.get_context())
@@ -316,21 +219,21 @@ def test_observation_is_centered_and_scaled_by_entry():
 
 @pytest.mark.parametrize("name", [*INFO_KEYS, *RECORDED_SIGNALS, "observation", "pose", "privileged", "rgb_image"])
 def test_reward_term_with_a_reserved_name_is_refused(name):
-    declare(reward_terms=lambda self, num_actions: [RewardTerm(name, {"pose": 2}, self.reward)])
+    declare(rewards=returning({name: lambda pose: 0.0}))
     with pytest.raises(InputError, match=f"no reward term of lab/Own can be called {name!r}"):
         make_env("lab/Own", guidance="kmp")
 
 
 @pytest.mark.parametrize("name", INFO_KEYS)
 def test_reset_value_with_a_reserved_name_is_refused(name):
-    declare(reset=lambda self, *arguments: {name: -9.0})
+    declare(reset=returning({name: -9.0}))
     env = make_env("lab/Own", guidance="kmp")
     with pytest.raises(InputError, match=f"reset of lab/Own returns a value named {name!r}, which is reserved"):
         env.reset(seed=0)
 
 
 def test_reward_term_may_have_the_name_of_a_guidance_port():
-    declare(reward_terms=lambda self, num_actions: [RewardTerm("held_action", {"pose": 2}, self.reward)])
+    declare(rewards=returning({"held_action": lambda pose: -float(pose[1])}))
     env = make_env("lab/Own", guidance="kmp")
     env.reset(seed=0)
     _, reward, *_, info = env.step(np.zeros(env.action_space.shape))
@@ -346,30 +249,10 @@ def test_observation_that_is_not_finite_is_refused(number):
 
     declare(
         signals=signals,
-        observation_terms=lambda self: (ObservationTerm("phase"), ObservationTerm("broken", entries=(1,))),
+        observe=returning((ObservationTerm("phase"), ObservationTerm("broken", entries=(1,)))),
     )
     with pytest.raises(InputError, match=r"the observation of lab/Own is not finite, but"):
         first_step()
-
-
-@pytest.mark.parametrize("number", [0, None])
-def test_invalid_num_steps_of_a_constructor_is_refused(number):
-    class SetInConstructor(Own):
-        def __init__(self, config):
-            super().__init__(config)
-            self.num_steps = number
-
-    declare(of=SetInConstructor, num_steps=np.int64(NUM_STEPS))
-    with pytest.raises(InputError, match=f"num_steps of lab/Own must be a whole number of at least 1, not {number}"):
-        make_env("lab/Own", guidance="kmp")
-
-
-def test_workcell_that_is_none_is_refused():
-    declare(workcell=lambda self: None)
-    with pytest.raises(
-        InputError, match=r"workcell\(\) of lab/Own returns nothing: let it return what station='plane'"
-    ):
-        make_env("lab/Own", guidance="kmp")
 
 
 def test_scope_is_training_without_held_out_conditions():
@@ -386,13 +269,16 @@ def test_scope_is_training_without_held_out_conditions():
 def test_collisions_are_counted_only_if_declared():
     declare()
     assert not counts_collisions("lab/Own")
-    declare(collision=Threshold("contact_force"))
+    declare(collision=property(returning(Threshold("contact_force"))))
     assert counts_collisions("lab/Own")
     assert all(map(counts_collisions, ("BncConnector", "GridClamp", "Pouring", "NarrowPassage")))
 
 
 def test_training_reports_collisions_only_if_declared(tmp_path):
-    for name, attributes, expected in (("without", {}, None), ("with", {"collision": Threshold("contact_force")}, 0)):
+    for name, attributes, expected in (
+        ("without", {}, None),
+        ("with", {"collision": property(returning(Threshold("contact_force")))}, 0),
+    ):
         declare(**attributes)
         run = train("lab/Own", out=tmp_path / name, episodes=1, algorithm="ppo", pictures=False)
         assert run.summary["collisions"] == expected
@@ -424,7 +310,7 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
 
 def test_validate_template_accepts_the_name_of_a_template(monkeypatch):
     monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    first, second = validate_template(Path("pouring"))["transitions"]
+    first, second = describe_template(Path("pouring"))["transitions"]
     assert first == "translational → tilt below 0.25 m, back above 0.27 m"
     assert second == "tilt → pour below 0.075 m, no way back"
 

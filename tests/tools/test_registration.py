@@ -55,16 +55,6 @@ class UnrelatedConfig:
         (lambda: register_task("lab")(3), "the task 'lab' is registered with a class derived from Task, not with 3"),
         (lambda: register_robot(3), "a robot is registered as a Robot object, not 3"),
         (lambda: register_end_effector(3), "an end effector is registered as an EndEffector object, not 3"),
-        (lambda: register_learner("lab", 3), "registered with a function or a class, not with 3"),
-        (lambda: register_learner("lab", build), "the learner lab has no Config"),
-        (
-            lambda: register_learner("lab", make_class(dict)),
-            "Config of lab must be a pydantic dataclass based on Learn",
-        ),
-        (
-            lambda: register_learner("lab", make_class(None)),
-            "Config of lab must be a pydantic dataclass .*, not None",
-        ),
         (lambda: register_learner("lab", make_class(UnrelatedConfig)), "Config of lab must be a pydantic dataclass"),
     ],
 )

@@ -8,7 +8,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from guiderail.tools.cli.main import main
-from guiderail.tools.console import PrintableConsole
+from guiderail.tools.progress import PrintableConsole
 from guiderail.tools.terminal import PrintableStream, printable, protect_terminal
 
 ATTACKS = {

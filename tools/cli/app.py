@@ -5,11 +5,13 @@ import math
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from importlib import import_module
+from inspect import Parameter, Signature, signature
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 import typer.core
@@ -17,6 +19,7 @@ import typer.core
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.plugins import find_plugins
 
+SEED = 1_000_000  # default seed of the first held-out episode
 COLUMN = 19  # width of a value in a table with several columns [characters]
 
 
@@ -127,7 +130,7 @@ REGISTRIES = {
 LISTED: dict[str, Callable[[], list[str]]] = {
     **{key: _names(place) for key, place in REGISTRIES.items()},
     "tasks": _names("guiderail.diagrams.tasks.registry:known_tasks"),
-    "presets": _names("guiderail.tools.learning.config:PRESETS"),
+    "presets": _names("guiderail.tools.learning.learner_config:PRESETS"),
 }
 """Lists that `guiderail list` prints, by name."""
 
@@ -212,9 +215,44 @@ def command(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return a decorator that registers a function as a command of a group.
 
-    `name` is the function's name by default. `example` is a command line without `guiderail`.
+    `name` is the function's name by default. `example` is a command line without `guiderail`. A parameter that is a
+    dataclass of options stands for the options that are its fields.
     """
-    return group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
+    register = group.command(name, cls=Command, epilog=f"Example: guiderail {example}")
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        register(_with_single_options(function))
+        return function
+
+    return decorate
+
+
+def _with_single_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that takes each field of a dataclass among the parameters as a parameter of its own."""
+    hints = get_type_hints(function, include_extras=True)
+    groups: dict[str, Any] = {name: hint for name, hint in hints.items() if is_dataclass(hint)}
+    parameters: dict[str, Parameter] = {}
+    for parameter in signature(function).parameters.values():
+        kind: Any = groups.get(parameter.name)
+        if kind is None:
+            parameters[parameter.name] = parameter.replace(annotation=hints[parameter.name])
+            continue
+        annotations = get_type_hints(kind, include_extras=True)
+        for field in fields(kind):
+            default = Parameter.empty if field.default is MISSING else field.default
+            annotation = annotations[field.name]
+            parameters[field.name] = Parameter(field.name, parameter.kind, default=default, annotation=annotation)
+
+    def call(**values: Any) -> Any:
+        for name, kind in groups.items():
+            values[name] = kind(**{field.name: values.pop(field.name) for field in fields(kind)})
+        return function(**values)
+
+    ordered = sorted(parameters.values(), key=lambda parameter: parameter.default is not Parameter.empty)
+    call.__signature__ = Signature(ordered)  # type: ignore[attr-defined]
+    call.__annotations__ = {name: parameter.annotation for name, parameter in parameters.items()}
+    call.__name__, call.__doc__, call.__module__ = function.__name__, function.__doc__, function.__module__
+    return call
 
 
 def command_group(name: str, text: str) -> typer.Typer:
@@ -296,25 +334,6 @@ TrustImports = Annotated[
 Guidance = Annotated[
     str | None, option("Guidance: {guidance}.  [default: that of the task or run]", choices="guidance")
 ]
-Difficulty = Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")]
-ActionRepeat = Annotated[int | None, option("Control steps per action.")]
-Reward = Annotated[
-    str | None,
-    option(
-        "Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task.",
-        choices="rewards",
-    ),
-]
-Observation = Annotated[
-    str | None,
-    option(
-        "Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task.",
-        choices="observations",
-    ),
-]
-FixtureOffset = Annotated[
-    str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
-]
 Station = Annotated[str | None, option("Station: {stations}.  [default: that of the task or run]", choices="stations")]
 Algorithm = Annotated[str | None, option("Learning algorithm: {learners}.  [default: the task's]", choices="learners")]
 Preset = Annotated[str | None, option("Settings of the learner: {presets}.  [default: the task's]", choices="presets")]
@@ -354,15 +373,75 @@ Processes = Annotated[
     int | None,
     option("Largest number of processes; results do not depend on it.  [default: the number of cores]"),
 ]
-Offsets = Annotated[bool, option("Resample the fixture offset of the run in every episode.", "--resample-offsets")]
+
+
+@dataclass(frozen=True)
+class EnvironmentOptions:
+    """Options of the environment of train and evaluate."""
+
+    env: Env = None
+    guidance: Guidance = None
+    difficulty: Annotated[str | None, option("Difficulty: standard or hard, if the task has one.")] = None
+    action_repeat: Annotated[int | None, option("Control steps per action.")] = None
+    reward: Annotated[
+        str | None,
+        option(
+            "Reward, such as sparse, shaped, aligned or hand_shaped; guiderail list TASK lists those of a task.",
+            choices="rewards",
+        ),
+    ] = None
+    observation: Annotated[
+        str | None,
+        option(
+            "Observation, such as state, center_of_pressure or image; guiderail list TASK lists those of a task.",
+            choices="observations",
+        ),
+    ] = None
+    fixture_offset: Annotated[
+        str | None, option("When the offset of the fixture is sampled: per_run, per_episode or none.")
+    ] = None
+    station: Station = None
+
+    def parse(self) -> dict[str, Any]:
+        """Return the options of the environment that are given; see `parse_environment`."""
+        return parse_environment(**vars(self))
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of a run that is trained in simulation or on a robot."""
+
+    out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None
+    algorithm: Algorithm = None
+    episodes: Annotated[
+        int | None,
+        option("Total number of episodes; --resume can change it, but not below the episodes done.  [default: 60]"),
+    ] = None
+    seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None
+    preset: Preset = None
+    setting: Settings = None
+    step_log: WriteStepLog = None
+    resume: Annotated[bool, option("Resume the run in --out.", "--resume")] = False
+    imports: Imports = None
+    trust_imports: TrustImports = False
+    as_json: Json = False
+
+    @property
+    def folder(self) -> Path:
+        """Folder of the run; an InputError if none is given."""
+        if self.out is None:
+            raise InputError("the run needs a folder: name one with --out RUN")
+        return self.out
+
+    def choices(self) -> dict[str, Any]:
+        """Return what is chosen of the run, by the names of `guiderail.tools.learning.run_folder.Choices`."""
+        values = {name: getattr(self, name) for name in ("algorithm", "preset", "episodes", "seed", "step_log")}
+        settings = parse_pairs(self.setting, "--set", "batch_size=128")
+        return {name: value for name, value in {**values, "settings": settings}.items() if value is not None}
 
 
 def parse_pairs(given: list[str] | None, option: str, example: str) -> dict[str, str]:
-    """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message.
-
-    Raises:
-        InputError: If a value has no `=`, or two values of one name differ.
-    """
+    """Return the `key=value` pairs of a repeated option as a dictionary; `example` is a valid pair, for the message."""
     pairs: dict[str, str] = {}
     for pair in given or []:
         if "=" not in pair:
@@ -379,11 +458,7 @@ def check_same(name: str, value: Any, other: Any) -> None:
 
 
 def parse_floats(text: str, count: int, option: str) -> list[float]:
-    """Return `count` finite numbers from a comma-separated list.
-
-    Raises:
-        InputError: If the number of values is not `count`, or a value is not finite.
-    """
+    """Return `count` finite numbers from a comma-separated list."""
     from guiderail.models.common.arrays import parse_number
 
     try:
@@ -396,11 +471,7 @@ def parse_floats(text: str, count: int, option: str) -> list[float]:
 
 
 def parse_integers(text: str | None, option: str) -> list[int] | None:
-    """Return integers from a comma-separated list; None for None.
-
-    Raises:
-        InputError: If a value is not an integer.
-    """
+    """Return integers from a comma-separated list; None for None."""
     if text is None:
         return None
     if not re.fullmatch(r"\s*[-+]?[0-9]{1,18}\s*(,\s*[-+]?[0-9]{1,18}\s*)*", text):
@@ -408,28 +479,20 @@ def parse_integers(text: str | None, option: str) -> list[int] | None:
     return [int(number) for number in text.split(",")]
 
 
-def parse_environment(given: list[str] | None, **options: Any) -> dict[str, Any]:
-    """Return the options of an environment: values of `--env`, read as YAML, and all `options` that are not None.
-
-    Raises:
-        InputError: If a value of `--env` has no `=`, or two values of one option differ.
-    """
+def parse_environment(env: list[str] | None, **options: Any) -> dict[str, Any]:
+    """Return the options of an environment: values of `--env`, read as YAML, and all `options` that are not None."""
     environment = {name: value for name, value in options.items() if value is not None}
-    if given:
+    if env:
         from guiderail.tools.environments import as_value
 
-        pairs = parse_pairs(given, "--env", "station=arm")
+        pairs = parse_pairs(env, "--env", "station=arm")
         for name, value in ((name, as_value(text)) for name, text in pairs.items()):
             check_same(name, environment.setdefault(name, value), value)
     return environment
 
 
 def import_files(imports: Sequence[str] | None) -> None:
-    """Import the modules and files that are given by `--import`.
-
-    Raises:
-        InputError: If an import fails.
-    """
+    """Import the modules and files that are given by `--import`."""
     if imports:
         from guiderail.tools.imports import import_modules
 
@@ -441,9 +504,6 @@ def find_task(name_or_folder: str, imports: Sequence[str] | None = None) -> tupl
 
     Returns:
         Name of the task, and the imports that a run must store. A text that is no folder is returned unchanged.
-
-    Raises:
-        InputError: If an import fails or the task folder is invalid.
     """
     import_files(imports)
     if not (Path(name_or_folder) / "task.yaml").is_file():
@@ -465,3 +525,10 @@ def refuse_robot(station: Any, remedy: str) -> None:
     """Raise an InputError that names the remedy if `station` is a real robot."""
     if is_hardware(station):
         raise InputError(f"station={station} is a real robot, which a reset cannot move: use {remedy}")
+
+
+def split_names(names: str | None) -> list[str] | None:
+    """Split comma-separated names of baseline policies; "none" is an empty list, and None means the default set."""
+    if names is None:
+        return None
+    return [] if names == "none" else [name.strip() for name in names.split(",")]

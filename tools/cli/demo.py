@@ -11,18 +11,17 @@ import pandas as pd
 
 from guiderail.diagrams.tasks.narrow_passage.task import avoids_obstacle_from
 from guiderail.models.policy import Policy
-from guiderail.tools.console import PrintableConsole
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.episode import HELD_OUT_SEED, check_seed
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.rollout import Paths, rollout
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.config import check_episodes
+from guiderail.tools.learning.learner_config import check_episodes
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
-from guiderail.tools.visualization.curves import draw_passage
-from guiderail.tools.visualization.style import color, new_figure, save_figure
+from guiderail.tools.learning.train import train
+from guiderail.tools.progress import PrintableConsole
+from guiderail.tools.visualization.figures import color, draw_passage, new_figure, save_figure
 
 HELD_OUT = 10  # number of held-out episodes
 PRESET = "tqc_cheap_correlated"
@@ -33,9 +32,6 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
     """Train sKGRL with TQC to avoid an obstacle in the narrow passage, evaluate it and print the result.
 
     An existing demo in the folder `out` is replaced.
-
-    Raises:
-        InputError: If the folder contains anything other than a demo, or a number is out of range.
     """
     check_episodes(episodes)
     check_seed(seed)
@@ -47,15 +43,8 @@ def run_demo(out: Path, *, episodes: int, seed: int) -> None:
         "were added. It now learns by trial and error to avoid the obstacle, and never enters the forbidden zone."
     )
     write_atomically(out / MARK, b"")
-    run = start_or_resume(
-        "NarrowPassage",
-        out,
-        environment={"guidance": "skgrl"},
-        preset=PRESET,
-        settings={"pipelined": True},
-        episodes=episodes,
-        seed=seed,
-    )
+    pipelined = {"pipelined": True}
+    run = train("NarrowPassage", "skgrl", out=out, preset=PRESET, settings=pipelined, episodes=episodes, seed=seed)
     before, after = _evaluate(out)
     picture = _draw(out, before, after)
     rows = RunFolder(out).episodes()

@@ -18,16 +18,8 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.tools.cli.app import app, print_message
 from guiderail.tools.terminal import protect_terminal
 
-COMMANDS = {
-    "train": ("train", "demo"),
-    "evaluate": ("evaluate",),
-    "ensemble": ("ensemble",),
-    "visualize": ("visualize",),
-    "template": ("template",),
-    "list": ("list",),
-    "export": ("export",),
-}
-"""Names of the commands that each module of this package registers."""
+COMMANDS = ("train", "demo", "evaluate", "ensemble", "visualize", "template", "list", "export")
+"""Names of the commands that `guiderail.tools.cli.commands` registers."""
 ENVIRONMENT_OPTIONS = (
     "--guidance", "--station", "--difficulty", "--reward", "--observation", "--action-repeat", "--fixture-offset",
     "--robot",
@@ -42,7 +34,7 @@ def load_commands(name: str = "") -> typer.Typer:
     Raises:
         MissingSiblingError: If the command belongs to a sibling distribution that is not installed.
     """
-    modules = {command: f"guiderail.tools.cli.{module}" for module, names in COMMANDS.items() for command in names}
+    modules = dict.fromkeys(COMMANDS, "guiderail.tools.cli.commands")
     modules |= {command: point.value for command, point in find_plugins("command")}
     for sibling, names in SIBLINGS.items():
         if name in names and name not in modules:

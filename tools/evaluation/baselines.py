@@ -127,26 +127,12 @@ def constant_policy(env: gymnasium.Env, action: np.ndarray) -> BaselinePolicy:
 
 
 def scripted_policies(task: str, difficulty: str = STANDARD) -> Mapping[str, PolicyFn]:
-    """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task.
-
-    Raises:
-        InputError: If the task returns anything but functions by name.
-    """
-    policies = TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
-    if not isinstance(policies, Mapping) or not all(map(callable, policies.values())):
-        raise InputError(
-            f"scripted_policies of {task} must return functions of an observation by name, {{}} if none, not "
-            f"{brief(policies)}"
-        )
-    return policies
+    """Return a task's scripted policies by name, the default for `difficulty` first; empty for an unregistered task."""
+    return TASKS.get(task).scripted_policies(difficulty) if task in TASKS.names() else {}
 
 
 def find_scripted_policy(task: str, name: str, difficulty: str = STANDARD) -> PolicyFn:
-    """Return a task's scripted policy by its name; "scripted" is the default for the difficulty.
-
-    Raises:
-        InputError: If the task has no policy of that name.
-    """
+    """Return a task's scripted policy by its name; "scripted" is the default for the difficulty."""
     policies = scripted_policies(task, difficulty)
     if name == "scripted" and policies:
         return next(iter(policies.values()))
@@ -169,16 +155,13 @@ def make_baseline(task: str, name: str, seed: int = 0) -> MakePolicy:
 
     The name is a key of `BASELINES`, the name of a scripted policy, or "scripted" for the default of the difficulty.
     `seed` is the seed of a baseline policy's random generators.
-
-    Raises:
-        InputError: If the task has no policy of that name.
     """
     if name in BASELINES:
         return partial(BaselinePolicy, BASELINES[name], seed=seed)
     find_scripted_policy(task, name)
 
     def make_policy(env: gymnasium.Env) -> PolicyFn:
-        config = getattr(cast(Any, env.unwrapped).diagram.task, "config", None)
+        config = getattr(cast(Any, env.unwrapped).diagram, "config", None)
         return find_scripted_policy(task, name, getattr(config, "difficulty", STANDARD))
 
     return make_policy

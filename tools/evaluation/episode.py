@@ -95,11 +95,7 @@ def has_image(space: Any) -> bool:
 
 
 def as_action(action: Any, env: gymnasium.Env) -> Any:
-    """Return a policy's result as an action: tensors become arrays, and an action (1, A) becomes (A,) if that fits.
-
-    Raises:
-        InputError: If a tensor cannot be converted.
-    """
+    """Return a policy's result as an action: tensors become arrays, and an action (1, A) becomes (A,) if that fits."""
     action, shape = from_tensors(action), env.action_space.shape
     if isinstance(action, np.ndarray) and shape == (1, *action.shape) and action.shape == (1,):
         return action[None]  # the row of an action (1, 1) was taken for a batch

@@ -4,10 +4,10 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Required, TypedDict, Unpack, cast
 
 import gymnasium
 import numpy as np
@@ -39,7 +39,7 @@ from guiderail.tools.evaluation.evaluation import (
 from guiderail.tools.evaluation.forks import check_processes, forked_map
 from guiderail.tools.evaluation.metrics import episodes_to_convergence
 from guiderail.tools.evaluation.policies import as_policy, is_compatible
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog
 from guiderail.tools.evaluation.subject import (
     Subject,
@@ -52,6 +52,7 @@ from guiderail.tools.evaluation.subject import (
 from guiderail.tools.files import ENDINGS, check_new, write_atomically
 from guiderail.tools.learning.environment_set import member_configs
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
+from guiderail.tools.progress import EpisodeProgress
 from guiderail.tools.tables import table_text
 
 SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
@@ -60,18 +61,26 @@ SIGNALS = ("commanded", "measured")  # poses that can be saved as demonstrations
 Collect = Callable[[gymnasium.Env, Mapping[str, Any]], Any]
 
 
+class EpisodeChoices(TypedDict, total=False):
+    """Held-out episodes that are evaluated; a choice that is missing has its default."""
+
+    episodes: Required[int]  # number of episodes of each policy
+    seed: int  # seed of the first episode; episode i has seed + i; default: `HELD_OUT_SEED`
+    options: Mapping[str, Any] | None  # further options of the resets
+    processes: int | None  # largest number of processes; default: 1; None: the number of cores
+    # Number for `start_episode` in the first episode, incremented in each further one and taken modulo 2^32; default:
+    # `seed` - `HELD_OUT_SEED`.
+    first_number: int | None
+
+
 def evaluate_policies(
     env: gymnasium.Env,
     policies: Mapping[str, PolicyFn],
     *,
-    episodes: int,
-    seed: int = HELD_OUT_SEED,
-    options: Mapping[str, Any] | None = None,
     labels: Mapping[str, str] | None = None,
     collect: Collect | None = None,
-    processes: int | None = 1,
-    first_number: int | None = None,
     steps: Path | None = None,
+    **choices: Unpack[EpisodeChoices],
 ) -> Iterator[tuple[str, pd.DataFrame, list[Any]]]:
     """Evaluate several policies on the same held-out episodes of one environment.
 
@@ -83,24 +92,17 @@ def evaluate_policies(
     Args:
         env: Environment. Its values that are constant in a run do not change without the reset option `new_run`.
         policies: Policies by name.
-        episodes: Number of episodes of each policy.
-        seed: Seed of the first episode; episode i has seed + i.
-        options: Further options of the resets.
         labels: Labels of the progress bars on standard error, by policy name; no bar by default.
         collect: Function from the environment and an episode's row to further data of the episode.
-        processes: Largest number of processes; None for the number of cores.
-        first_number: Number for `start_episode` in the first episode, incremented in each further one; by default
-            `seed` - `HELD_OUT_SEED`. Numbers are taken modulo 2^32.
         steps: Folder for the step log of the policy named `POLICY`; None for no step log.
+        **choices: Episodes.
 
     Yields:
         Name of a policy, its rows, and the data that `collect` returned for each of its episodes (None without it).
-
-    Raises:
-        InputError: If `episodes`, `seed` or `processes` is out of range, or a policy raises an exception.
-        KilledError: If a process is killed.
     """
-    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
+    episodes, seed = check_num_episodes(choices["episodes"]), check_seed(choices.get("seed", HELD_OUT_SEED))
+    processes, options = check_processes(choices.get("processes", 1)), choices.get("options")
+    first_number = choices.get("first_number")
     if has_image(env.observation_space):
         processes = 1  # the renderer has threads, which a fork does not inherit
     policies = {name: act if callable(act) else as_policy(act) for name, act in policies.items()}
@@ -161,9 +163,6 @@ def evaluate_run(
     Hidden values that are constant in a run are the same as in its training. With `skips_incompatible`, a policy whose
     observation or action shape does not match the environment has no rows. Further arguments are those of
     `evaluate_policy`.
-
-    Raises:
-        InputError: If the environment cannot be made, or an argument is out of range.
     """
     with closing(make_environment(config.task, config.environment if environment is None else environment)) as env:
         env.reset(seed=config.seed)
@@ -191,9 +190,6 @@ def evaluate_once(
 
     Returns:
         Rows of the episodes, or None if the policy's observation or action shape does not match the environment.
-
-    Raises:
-        InputError: If the stored file is damaged or cannot be written, or an argument is invalid.
     """
     compute = partial(
         evaluate_run, config, make_policy, environment, **{"label": name, "skips_incompatible": True, **kwargs}
@@ -211,10 +207,6 @@ def evaluate_trained(folder: RunFolder, config: RunConfig, episodes: int) -> pd.
 
     The episodes are stored in the run's folder, and read from there if they are stored already. They are simulated in
     as many processes as there are cores.
-
-    Raises:
-        InputError: If the run has no policy, a stored file is damaged or cannot be written, or `episodes` is not a
-            whole number of at least 1.
     """
     policy = Policy.load(folder.path)
     tables = []
@@ -304,16 +296,12 @@ def evaluate(
             or the environment records no poses to save. With `resample_offsets`, also if the task has no hidden offset,
             or an episode has the seed, and so the offset, of the run.
     """
-    save = None if save is None else Path(save)
-    _check_saved(save, signal)
-    if steps is not None:
-        check_new(Path(steps), "folder")
-    episodes, seed, processes = check_num_episodes(episodes), check_seed(seed), check_processes(processes)
-    options: dict[str, Any] = {
-        "episodes": episodes, "seed": seed, "processes": processes, "baselines": baselines, "save": save,
-        "signal": signal, "environment": environment or {}, "resample_offsets": resample_offsets,
-        "describe_differences": describe_differences, "steps": None if steps is None else Path(steps),
-    }  # fmt: skip
+    options = _Options(
+        check_num_episodes(episodes), check_seed(seed), check_processes(processes), baselines, environment or {},
+        resample_offsets, None if save is None else Path(save), signal, None if steps is None else Path(steps),
+        describe_differences,
+    )  # fmt: skip
+    options.check_files()
     envs: list[Any] = list(env) if isinstance(env, list | tuple) else [env]
     if not envs:
         raise InputError("a policy is evaluated in at least one environment: name a task")
@@ -329,22 +317,48 @@ def evaluate(
     if len(envs) > 1:
         return _evaluate_set(places, options)
     if subject.config is None or not subject.config.members:
-        return _evaluate_subject(subject, found, is_given, **options)
+        return _evaluate_subject(subject, found, is_given, options)
     configs = member_configs(subject.config)
     return _evaluate_set(
         {name: (replace(subject, config=config), None, False) for name, config in configs.items()}, options
     )
 
 
-def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: Mapping[str, Any]) -> Evaluation:
+@dataclass(frozen=True)
+class _Options:
+    """Arguments of `evaluate`."""
+
+    episodes: int
+    seed: int
+    processes: int
+    baselines: Mapping[str, MakePolicy] | Sequence[str] | None
+    environment: Mapping[str, Any]
+    resample_offsets: bool
+    save: Path | None
+    signal: str
+    steps: Path | None
+    describe_differences: Callable[[RunConfig], Sequence[str]] | None
+
+    def check_files(self) -> None:
+        """Raise an InputError if the step log or demonstrations cannot be written."""
+        if self.signal not in SIGNALS:
+            raise InputError(f"there is no signal {self.signal!r} to save: choose one of {', '.join(SIGNALS)}")
+        if self.save is not None:
+            if self.save.suffix not in ENDINGS:
+                raise InputError(f"{self.save} has the ending {self.save.suffix!r}: demonstrations are .npz or .csv")
+            check_new(self.save, "file")
+        if self.steps is not None:
+            check_new(self.steps, "folder")
+
+
+def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: _Options) -> Evaluation:
     """Evaluate a policy in each of several environments, and combine the results; see `evaluate`."""
-    if options["save"] is not None:
+    if options.save is not None:
         raise InputError("demonstrations are saved from one environment: evaluate in one, or leave save out")
-    steps = options["steps"]
-    results = {
-        name: _evaluate_subject(*place, **{**options, "label": name, "steps": None if steps is None else steps / name})
-        for name, place in places.items()
-    }
+    results = {}
+    for name, place in places.items():
+        steps = None if options.steps is None else options.steps / name
+        results[name] = _evaluate_subject(*place, replace(options, steps=steps), name)
     first = next(iter(results.values()))
     policies = [policy for policy in first.rows if all(policy in result.rows for result in results.values())]
     rows = {
@@ -369,29 +383,15 @@ def _evaluate_set(places: Mapping[str, tuple[Subject, Any, bool]], options: Mapp
     return Evaluation(result, rows, is_held_out=all(each.is_held_out for each in results.values()))
 
 
-def _evaluate_subject(
-    subject: Subject,
-    env: Any,
-    is_given: bool,
-    *,
-    episodes: int,
-    seed: int,
-    processes: int,
-    baselines: Mapping[str, MakePolicy] | Sequence[str] | None,
-    environment: Mapping[str, Any],
-    resample_offsets: bool,
-    save: Path | None,
-    signal: str,
-    describe_differences: Callable[[RunConfig], Sequence[str]] | None,
-    steps: Path | None,
-    label: str = "",
-) -> Evaluation:
+def _evaluate_subject(subject: Subject, env: Any, is_given: bool, options: _Options, label: str = "") -> Evaluation:
     """Evaluate a policy in one environment; see `evaluate`.
 
     `env` is the environment or the name of the task, None for a run. `is_given` is True if the caller closes it.
     `label` precedes the labels of the progress bars.
     """
-    config, folder = subject.config, subject.folder
+    config, folder, environment = subject.config, subject.folder, options.environment
+    episodes, seed, save, steps = options.episodes, options.seed, options.save, options.steps
+    resample_offsets, baselines = options.resample_offsets, options.baselines
     kwargs: dict[str, Any] = {"episodes": episodes, "seed": seed}
     if config is None:
         if environment or resample_offsets or save is not None:
@@ -445,9 +445,9 @@ def _evaluate_subject(
         for name in stored:
             print(f"{labels[name]}: evaluated before, and used again", file=sys.stderr, flush=True)
         evaluated, motions, started = dict(stored), [], time.monotonic()
-        collect = None if save is None else partial(_successful_motion, signal)
+        collect = None if save is None else partial(_successful_motion, options.signal)
         for name, rows, data in evaluate_policies(
-            evaluation_env, policies, labels=labels, processes=processes, collect=collect, steps=steps, **kwargs
+            evaluation_env, policies, labels=labels, processes=options.processes, collect=collect, steps=steps, **kwargs
         ):
             evaluated[name] = rows
             if name == POLICY:
@@ -463,8 +463,8 @@ def _evaluate_subject(
         result |= {"best_baseline": comparison.baseline, "p": comparison.p}
     if save is not None:
         result["saved"] = _save_demonstrations(motions, save)
-    if describe_differences is not None and config is not None:
-        result["differences"] = list(describe_differences(replace(config, environment=environment)))
+    if options.describe_differences is not None and config is not None:
+        result["differences"] = list(options.describe_differences(replace(config, environment=environment)))
     return Evaluation(result, rows_of, is_held_out=config is not None)
 
 
@@ -483,16 +483,6 @@ def check_num_episodes(episodes: object) -> int:
     if number < 1:
         raise InputError(f"an evaluation needs at least one episode, not {number}")
     return number
-
-
-def _check_saved(save: Path | None, signal: str) -> None:
-    """Raise an InputError if demonstrations cannot be saved."""
-    if signal not in SIGNALS:
-        raise InputError(f"there is no signal {signal!r} to save: choose one of {', '.join(SIGNALS)}")
-    if save is not None:
-        if save.suffix not in ENDINGS:
-            raise InputError(f"{save} has the ending {save.suffix!r}: demonstrations are .npz or .csv")
-        check_new(save, "file")
 
 
 def _episodes_file(

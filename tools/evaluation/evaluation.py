@@ -36,9 +36,6 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: i
     """Return the rows of a file; if it does not exist, compute and write them. An empty table is not written.
 
     With `episodes`, rows are also computed again if the file has another number of them.
-
-    Raises:
-        InputError: If the file is damaged or cannot be written.
     """
     if (stored := read_complete(file, episodes)) is not None:
         return stored
@@ -50,11 +47,7 @@ def load_or_compute(file: Path, compute: Callable[[], pd.DataFrame], episodes: i
 
 
 def read_complete(file: Path, episodes: int | None = None) -> pd.DataFrame | None:
-    """Return the rows of a table; None if it does not exist, or the number of rows is not `episodes`.
-
-    Raises:
-        InputError: If the table is damaged.
-    """
+    """Return the rows of a table; None if it does not exist, or the number of rows is not `episodes`."""
     rows = read_table(file) if file.exists() else None
     return None if rows is None or (episodes is not None and len(rows) != episodes) else rows
 
@@ -67,9 +60,6 @@ def episodes_file(
     The digest covers the task with its files, the options of the environment, the run's seed, package versions, and the
     arguments `kwargs` of `evaluate_policy` except `label` and `processes`. `about` is anything else that the episodes
     depend on, such as the digest of the policy.
-
-    Raises:
-        InputError: If `name` cannot be part of a file's name, or a file of the task cannot be read.
     """
     if not _can_name_file(name):
         raise InputError(

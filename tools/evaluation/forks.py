@@ -29,11 +29,7 @@ def num_cores() -> int:
 
 
 def check_processes(processes: int | None) -> int:
-    """Return `processes` as an int, or the number of cores for None.
-
-    Raises:
-        InputError: If `processes` is no whole number, or less than 1.
-    """
+    """Return `processes` as an int, or the number of cores for None."""
     if processes is None:
         return num_cores()
     processes = as_whole(processes, "the number of processes")

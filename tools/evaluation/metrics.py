@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ import numpy as np
 import pandas as pd
 import scipy  # `scipy.stats` is imported on first use
 
-from guiderail.diagrams.envs.trace import EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import QUASI_STATIC_TIME, EpisodeTrace, Metric, mean_jerk
+from guiderail.diagrams.envs.trace import TOLERANCE as TOLERANCE
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.arrays import as_whole, find_streak
 from guiderail.models.common.errors import InputError
@@ -24,51 +25,8 @@ from guiderail.models.common.registry import did_you_mean
 from guiderail.models.common.termination import Termination
 
 CONFIDENCE = 0.95  # level of all confidence intervals
-RESAMPLES = 1000  # number of bootstrap resamples
-MEAN_RESAMPLES = 20_000  # number of bootstrap resamples of an interquartile mean, which have few distinct values
-MAX_ENUMERATED = 6  # largest number of seeds for which all resamples are enumerated
-TRIMMED_FRACTION = 0.25  # fraction of the seeds that the interquartile mean drops at either end
 CONVERGED_SUCCESSES = 10  # consecutive successes that count as convergence
 REPORTS_SUCCESS = "reports_success"  # column of another package's environment: 1 if `info` has a success flag
-TOLERANCE = 1e-9  # largest constraint violation that counts as rounding of the primitive's solver [m or rad]
-
-
-def bootstrap_band(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper ends, (n,) each, of the 95 % interval of the mean of `values` (R, n) over R ≥ 2 runs."""
-    return _bootstrap(np.asarray(values, float), np.mean)
-
-
-def interquartile_mean(values: Sequence[float]) -> tuple[float, tuple[float, float] | None]:
-    """Return the mean of the values without the lowest and the highest quarter, and its 95 % interval.
-
-    With fewer than four values, none is dropped. The interval is None for a single value.
-    """
-    array = np.asarray(values, float)
-    mean = float(scipy.stats.trim_mean(array, TRIMMED_FRACTION))
-    if len(array) < 2:
-        return mean, None
-    if np.ptp(array) == 0:  # SciPy warns if there is nothing to resample
-        return mean, (mean, mean)
-    size = len(array)
-    if size <= MAX_ENUMERATED:  # the interval is exact
-        means = scipy.stats.trim_mean(array[np.indices((size,) * size).reshape(size, -1)], TRIMMED_FRACTION, axis=0)
-        low, high = np.quantile(means, [0.5 - 0.5 * CONFIDENCE, 0.5 + 0.5 * CONFIDENCE], method="inverted_cdf")
-    else:
-        trimmed = partial(scipy.stats.trim_mean, proportiontocut=TRIMMED_FRACTION)
-        low, high = _bootstrap(array, trimmed, MEAN_RESAMPLES)
-    return mean, (float(low), float(high))
-
-
-def _bootstrap(values: np.ndarray, statistic: Any, resamples: int = RESAMPLES) -> tuple[Any, Any]:
-    """Return the ends of the 95 % percentile interval of a statistic over the first axis, by resampling."""
-    if np.ptp(values, axis=0).max() == 0:  # SciPy warns if there is nothing to resample
-        mean = statistic(values, axis=0)
-        return mean, mean
-    interval = scipy.stats.bootstrap(
-        (values,), statistic, axis=0, vectorized=True, confidence_level=CONFIDENCE, n_resamples=resamples,
-        method="percentile", rng=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
-    return interval.low, interval.high
 
 
 def wilson(successes: int, episodes: int) -> tuple[float, float]:
@@ -79,35 +37,6 @@ def wilson(successes: int, episodes: int) -> tuple[float, float]:
     """
     interval = scipy.stats.binomtest(int(successes), int(episodes)).proportion_ci(CONFIDENCE, method="wilson")
     return float(interval.low), float(interval.high)
-
-
-def survival(converged: Sequence[int | None], episodes: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Estimate the fraction of runs that have not converged, by the Kaplan-Meier estimator.
-
-    A run that never converged is censored ten episodes before its end: ten successes that begin later would not fit.
-
-    Args:
-        converged: Episodes to convergence of each run; None for a run that never converged.
-        episodes: Number of episodes of each run.
-
-    Returns:
-        Numbers of episodes in order, beginning with 0, and the fraction from each of them on, (k,) each.
-    """
-    uncensored = [after for after in converged if after is not None]
-    censored = [max(n - CONVERGED_SUCCESSES, 0) for after, n in zip(converged, episodes, strict=True) if after is None]
-    if not uncensored:
-        return np.array([0.0]), np.array([1.0])
-    function = scipy.stats.ecdf(scipy.stats.CensoredData(uncensored=uncensored, right=censored)).sf
-    return np.append(0.0, function.quantiles), np.append(1.0, function.probabilities)
-
-
-def median_survival(steps: np.ndarray, fractions: np.ndarray) -> float | None:
-    """Return the number of episodes after which half of the runs have converged; None if fewer than half do.
-
-    The arguments are the results of `survival`, (k,) each.
-    """
-    reached = steps[fractions < 0.5 + 1e-9]  # the estimator's products round a half to slightly more
-    return float(reached[0]) if len(reached) else None
 
 
 @dataclass(frozen=True)
@@ -193,6 +122,12 @@ COLUMNS = (
         "largest contact force of any control step, low-pass filtered (10 ms)",
         _statistic("peak_contact_force"),
     ),
+    Metric(
+        "quasi_static_force",
+        "N",
+        f"largest contact force that lasts {QUASI_STATIC_TIME:g} s",
+        _statistic("quasi_static_force"),
+    ),
     Metric("mean_force", "N", "force as in peak_force, mean over control steps", _statistic("mean_force")),
     Metric("mean_squared_force", "N²", "squared contact force, mean over control steps", _squared_force),
     *(
@@ -203,6 +138,7 @@ COLUMNS = (
     *_violations(_statistic),
     Metric("collisions", "", f"collisions that began, of any duration ({COLLISION})", _count("collisions")),
     Metric("collision_steps", STEPS, "control steps in collision", _count("collision_steps")),
+    Metric("cost", STEPS, "control steps with a violated constraint or in collision", _count("cost")),
     Metric("saturated_steps", STEPS, "control steps with the controller at a limit", _count("saturated_steps")),
     Metric(
         "fallback_steps",
@@ -228,9 +164,6 @@ def outside_row(index: int, total: float, infos: Sequence[Mapping[str, Any]], *,
     `peak_contact_force`; without an impedance, `peak_force` is the largest `contact_force`. `steps` is the last
     `control_steps`, which `GuidedEnv` counts, or the number of actions if `info` does not have it. `is_terminated` is
     False if the episode was truncated.
-
-    Raises:
-        InputError: If `control_steps` is no whole number.
     """
     success = any(bool(info.get("is_success", info.get("success", False))) for info in infos)
     row = {
@@ -265,16 +198,11 @@ def reports_success(rows: pd.DataFrame) -> bool:
 # Columns of text; `fault` exists on hardware only, and `environment` in runs over a set of environments.
 WORDS = ("termination", "fault", "environment")
 # Columns of whole numbers.
-COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "saturated_steps", "fallback_steps")
+COUNTS = ("episode", "success", "steps", "collisions", "collision_steps", "cost", "saturated_steps", "fallback_steps")
 
 
 def check_rows(rows: pd.DataFrame, source: Path) -> pd.DataFrame:
-    """Return a table of episodes unchanged; `source` is its file, for the message.
-
-    Raises:
-        InputError: If a column other than `WORDS` has text, a column of `COUNTS` has a number that is not whole, or
-            `success` has a number other than 0 and 1.
-    """
+    """Return a table of episodes unchanged; `source` is its file, for the message."""
     text = [name for name in rows if name not in WORDS and not pd.api.types.is_numeric_dtype(rows[name])]
     fractional = [name for name in COUNTS if name in rows and name not in text and not (rows[name] % 1 == 0).all()]
     wrong = [*(text if len(rows) else ()), *fractional]
@@ -402,9 +330,6 @@ def summary(rows: pd.DataFrame, names: Iterable[str], prefix: str = "", task: st
     """Return statistics of episodes by name, with a prefix; each is None if there are no episodes.
 
     With a task, its own statistics may be named too.
-
-    Raises:
-        InputError: If a statistic is unknown, or the episodes lack a column that a statistic is computed from.
     """
     known = statistics_of(task) if task else STATISTICS
     statistics: dict[str, Any] = {}

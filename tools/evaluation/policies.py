@@ -12,23 +12,18 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from copy import deepcopy
 from importlib import import_module
-from itertools import islice, product
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief, naming_failures, require_extra
 from guiderail.models.common.files import read_bytes
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.policy import MAX_WEIGHTS_SIZE, Policy
-from guiderail.tools.environments import beyond_defaults, changed_environment, make_environment
 from guiderail.tools.evaluation.episode import Callback, PolicyFn, as_action
 from guiderail.tools.imports import import_modules, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
@@ -88,12 +83,7 @@ class ForeignPolicy(Callback):
         self._act, self._name = act, name
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action for an observation.
-
-        Raises:
-            InputError: If the observation has another shape than the policy takes, or the function raised an exception
-                or called `sys.exit`.
-        """
+        """Return the action for an observation."""
         if self.observation_shape is not None and self.observation_shape != np.shape(observation):
             raise InputError(f"the policy takes observations {self.observation_shape}, not {np.shape(observation)}")
         try:
@@ -240,9 +230,6 @@ def as_policy(given: Any) -> PolicyFn:
     """Convert a function or an object with a `predict` method to a policy whose errors name the policy.
 
     A policy of this package, or a callable `Callback`, is returned unchanged.
-
-    Raises:
-        InputError: If `given` is neither.
     """
     if isinstance(given, type) and (hasattr(given, "predict") or "__call__" in vars(given)):
         raise InputError(f"{given.__name__} is a class: give a policy, such as {given.__name__}()")
@@ -271,10 +258,6 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
             (.pt, .ts, .torchscript); or `module:function`, where `module` is a module's name or a file (.py), and
             `function` is any policy that `as_policy` takes, or a class of such policies.
         trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
-
-    Raises:
-        InputError: If the file or function is missing, the file is damaged, it can execute code and is not trusted, or
-            its package is not installed.
     """
     if (function := function_of(str(source))) is not None:
         return _load_function(*function)
@@ -409,25 +392,58 @@ def _load_onnx(path: Path) -> PolicyFn:
     return ForeignPolicy(act, observation_shape=observation_shape if is_known else None, name=path.name)
 
 
+_MAX_DIFFERENCES = 5  # largest number of options that a message names
+
+
 def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None = None) -> PolicyFn:
-    """Return `as_policy(policy)` if its observation and action shapes match an environment.
+    """Return `as_policy(policy)` if its observations and actions have the layout of an environment's.
 
-    `learned_in` are the options of the environment in training; the error message names those that differ.
-
-    Raises:
-        InputError: If the shape of the policy's observations or actions differs from the environment's, a model's
-            action space has other bounds, or the policy raises an exception.
+    `learned_in` are the options of the environment in training; the error message names those that differ. A model's
+    action space must also have the bounds of the environment's.
     """
     policy = as_policy(policy)
-    raised: Exception | None = None
+    taken, returned = _declared_layout(policy)
     try:
-        is_same = has_same_shapes(policy, env)
+        if has_same_shapes(policy, env):
+            _check_bounds(policy, env)
+            return policy
     except (IndexError, TypeError, ValueError) as error:
-        is_same, raised = False, error
-    if is_same:
-        _check_bounds(policy, env)
-        return policy
-    raise InputError(_describe_mismatch(policy, env, learned_in, raised)) from raised
+        if taken in (None, describe_space(env.observation_space)):
+            raise error if isinstance(error, InputError) else InputError(f"the policy failed: {error}") from error
+    expected = describe_space(env.action_space)
+    if taken in (None, describe_space(env.observation_space)):
+        taken, hint = describe_space(env.observation_space), f": it must return an action {expected}"
+    else:
+        hint = ": give another policy"
+    task = getattr(getattr(env.unwrapped, "diagram", None), "task", None)  # None for an environment of another origin
+    options = {} if task is None else task.config.options
+    changed = [
+        f"{name}={brief(value)} instead of {brief(options[name])}"
+        for name, value in (learned_in or {}).items()
+        if name in options and options[name] != value
+    ][:_MAX_DIFFERENCES]
+    if changed:
+        hint = f"; it learned with {', '.join(changed)}: change --env"
+    raise InputError(
+        f"the policy takes observations {taken} and returns actions {returned or 'of another shape'}, and this "
+        f"environment has observations {describe_space(env.observation_space)} and actions {expected}{hint}"
+    )
+
+
+def _declared_layout(policy: PolicyFn) -> tuple[str | None, str | None]:
+    """Return the observations and actions that a policy declares, as `describe_space`; None if unknown."""
+    if isinstance(policy, Policy):
+        size = len(policy.description["action_low"])
+        return str(tuple(policy.description["observation_shape"])), str((size,))
+    pairs = (
+        (getattr(policy, f"{kind}_space", None), getattr(policy, f"{kind}_shape", None))
+        for kind in ("observation", "action")
+    )
+    taken, returned = (
+        (None if shape is None else str(tuple(shape))) if space is None else describe_space(space)
+        for space, shape in pairs
+    )
+    return taken, returned
 
 
 def _check_bounds(policy: PolicyFn, env: gymnasium.Env) -> None:
@@ -443,147 +459,10 @@ def _check_bounds(policy: PolicyFn, env: gymnasium.Env) -> None:
         )
 
 
-_MAX_DIFFERENCES = 5  # largest number of options that a message names
-
-
-def _describe_mismatch(
-    policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[str, Any] | None, raised: Exception | None
-) -> str:
-    """Return a sentence with the shapes of policy and environment, and the options that differ or would fit.
-
-    `raised` is the policy's exception for this environment's observations. If the shapes match anyway, or the policy
-    fails for all flat observations too, the sentence is the message of `raised`.
-    """
-    if isinstance(policy, ForeignPolicy) and _are_composite(policy, env):
-        if raised is not None:
-            return str(raised)
-        own, other = (
-            f"observations {_describe(source.observation_space)} and {verb}actions {_describe(source.action_space)}"
-            for source, verb in ((policy, "returns "), (env, ""))
-        )
-        return f"the policy takes {own}, and this environment has {other}: give another policy"
-    observation_shape, action_shape = shapes(policy, env)
-    expected = env.action_space.shape
-    if isinstance(raised, InputError):
-        if (observation_shape, action_shape) == (env.observation_space.shape, expected):
-            return str(raised)
-        if observation_shape in (None, env.observation_space.shape) and not _flat_shapes(policy):
-            return f"{raised}, for observations of shape {env.observation_space.shape}"
-    takes = "cannot take these observations" if observation_shape is None else f"takes observations {observation_shape}"
-    returns = "" if action_shape is None else f" and returns actions {action_shape}"
-    declaration = getattr(getattr(env.unwrapped, "diagram", None), "task", None)
-    config = getattr(declaration, "config", None)  # None for an environment of another origin
-    task, options = ("", {}) if config is None else (config.task, config.options)
-    changed = [
-        f"{name}={brief(value)} instead of {brief(options[name])}"
-        for name, value in (learned_in or {}).items()
-        if name in options and options[name] != value
-    ][:_MAX_DIFFERENCES]
-    if changed:
-        hint = f"; it learned with {', '.join(changed)}: change --env"
-    elif task and (fitting := fitting_options(task, options, policy)):
-        hint = f"; it fits with {' or '.join(f'--env {changes}' for changes in fitting)}"
-    elif observation_shape == env.observation_space.shape and action_shape not in (None, expected):
-        hint = f": it must return {f'an array of shape {expected}' if expected else 'one number'}"
-    else:
-        hint = f", and no options of {task} fit it: give another policy" if task else ": give another policy"
-    return (
-        f"the policy {takes}{returns}, and this environment has observations {env.observation_space.shape} and actions "
-        f"{env.action_space.shape}{hint}"
-    )
-
-
-def _are_composite(policy: ForeignPolicy, env: gymnasium.Env) -> bool:
-    """Return True if shapes do not describe the difference of a policy's spaces from an environment's."""
-    box = gymnasium.spaces.Box
-    given = [space for space in (policy.observation_space, policy.action_space) if space is not None]
-    return not all(isinstance(space, box) for space in (*given, env.observation_space, env.action_space))
-
-
-def _describe(space: Any) -> str:
-    return "of unknown shape" if space is None else describe_space(space)
-
-
-def shapes(policy: PolicyFn, env: gymnasium.Env) -> tuple[tuple[int, ...] | None, tuple[int, ...] | None]:
-    """Return the shapes of a policy's observation and action; None if a shape is unknown.
-
-    If a policy declares no shape and fails for the environment's observations, it is called with flat observations of
-    all sizes up to `_MAX_SIZE`. The shapes are known if the policy takes exactly one size, as a network does.
-    """
-    if isinstance(policy, Policy):
-        return tuple(policy.description["observation_shape"]), (len(policy.description["action_low"]),)
-    given, action_shape = (getattr(policy, f"{kind}_shape", None) for kind in ("observation", "action"))
-    observation_shape = given or env.observation_space.shape or ()
-    if action_shape is None:
-        try:
-            action_shape = np.shape(policy(np.zeros(observation_shape, np.float32)))
-        except (IndexError, TypeError, ValueError):
-            found = _flat_shapes(policy) if given is None else []
-            return found[0] if len(found) == 1 else (given, None)
-    return observation_shape, action_shape
-
-
-_MAX_SIZE = 256  # largest size of a flat observation that is tried
-
-
-def _flat_shapes(policy: PolicyFn) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Return the first flat observation shapes that a policy takes, at most two, with its actions' shapes."""
-    found: list[tuple[tuple[int, ...], tuple[int, ...]]] = []
-    for size in range(1, _MAX_SIZE + 1):
-        with suppress(Exception):  # code of others can raise any exception
-            found.append(((size,), np.shape(policy(np.zeros(size, np.float32)))))
-        if len(found) > 1:
-            break
-    return found
-
-
-_MAX_FITTING = 2  # largest number of combinations that a message names
-
-
-def fitting_options(task: str, options: Mapping[str, Any], policy: PolicyFn) -> list[str]:
-    """Return changes of a task's `options` with which a policy is compatible, as command-line text, smallest first.
-
-    Guidance, observation and difficulty are varied, because they determine the sizes of observation and action. At most
-    `_MAX_FITTING` changes are returned.
-    """
-    kind = TASKS.get(task)
-    values = {
-        "guidance": possible_guidance(kind.provides()),
-        "observation": list(kind.observations),
-        "difficulty": list(kind.difficulties),
-    }
-    candidates = [
-        {name: value for name, value in zip(values, combination, strict=True) if value != options.get(name)}
-        for combination in product(*values.values())
-    ]
-    fitting = (changes for changes in sorted(candidates, key=len) if changes and _fits(policy, task, options, changes))
-    texts = (" --env ".join(f"{name}={value}" for name, value in changes.items()) for changes in fitting)
-    return list(islice(texts, _MAX_FITTING))
-
-
-def _fits(policy: PolicyFn, task: str, options: Mapping[str, Any], changes: Mapping[str, Any]) -> bool:
-    try:
-        given = beyond_defaults(task, options)  # without defaults, because guidance kinds have different options
-        env = make_environment(task, changed_environment(task, given, changes))
-    except InputError:
-        return False
-    try:
-        return is_compatible(lambda env: policy, env)
-    finally:
-        env.close()
-
-
 def is_compatible(make_policy: Callable[[gymnasium.Env], PolicyFn], env: gymnasium.Env) -> bool:
-    """Return True if a policy's observations and actions have the layout of the environment's; see `has_same_shapes`.
-
-    Raises:
-        InputError: If `make_policy` returns no function.
-    """
-    act = make_policy(env)
-    if not callable(act):
-        raise InputError(f"a function that makes a policy for an environment must return a policy, not {brief(act)}")
+    """Return True if a policy's observations and actions have the layout of the environment's."""
     try:
-        return has_same_shapes(act, env)
+        return has_same_shapes(make_policy(env), env)
     except (IndexError, TypeError, ValueError):
         return False
 

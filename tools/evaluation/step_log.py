@@ -74,11 +74,7 @@ class StepLog(EnvCallback):
             self._disagreements += [self._disagreement(transition.observation)] * number
 
     def on_episode_end(self, row: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Write the episode's control steps; add no column to its row.
-
-        Raises:
-            InputError: If the file cannot be written.
-        """
+        """Write the episode's control steps; add no column to its row."""
         start_time = time.perf_counter()
         steps = table(self.base.trace, row["episode"])
         if self._disagreement is not None:
@@ -142,12 +138,7 @@ def write_step_log(path: Path, rows: pa.Table) -> None:
 
 
 def read_step_log(folder: Path) -> pd.DataFrame:
-    """Return the control steps of all episodes in a run's `steps/`, in order.
-
-    Raises:
-        InputError: If there is no step log, it has more than `guiderail.tools.tables.MAX_ROWS` rows, or a
-            file is damaged.
-    """
+    """Return the control steps of all episodes in a run's `steps/`, in order."""
     files = sorted(folder.glob("episode-*.parquet"))
     if not files:
         raise InputError(f"{folder} has no step log: the run was trained without a step log")

@@ -19,7 +19,7 @@ from guiderail.models.common.transforms import POSE_SIZE, RigidTransform, pose_t
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.laws.law import Command, Law, check_law, safe_command
 from guiderail.models.laws.primitive import PrimitiveLaw, Request, predict
-from guiderail.models.laws.template import TemplateLaw
+from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, phases_of_steps
 from guiderail.models.primitives.fit import LONG, MIN_DEMONSTRATIONS, Selection, fit
@@ -139,12 +139,7 @@ class _FittedSegment:
             self.primitive_for(self.as_linear(segment.constraints))  # refuses invalid constraints before an episode
 
     def as_linear(self, constraints: Any) -> LinearConstraints:
-        """Return the linear constraints of a segment; demonstrated bounds become a box for each step.
-
-        Raises:
-            InputError: If the value is no constraint, does not fit the reference, or has limits of the motion that
-                residual guidance does not enforce.
-        """
+        """Return the linear constraints of a segment; demonstrated bounds become a box for each step."""
         if constraints is None:
             return LinearConstraints.none(self.num_outputs)
         if isinstance(constraints, DemonstratedBounds):
@@ -154,8 +149,6 @@ class _FittedSegment:
             if "residual" in self.guidance:
                 constraints.refuse_limits()
             constraints = constraints.linear
-        if not isinstance(constraints, LinearConstraints):
-            raise InputError(f"constraints of a segment are LinearConstraints or bounds, not {brief(constraints)}")
         constraints.check_sizes(self.num_outputs, self.num_steps)
         return constraints
 
@@ -188,11 +181,7 @@ class _FittedSegment:
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """Settings of guidance by demonstrations.
-
-    Raises:
-        InputError: If `history` is not a whole number of at least 1; `PrimitiveGuide` checks the other settings.
-    """
+    """Settings of guidance by demonstrations."""
 
     # κ; a constant action of ±1 displaces the motion by about √3 κ standard deviations of the demonstrations.
     action_scale: float = 1.0
@@ -202,11 +191,6 @@ class GuideSettings:
     horizon: int = HORIZON  # H, number of future points at which the constraints are satisfied
     # Representation of the last three of six outputs; None: by the demonstrations' names, otherwise "rotation_vector".
     orientation: Orientation | None = None
-
-    def __post_init__(self) -> None:
-        if not is_whole(self.history, 1):
-            raise InputError(f"history is a number of outputs, at least 1, not {brief(self.history)}")
-        object.__setattr__(self, "history", int(self.history))
 
 
 class PrimitiveGuide(Guide):
@@ -218,10 +202,6 @@ class PrimitiveGuide(Guide):
             (moved to the nearest point within the linear constraints).
         settings: Settings.
         period: Control period [s]; required for `MotionConstraints`, and unless every segment has `num_steps`.
-
-    Raises:
-        InputError: If an argument is out of range, a segment has fewer than three demonstrations, or segments have
-            different outputs.
     """
 
     def __init__(
@@ -231,6 +211,8 @@ class PrimitiveGuide(Guide):
             raise InputError(f"there is no guidance {brief(guidance)}: {did_you_mean(guidance, GUIDANCE)}")
         if not segments:
             raise InputError("guidance by demonstrations needs at least one segment")
+        if settings.history < 1:
+            raise InputError(f"history is a number of outputs, at least 1, not {settings.history}")
         for index, segment in enumerate(segments):
             if (number := segment.recorded.num_demonstrations) < MIN_DEMONSTRATIONS:
                 raise InputError(
@@ -252,11 +234,7 @@ class PrimitiveGuide(Guide):
         self.num_steps = sum(fitted.num_steps + fitted.segment.dwell for fitted in self.segments)
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin the first segment.
-
-        Raises:
-            InputError: If a frame or constraints are invalid, or `MotionConstraints` have no period.
-        """
+        """Begin the first segment."""
         self._recent = [np.array(pose, dtype=float)]
         self._is_ended = False
         self._begin_segment(0, env, observation)
@@ -356,8 +334,7 @@ def _checked_dims(action_dims: Sequence[int] | None, num_outputs: int) -> list[i
     """Return the indices of the outputs that an action moves; raise an InputError unless they are distinct indices."""
     if action_dims is None:
         return list(range(num_outputs))
-    is_list = isinstance(action_dims, Sequence | np.ndarray) and np.ndim(action_dims) == 1
-    dims = list(action_dims) if is_list else [-1]
+    dims = list(action_dims)
     if len(set(dims)) < len(dims) or not all(is_whole(o, 0) and o < num_outputs for o in dims):
         raise InputError(
             f"action_dims are distinct indices of the outputs, from 0 to {num_outputs - 1}, not {brief(action_dims)}"
@@ -393,10 +370,6 @@ class TemplateGuide(Guide):
             `RigidTransform` of `guiderail.models.common.transforms` or of Drake.
         period: Control period [s], positive.
         extra: Value for `to_action`, or (name of the state) → value.
-
-    Raises:
-        InputError: If the period is missing or not positive, active constraints of a state contradict each other, or a
-            state limits force or torque.
     """
 
     num_outputs = POSE_SIZE
@@ -418,21 +391,11 @@ class TemplateGuide(Guide):
         self.num_actions = template.inputs
 
     def reset(self, env: Any, observation: Any, pose: np.ndarray) -> None:
-        """Begin in the template's state for the measured pose.
-
-        Raises:
-            InputError: If the pose of an object is missing or no transform, a pose is not finite, or the measured pose
-                is more than 0.2 m or 1 rad outside of the active constraints.
-        """
+        """Begin in the template's state for the measured pose."""
         frames = self._frames_of(env, observation)
-        if not isinstance(frames, Mapping):
-            raise InputError(f"the frames of a template are poses by name, not {brief(frames)}")
         missing = [name for name in self.template.frames if name not in frames]
         if missing:
             raise InputError(f"the template {self.template.name} needs the frame {missing[0]}: give its pose")
-        for name, X_WF in frames.items():
-            if not (hasattr(X_WF, "rotation") and hasattr(X_WF, "translation")):
-                raise InputError(f"the frame {name} is a RigidTransform, as of Drake, not {brief(X_WF)}")
         self._frames = {name: RigidTransform(X_WF) for name, X_WF in frames.items()}
         self._begin(TemplateLaw(self.template, self._frames, self._period), pose)
         self._now = self._state
@@ -463,9 +426,6 @@ class LawGuide(Guide):
 
     Args:
         law: Law.
-
-    Raises:
-        InputError: If `law` is not a law.
     """
 
     def __init__(self, law: Law):

@@ -1,6 +1,7 @@
 """Checkpoint files, which contain no code and resume a run bit for bit; selection of the exported actor."""
 
 import json
+import random
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import reduce
@@ -107,11 +108,7 @@ def save_checkpoint(path: Path, arrays: Mapping[str, np.ndarray], values: Mappin
 
 
 def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read the arrays and values that `save_checkpoint` wrote.
-
-    Raises:
-        InputError: If the file is missing, truncated or changed.
-    """
+    """Read the arrays and values that `save_checkpoint` wrote."""
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}: train again in another folder")
     try:
@@ -129,22 +126,80 @@ def load_checkpoint(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def load_off_policy(run: str) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return the state of a run's off-policy learner; without the last episode if the learner was pipelined.
-
-    Raises:
-        InputError: If the run has no checkpoint, or its learner is not off-policy.
-    """
+    """Return the state of a run's off-policy learner; without the last episode if the learner was pipelined."""
     from guiderail.tools.learning.run_folder import RunFolder  # imports pandas, which the learners do not need
 
     file = RunFolder(Path(run)).checkpoint
     if not file.is_file():
         raise InputError(f"init_from names {run}, which has no checkpoint: name the folder of a trained run")
     arrays, stored = load_checkpoint(file)
-    values = stored["learner"]
+    arrays, values = {k: v for k, v in arrays.items() if not k.startswith("episodes/")}, stored["learner"]
     if "acting" in values:  # pipelined; only the acting process counts the episodes
         arrays, values = entries_of(arrays, "learning"), values["learning"] | {"episodes": values["acting"]["episodes"]}
-    elif "learner" in values:  # with parallel actors
-        arrays, values = entries_of(arrays, "learner"), values["learner"]
     if "exploration" not in values:
         raise InputError(f"init_from names {run}, whose learner is not off-policy: name a run of the same algorithm")
     return arrays, values
+
+
+def module_arrays(
+    modules: Mapping[str, torch.nn.Module], optimizers: Mapping[str, torch.optim.Optimizer]
+) -> dict[str, np.ndarray]:
+    """Return the parameters and buffers of modules and the moments of optimizers as arrays by name."""
+    arrays: dict[str, np.ndarray] = {}
+    for name, module in modules.items():
+        arrays |= {f"{name}/{key}": value.cpu().numpy() for key, value in module.state_dict().items()}
+    for name, optimizer in optimizers.items():
+        for index, moments in optimizer.state_dict()["state"].items():
+            arrays |= {f"optimizer/{name}/{index}/{key}": value.cpu().numpy() for key, value in moments.items()}
+    return arrays
+
+
+def restore_modules(
+    arrays: Mapping[str, Any],
+    modules: Mapping[str, torch.nn.Module],
+    optimizers: Mapping[str, torch.optim.Optimizer],
+) -> None:
+    """Restore modules and optimizers from a result of `module_arrays`; the moments of optimizers must be tensors."""
+    for name, module in modules.items():
+        load_module(module, entries_of(arrays, name))
+    for name, optimizer in optimizers.items():
+        moments: dict[int, dict[str, torch.Tensor]] = {}
+        for key, value in entries_of(arrays, f"optimizer/{name}").items():
+            index, moment = key.split("/")
+            moments.setdefault(int(index), {})[moment] = value
+        optimizer.load_state_dict({"state": moments, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def load_module(module: torch.nn.Module, arrays: Mapping[str, Any]) -> None:
+    """Set the parameters and buffers of a module from arrays or tensors by name.
+
+    Each array is reshaped to the module's shape, because safetensors stores 0-d arrays, such as step counters, as 1-d.
+    """
+    shapes = {name: value.shape for name, value in module.state_dict().items()}
+    tensors = {name: torch.as_tensor(value) for name, value in arrays.items()}
+    module.load_state_dict({name: value.reshape(shapes.get(name, value.shape)) for name, value in tensors.items()})
+
+
+def random_state() -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return the states of the global random generators, which Stable-Baselines3 samples from.
+
+    Returns:
+        Arrays by name, and JSON-serializable values.
+    """
+    kind, keys, *rest = np.random.get_state(legacy=True)  # noqa: NPY002 (Stable-Baselines3 samples from it)
+    arrays = {"random/torch": torch.get_rng_state().numpy(), "random/numpy": np.asarray(keys)}
+    if torch.cuda.is_initialized():  # so that a resumed run samples the same numbers
+        arrays["random/cuda"] = torch.cuda.get_rng_state().numpy()
+    version, state, gauss = random.getstate()
+    return arrays, {"numpy": [kind, *rest], "python": [version, list(state), gauss]}
+
+
+def restore_random(arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+    """Set the global random generators to the states that `random_state` returned."""
+    torch.set_rng_state(torch.from_numpy(np.array(arrays["random/torch"])))
+    if "random/cuda" in arrays:
+        torch.cuda.set_rng_state(torch.from_numpy(np.array(arrays["random/cuda"])))
+    kind, *rest = values["numpy"]
+    np.random.set_state((kind, arrays["random/numpy"], *rest))  # noqa: NPY002
+    version, state, gauss = values["python"]
+    random.setstate((version, tuple(state), gauss))

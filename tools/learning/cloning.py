@@ -13,11 +13,10 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.checkpoint import entries_of
-from guiderail.tools.learning.config import BcConfig
+from guiderail.tools.learning.checkpoint import entries_of, load_module
 from guiderail.tools.learning.learner import Learner, register_learner
+from guiderail.tools.learning.learner_config import BcConfig
 from guiderail.tools.learning.networks import export_layers
-from guiderail.tools.learning.sb3 import load_module
 
 
 @register_learner("bc")
@@ -98,11 +97,7 @@ class BcLearner(Learner):
         return {"train/loss": loss} if np.isfinite(loss) else {}
 
     def policy(self, description: Mapping[str, Any]) -> Policy:
-        """Return the cloned policy; the entries of `description` are added to the policy's description.
-
-        Raises:
-            InputError: If there were fewer demonstrations than `demonstration_episodes`.
-        """
+        """Return the cloned policy; the entries of `description` are added to the policy's description."""
         self._check_trained()
         return export_layers([*self.network], self._space, {"squash": "clip", **description})
 

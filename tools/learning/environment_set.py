@@ -38,11 +38,7 @@ class EnvironmentSet(gymnasium.Env):
     metadata = {"render_modes": []}  # noqa: RUF012 (Gymnasium's own convention)
 
     def __init__(self, members: Mapping[str, gymnasium.Env], seed: int):
-        """Construct the set from environments by name, at least one; `close` closes them.
-
-        Raises:
-            InputError: If the environments differ in their observations, actions or reward terms.
-        """
+        """Construct the set from environments by name, at least one; `close` closes them."""
         self.members, self.current, self._seed = dict(members), next(iter(members)), seed
         first = self.members[self.current]
         self.observation_space, self.action_space = first.observation_space, first.action_space
@@ -130,7 +126,7 @@ class TrainedSet:
 def make_run_environment(config: RunConfig) -> gymnasium.Env:
     """Make the environment of a run, or the set of its environments."""
     if not config.members:
-        return make_environment(config.task, config.environment)
+        return make_environment(config.task, config.resolved)
     envs: dict[str, gymnasium.Env] = {}
     try:
         for member in config.members:
@@ -149,11 +145,7 @@ def select_environment(env: gymnasium.Env, index: int) -> str | None:
 
 
 def trained_set(env: EnvironmentSet, config: RunConfig) -> TrainedSet:
-    """Return the properties of a set that training uses.
-
-    Raises:
-        InputError: As `trained_task`, for one of the environments.
-    """
+    """Return the properties of a set that training uses."""
     tasks = {member.name: trained_task(env.members[member.name], member.task) for member in config.members}
     repeats = {name: getattr(each.unwrapped, "action_repeat", 1) for name, each in env.members.items()}
     actions = max(-(-task.num_steps // repeats[name]) for name, task in tasks.items())
@@ -194,9 +186,6 @@ def load_variants(source: Variants | Path | str | None) -> Variants:
     """Return variants, or those of a YAML file; none for None.
 
     The paths of task folders in a file are relative to the file.
-
-    Raises:
-        InputError: If the file cannot be read, or a name or a variant is invalid.
     """
     if source is None:
         return {}
@@ -230,10 +219,6 @@ def find_members(
         environment: Options of all environments.
         variants: Variants by name; empty for the tasks alone.
         imports: Modules and files that register tasks, as `import_modules` returns them.
-
-    Raises:
-        InputError: If two environments have the same name, a task is unknown or an option is invalid, or the
-            environments have different guidance.
     """
     members: list[SetMember] = []
     folders: dict[str, None] = {}

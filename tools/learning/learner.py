@@ -8,11 +8,9 @@ of the group `guiderail`.
 from __future__ import annotations
 
 import hashlib
-import inspect
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from numbers import Real
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -22,7 +20,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 from pydantic.dataclasses import dataclass, is_pydantic_dataclass
 
 from guiderail.models.common.errors import InputError, brief, require_extra
-from guiderail.models.common.registry import Registry, check_callable, did_you_mean
+from guiderail.models.common.registry import Registry, did_you_mean
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Callback, has_image
 
@@ -157,24 +155,12 @@ class Learner(Callback, ABC):
 
 
 def _check_learner(name: str, learner: Any) -> None:
-    """Raise an InputError if a learner's name is invalid, or the learner is incomplete."""
+    """Raise an InputError if a learner's name cannot name a file, or the learner has no class of settings."""
     if not re.fullmatch(r"\w[\w.-]*", name):
         raise InputError(f"the name of a learner has letters, digits, '_', '-' and '.', unlike {brief(name)}")
-    check_callable(name, learner)
     config = getattr(learner, "Config", None)
-    if hasattr(learner, "Config") and not (
-        isinstance(config, type) and issubclass(config, LearnerConfig) and is_pydantic_dataclass(config)
-    ):
+    if not (isinstance(config, type) and issubclass(config, LearnerConfig) and is_pydantic_dataclass(config)):
         raise InputError(f"Config of {name} must be a pydantic dataclass based on LearnerConfig, not {brief(config)}")
-    if not inspect.isclass(learner):
-        if config is None:
-            raise InputError(f"the learner {name} has no Config: see `Learner`")
-        return
-    missing = sorted(getattr(learner, "__abstractmethods__", ()))
-    missing += [] if hasattr(learner, "Config") else ["Config"]
-    missing += [] if any("__init__" in vars(kind) for kind in learner.__mro__[:-1]) else ["__init__"]
-    if missing:
-        raise InputError(f"the learner {learner.__name__} has no {', '.join(missing)}: see `Learner`")
 
 
 # An entry is a class derived from `Learner`, or a callable with the same arguments and an attribute `Config`. PyTorch
@@ -201,9 +187,6 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
     """Return the keyword arguments of a learner for the `RunConfig` and the task of a run.
 
     If a supervisor or via-points correct the demonstrations, the symmetry is None.
-
-    Raises:
-        InputError: If observations have images, and the learner does not accept images.
     """
     if not config.learner.takes_images and has_image(task.observation_space):
         name = config.learner.algorithm
@@ -220,8 +203,6 @@ def learner_arguments(config: Any, task: Any) -> dict[str, Any]:
 
 def check_log_formats(formats: str | Sequence[str]) -> tuple[str, ...]:
     """Return the names of log formats; raise an InputError if one is unknown, or its package is not installed."""
-    if not isinstance(formats, Iterable):
-        raise InputError(f"log is a format or a list of formats, not {brief(formats)}")
     names = (formats,) if isinstance(formats, str) else tuple(formats)
     for name in names:
         if name not in LOG_FORMATS:
@@ -239,11 +220,7 @@ class LearningLog:
     """
 
     def __init__(self, folder: Path, formats: str | Sequence[str] = ()):
-        """Construct the log, which opens files in `folder` at the first entry.
-
-        Raises:
-            InputError: If a format is unknown, or its package is not installed.
-        """
+        """Construct the log, which opens files in `folder` at the first entry."""
         self._folder, self._formats = folder, check_log_formats(formats)
         self._logger: Any = None
 
@@ -265,7 +242,7 @@ class LearningLog:
             return
         row = rows[-1]
         entry = {} if is_finished else {name: row[column] for column, name in LOGGED_COLUMNS.items() if column in row}
-        entry |= _checked_metrics(metrics)
+        entry |= metrics()
         if not entry:
             return
         if self._logger is None:
@@ -288,18 +265,6 @@ class LearningLog:
         """Close the files."""
         if self._logger is not None:
             self._logger.close()
-
-
-def _checked_metrics(metrics: Callable[[], Mapping[str, float]]) -> Mapping[str, float]:
-    """Return a learner's metrics; raise an InputError unless they are numbers by name."""
-    values: Any = metrics()
-    owner = f"{type(getattr(metrics, '__self__', metrics)).__name__}.metrics"
-    if not isinstance(values, Mapping):
-        raise InputError(f"{owner} must return numbers by name, not {brief(values)}")
-    for name, value in values.items():
-        if not (isinstance(name, str) and isinstance(value, Real)):
-            raise InputError(f"{owner} must return numbers by name, and {brief(name)} is {brief(value)}")
-    return values
 
 
 def _make_wandb_output(folder: str) -> Any:

@@ -1,4 +1,4 @@
-"""Networks of Stable-Baselines3 learners: images, activations, export, and critics that observe more than the actor."""
+"""Networks and replay buffer of Stable-Baselines3 learners: images, activations, export, privileged critics."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from sb3_contrib.common.torch_layers import BatchRenorm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
@@ -65,10 +68,6 @@ def observe_privileged(
     Returns:
         An environment with the spaces of the critics, a policy class whose actor observes only the observation of
         `env`, and the number of privileged entries.
-
-    Raises:
-        InputError: If the observation is not a vector, the task declares no privileged observation or, with `symmetry`,
-            no symmetry of it, or the algorithm has no critic apart from its actor.
     """
     base: Any = env.unwrapped
     observed, hidden = env.observation_space, getattr(base, "privileged_space", None)
@@ -153,9 +152,6 @@ class ImageFeatures(BaseFeaturesExtractor):
 
         The encoder is "average_pooling", "convolutional" or "pixels" (none). In training mode, images are shifted by
         up to `RANDOM_SHIFT` pixels before convolutions.
-
-        Raises:
-            InputError: If the image is too small.
         """
         height, width, channels = shape
         side_of_squares = IMAGE_POOL if encoder == "average_pooling" else 1
@@ -214,9 +210,6 @@ def share_encoder(model: Any) -> None:
     """Make the actor of an actor-critic algorithm use the critic's encoder, which only the critic's loss trains.
 
     This is the architecture of DrQ (Yarats et al., 2021). Target critics shift images at random as well.
-
-    Raises:
-        InputError: If the algorithm has a target actor, whose encoder would not be updated.
     """
     actor, critic = model.actor, model.critic
     if getattr(model, "actor_target", None) is not None:
@@ -263,9 +256,6 @@ def export_policy(actor: Any, description: Mapping[str, Any]) -> Policy:
     """Return the policy of a Stable-Baselines3 actor: linear layers with activations between them, and a final tanh.
 
     The entries of `description`, such as the observation's shape, are added to the policy's description.
-
-    Raises:
-        InputError: If the actor has other layers.
     """
     layers = [*actor.latent_pi, actor.mu] if hasattr(actor, "latent_pi") else [*actor.mu][:-1]
     features = actor.features_extractor
@@ -295,9 +285,6 @@ def export_layers(
         space: Action space.
         description: Entries to add to the policy's description.
         encoder: Weight (out, in, 3, 3) and bias (out,) of each convolution.
-
-    Raises:
-        InputError: If a layer has another type, or the layers are in another order.
     """
     linear: list[tuple[torch.Tensor, torch.Tensor]] = []
     activations: list[str | None] = []
@@ -337,3 +324,50 @@ def export_layers(
 
 
 _ACTIVATIONS = {torch.nn.ReLU: "relu", torch.nn.Tanh: "tanh"}
+
+
+class DemonstrationReplayBuffer(ReplayBuffer):
+    """Replay buffer with a fixed fraction of demonstrated transitions in every batch (RLPD; Ball et al., 2023).
+
+    The first `num_demonstrated` rows are the demonstrations; a full buffer overwrites only the rows after them.
+
+    Attributes:
+        fraction: Fraction of demonstrations in a batch, once the buffer also has other transitions.
+        num_demonstrated: Number of rows of demonstrations.
+    """
+
+    fraction = 0.5
+    num_demonstrated = 0
+
+    def add(self, *args: np.ndarray, **kwargs: np.ndarray) -> None:  # type: ignore[override]
+        """Add a row; once the buffer is full, overwrite the oldest row after the demonstrations."""
+        if self.num_demonstrated >= self.buffer_size:
+            raise InputError(
+                f"the demonstrations fill the replay buffer of {self.buffer_size} transitions: give a larger "
+                "--set buffer_size=..."
+            )
+        super().add(*args, **kwargs)  # type: ignore[arg-type]
+        if self.full and self.pos < self.num_demonstrated:
+            self.pos = self.num_demonstrated
+
+    @property
+    def newest(self) -> int:
+        """Index of the row that was added last."""
+        is_wrapped = self.full and self.pos == self.num_demonstrated
+        return self.buffer_size - 1 if is_wrapped else self.pos - 1
+
+    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
+        """Return a batch with evenly spaced demonstrated rows.
+
+        Several batches can be sampled at once and then divided into equal parts: the numbers of demonstrations in the
+        parts differ by at most one.
+        """
+        size, first = self.size(), self.num_demonstrated
+        if not 0 < first < size:
+            return super().sample(batch_size, env)
+        count = np.arange(batch_size + 1) * self.fraction
+        is_demonstrated = np.diff(np.floor(count + 1e-9)) > 0
+        low, high = np.where(is_demonstrated, 0, first), np.where(is_demonstrated, first, size)
+        # NumPy's global generator is used, as in Stable-Baselines3's own buffers.
+        indices = np.random.randint(low, high)  # noqa: NPY002
+        return self._get_samples(indices, env=env)

@@ -25,11 +25,20 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.checkpoint import CheckpointSelection, entries_of, load_off_policy
-from guiderail.tools.learning.config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
+from guiderail.tools.learning.checkpoint import (
+    CheckpointSelection,
+    entries_of,
+    load_off_policy,
+    module_arrays,
+    random_state,
+    restore_modules,
+    restore_random,
+)
 from guiderail.tools.learning.fast_sb3 import FastSac, FastTqc
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
+from guiderail.tools.learning.learner_config import CrossQConfig, OffPolicyConfig, Td3Config, action_gamma
 from guiderail.tools.learning.networks import (
+    DemonstrationReplayBuffer,
     ImageFeatures,
     NormalizedReLU,
     SpacesOnlyEnv,
@@ -41,13 +50,6 @@ from guiderail.tools.learning.networks import (
     packed_space,
     share_encoder,
     with_privileged,
-)
-from guiderail.tools.learning.sb3 import (
-    DemonstrationReplayBuffer,
-    module_arrays,
-    random_state,
-    restore_modules,
-    restore_random,
 )
 
 

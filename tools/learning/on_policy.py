@@ -18,10 +18,10 @@ from torch.nn.utils import parameters_to_vector
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
+from guiderail.tools.learning.checkpoint import module_arrays, random_state, restore_modules, restore_random
 from guiderail.tools.learning.learner import Learner, divergence_error, register_learner
+from guiderail.tools.learning.learner_config import OnPolicyConfig, PpoConfig, TrpoConfig, action_gamma
 from guiderail.tools.learning.networks import export_layers
-from guiderail.tools.learning.sb3 import module_arrays, random_state, restore_modules, restore_random
 
 _BUFFER_ARRAYS = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
 
@@ -91,9 +91,6 @@ class OnPolicyLearner(Learner):
 
         A transition is not stored if the simulation failed in it, or if its action is not from `act`, as a supervisor's
         correction. The previous transition is then treated as the episode's last, as at a time limit.
-
-        Raises:
-            InputError: If learning diverged.
         """
         buffer = self.model.rollout_buffer
         if "simulation_failure" in transition.info or self._sampled is None:

@@ -1,15 +1,21 @@
-"""Run folder: the files of one training run, readable without the program that wrote them."""
+"""Run: its configuration, resolved from choices or from the run to resume, and the files of its folder.
+
+The files are readable without the program that wrote them.
+"""
+
+from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import platform
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, field, replace
-from functools import cache
+from dataclasses import asdict, field, make_dataclass, replace
+from functools import cache, cached_property
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypedDict, Unpack
 
 import filelock
 import pandas as pd
@@ -18,9 +24,11 @@ from pydantic import ConfigDict, Field, SkipValidation
 from pydantic.dataclasses import dataclass
 from safetensors import SafetensorError, safe_open
 
+from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
-from guiderail.tools.environments import check_environment, task_content
+from guiderail.tools.environments import check_environment, flat_environment, resolve_environment, task_content
+from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.evaluation.metrics import check_rows
 from guiderail.tools.files import (
     LOCK,
@@ -30,14 +38,23 @@ from guiderail.tools.files import (
     write_atomically,
     write_error,
 )
-from guiderail.tools.imports import import_stored
-from guiderail.tools.learning.config import MAX_EPISODES, config_values, make_config
-from guiderail.tools.learning.learner import LearnerConfig
+from guiderail.tools.imports import import_stored, is_trusted
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig
+from guiderail.tools.learning.learner_config import (
+    MAX_EPISODES,
+    check_episodes,
+    config_values,
+    default_preset,
+    flat_settings,
+    make_config,
+    resolve_preset,
+)
 from guiderail.tools.tables import read_table, table_text
 
 PACKAGES = ("guiderail", "drake", "numpy", "scipy", "gymnasium", "torch", "stable-baselines3", "sb3-contrib", "daqp")
 # Options that may change within a run: corrections add via-points, and a robot may have another address when resumed.
 CHANGING = ("via_points", "robot_url", "robot_timeout")
+_LOGGER = logging.getLogger(__name__)
 _version = cache(metadata.version)  # cached, because it reads files
 
 
@@ -73,6 +90,11 @@ class RunConfig:
     # Environments of a set, of which each episode has another one; `task` and `environment` are those of the first.
     # Empty for a single environment.
     members: tuple[SetMember, ...] = ()
+
+    @cached_property
+    def resolved(self) -> Any:
+        """Environment as `make_environment` takes it: the validated `EnvConfig` of a registered task, or options."""
+        return resolve_environment(self.task, self.environment)
 
     @property
     def action_repeat(self) -> int:
@@ -136,12 +158,7 @@ class RunFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the run against other processes; the lock of a killed process has no effect.
-
-        Raises:
-            InputError: If another process writes into the run, the folder cannot be written, or a folder in it is a
-                link to a place outside.
-        """
+        """Lock the run against other processes; the lock of a killed process has no effect."""
         refuse_links(self.path)
         lock = filelock.FileLock(self.path / LOCK, timeout=0)
         try:
@@ -206,12 +223,12 @@ class RunFolder:
             del values["members"]
         write_atomically(self.path / "config.yaml", yaml.safe_dump(values, sort_keys=False).encode())
 
-    def config(self) -> RunConfig:
+    def config(self, *, runs_code: bool = True) -> RunConfig:
         """Read the configuration of the run, and import the modules that register its task and learner.
 
-        Raises:
-            InputError: If the folder is not a run, a folder in it is a link to a place outside, its configuration is
-                invalid, or the configuration names code that is not trusted (`trust_imports`).
+        Args:
+            runs_code: False if the configuration is only shown: code that is not trusted is then not imported, and the
+                settings of an unknown learner are not checked.
         """
         file = self.path / "config.yaml"
         refuse_links(self.path)
@@ -230,8 +247,12 @@ class RunFolder:
                 member["environment"] = as_arguments(member["environment"])
             settings = dict(values["learner"])
             config = RunConfig(**values)
-            import_stored(config.imports, file)
-            return replace(config, learner=make_config(settings.pop("algorithm"), settings))
+            algorithm = settings.pop("algorithm")
+            if runs_code or is_trusted():
+                import_stored(config.imports, file)
+            elif config.imports and algorithm not in LEARNERS.names():
+                return replace(config, learner=_shown_settings(algorithm, settings))
+            return replace(config, learner=make_config(algorithm, settings))
         except InputError:
             raise
         except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -263,6 +284,129 @@ class RunFolder:
         return check_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
 
 
+def _shown_settings(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
+    """Return the stored settings of a learner whose code is not imported."""
+    base = {name: settings.pop(name) for name in LearnerConfig.__dataclass_fields__ if name in settings}
+    kind = make_dataclass(
+        "ShownConfig", [(name, Any) for name in settings], bases=(LearnerConfig,), frozen=True, kw_only=True
+    )
+    shown: LearnerConfig = kind(algorithm=algorithm, **base, **settings)
+    return shown
+
+
 def as_arguments(environment: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of an environment with each list, as read from YAML, converted to a tuple."""
     return {key: tuple(value) if isinstance(value, list) else value for key, value in environment.items()}
+
+
+DEFAULT_EPISODES, DEFAULT_SEED = 60, 0
+
+
+class Choices(TypedDict, total=False):
+    """Choices of a run; one that is missing has its default."""
+
+    algorithm: str  # registered name of the learner; default: the preset's, without a preset the task's
+    preset: str | None  # settings of the learner; default: `default_preset`, without an algorithm the task's
+    settings: Mapping[str, Any] | None  # settings of the learner that override those of preset and task
+    episodes: int
+    seed: int
+    step_log: bool
+    human_in_the_loop: bool  # True if a supervisor corrects the policy
+
+
+def configure(
+    task: str,
+    environment: Mapping[str, Any],
+    *,
+    imports: Sequence[str] = (),
+    members: Sequence[SetMember] = (),
+    **choices: Unpack[Choices],
+) -> RunConfig:
+    """Return a checked configuration with everything resolved.
+
+    Args:
+        task: Name of the task; with `members`, that of the first member.
+        environment: Options of the environment; with `members`, those of the first member.
+        imports: Modules, files and task folders that register the task, as `import_modules` returns them.
+        members: Environments of a set.
+        **choices: Choices of the run.
+    """
+    has_learner = choices.keys() & {"algorithm", "preset"} or task not in TASKS.names()
+    declared: dict[str, Any] = {} if has_learner else dict(TASKS.get(task).learner)
+    settings = flat_settings(declared.pop("settings", None)) | flat_settings(choices.get("settings"))
+    chosen: dict[str, Any] = declared | choices | {"settings": settings}
+    episodes, seed = check_episodes(chosen.get("episodes", DEFAULT_EPISODES)), chosen.get("seed", DEFAULT_SEED)
+    learner = resolve_preset(chosen.get("preset"), chosen.get("algorithm"), settings)
+    resolved = resolve_environment(task, environment)
+    options = as_arguments(resolved if isinstance(resolved, Mapping) else resolved.options)
+    config = RunConfig(
+        task, options, learner, chosen.get("preset") or default_preset(learner.algorithm), episodes, check_seed(seed),
+        installed_versions(), tuple(imports), chosen.get("step_log", True), task_content(task, options, imports),
+        chosen.get("human_in_the_loop", False), members=tuple(members),
+    )  # fmt: skip
+    vars(config)["resolved"] = resolved  # the environment is not resolved again
+    return config
+
+
+def resumed_config(
+    folder: RunFolder,
+    task: str | None,
+    environment: Mapping[str, Any],
+    choices: Choices,
+    members: Sequence[SetMember] = (),
+) -> RunConfig:
+    """Return the configuration of the run to continue; raise an InputError if an argument contradicts it."""
+    config = folder.config()
+    config.refuse_changed_task(folder.path)
+    stored = {"task": config.task, "seed": config.seed, "preset": config.preset, "algorithm": config.learner.algorithm}
+    stored |= {"step_log": config.step_log, "human_in_the_loop": config.human_in_the_loop} | config.environment
+    if environment:
+        resolved = check_environment(config.task, environment)
+        given_options = flat_environment(config.task, environment)
+        environment = {key: resolved.get(key, value) for key, value in given_options.items()}
+    arguments = {**as_arguments(environment), **choices} | ({} if task is None else {"task": task})
+    settings = arguments.pop("settings", None)
+    for key, value in arguments.items():
+        if key == "episodes" and value < config.episodes and value < (done := folder.num_saved_episodes()):
+            raise InputError(f"the run in {folder.path} has done {done} episodes: give at least as many")
+        if key != "episodes" and stored.get(key) != value:
+            raise InputError(
+                f"the run in {folder.path} has {key} {stored.get(key)!r}, not {value!r}: leave {key} out, or train "
+                "again in another folder"
+            )
+    if members and tuple(members) != config.members:
+        raise InputError(
+            f"the run in {folder.path} has another set of environments: leave the tasks and --variants out, or train "
+            "again in another folder"
+        )
+    values = config_values(config.learner) | flat_settings(settings)
+    algorithm = values.pop("algorithm")
+    if make_config(algorithm, values) != config.learner:
+        raise InputError(
+            f"the run in {folder.path} has other learner settings: leave --set out, or train again in another folder"
+        )
+    episodes = check_episodes(choices.get("episodes", config.episodes))
+    return replace(config, episodes=episodes, versions=_merged_versions(folder, config))
+
+
+def _merged_versions(folder: RunFolder, config: RunConfig) -> dict[str, str]:
+    """Return the package versions so far and the current ones; warn if they differ, because results may differ."""
+    merged = {}
+    for name, current in installed_versions().items():
+        stored = config.versions.get(name, current)
+        merged[name] = stored if stored.split(", then ")[-1] == current else f"{stored}, then {current}"
+    if changed := [f"{name} {value}" for name, value in merged.items() if value != config.versions.get(name, value)]:
+        _LOGGER.warning("the run in %s continues with other versions: %s", folder.path, "; ".join(changed))
+    return config.versions | merged
+
+
+def warn_of_unfinished_source(config: RunConfig) -> None:
+    """Warn if the run that the setting `init_from` names is unfinished; training starts from its checkpoint."""
+    name = getattr(config.learner, "init_from", "")
+    source = RunFolder(name)
+    if name and source.checkpoint.is_file() and not (source.path / "policy.json").is_file():
+        _LOGGER.warning(
+            "the run %s that init_from names is unfinished: training starts from its checkpoint of %d episodes",
+            source.path,
+            source.num_saved_episodes(),
+        )

@@ -19,25 +19,28 @@ from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.yaml import load_yaml
 from guiderail.models.policy import Policy
-from guiderail.tools.environments import check_environment, register_environment, task_named
+from guiderail.tools.environments import check_environment, register_environment, task_named, warn_of_deviation
 from guiderail.tools.evaluation.baselines import MakePolicy, make_baseline
-from guiderail.tools.evaluation.episode import check_seed
 from guiderail.tools.evaluation.metrics import own_episodes, reports_success, summary
 from guiderail.tools.evaluation.policies import is_policy_file
-from guiderail.tools.evaluation.rollout import EpisodeProgress
 from guiderail.tools.evaluation.subject import counts_collisions
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import (
-    OffPolicyConfig,
-    check_episodes,
-)
-from guiderail.tools.learning.configure import configure, resumed_config, warn_of_unfinished_source, with_defaults
 from guiderail.tools.learning.environment_set import EnvironmentSet, Variants, find_members, load_variants
 from guiderail.tools.learning.learner import check_log_formats
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, SetMember
+from guiderail.tools.learning.learner_config import OffPolicyConfig
+from guiderail.tools.learning.run_folder import (
+    Choices,
+    RunConfig,
+    RunFolder,
+    SetMember,
+    configure,
+    resumed_config,
+    warn_of_unfinished_source,
+)
+from guiderail.tools.progress import EpisodeProgress
 
 if TYPE_CHECKING:
-    from guiderail.tools.learning.supervision import Supervise
+    from guiderail.tools.learning.episodes import Supervise
 
 # Statistics of a run's summary.
 SUMMARY = (
@@ -166,20 +169,23 @@ def train(
                 f"training needs the name of a task or its folder, an environment, or the id of an environment "
                 f"registered with Gymnasium, not {brief(each)}"
             )
-    if not isinstance(out, str | PathLike):
-        raise InputError(f"out is the path of the run's folder, not {brief(out)}")
-    if not (settings is None or isinstance(settings, Mapping)):
-        raise InputError(f"settings of the learner are values by name, not {brief(settings)}")
     names = [task_named(str(each)) for each in tasks]
     environment = options if guidance is None else {"guidance": guidance, **options}
     if names:
         _refuse_misspelled(names[0][0], environment, options)
-    return start_or_resume(
-        [name for name, _ in names], Path(out), variants=variants, environment=environment, algorithm=algorithm,
-        preset=preset, settings=settings, episodes=episodes, seed=seed, log=log, resume=resume,
-        imports=[folder for _, folders in names for folder in folders], sb3_callbacks=callbacks,
+    choices = {"algorithm": algorithm, "preset": preset, "settings": settings, "episodes": episodes, "seed": seed}
+    return Training(
+        Path(out),
+        [name for name, _ in names],
+        environment,
+        cast(Choices, {key: value for key, value in choices.items() if value is not None}),
+        variants=variants,
+        imports=[folder for _, folders in names for folder in folders],
+        resume=resume,
+        log=log,
+        callbacks=callbacks,
         pictures=pictures,
-    )  # fmt: skip
+    ).start()
 
 
 def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mapping[str, Any]) -> None:
@@ -192,89 +198,77 @@ def _refuse_misspelled(task: str, environment: Mapping[str, Any], options: Mappi
                 raise InputError(f"train has no argument {name!r}: did you mean {near[0]}?") from None
 
 
-def start_or_resume(
-    task: str | Sequence[str] | None,
-    out: Path,
-    *,
-    environment: Mapping[str, Any],
-    variants: Variants | Path | str | None = None,
-    algorithm: str | None = None,
-    preset: str | None = None,
-    settings: Mapping[str, Any] | None = None,
-    episodes: int | None = None,
-    seed: int | None = None,
-    resume: bool = False,
-    imports: Sequence[str] = (),
-    step_log: bool | None = None,
-    log: str | Sequence[str] = (),
-    pictures: bool = True,
-    sb3_callbacks: Any = None,
-    open_supervision: Callable[[], Supervise] | None = None,
-) -> Run:
-    """Train with a progress bar, and draw the learning curve and the replay page.
+@dataclass(frozen=True)
+class Training:
+    """Training as `train` and the command line request it."""
 
-    A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes. An
-    argument that is None has its default. The arguments are those of `train` and:
+    out: Path  # folder of the run
+    tasks: Sequence[str] = ()  # names of tasks, several for a set of environments; empty with `resume`
+    environment: Mapping[str, Any] = field(default_factory=dict)  # options of the environment
+    choices: Choices = field(default_factory=Choices)  # choices of the run
+    variants: Variants | Path | str | None = None  # options of environments by a variant's name, or their file
+    imports: Sequence[str] = ()  # modules, files (.py) or task folders that register the task, the learner, …
+    resume: bool = False  # True to continue the run in `out`
+    log: str | Sequence[str] = ()  # formats of the learning log
+    callbacks: Any = None  # callbacks of Stable-Baselines3
+    pictures: bool = True  # True to draw the learning curve and the replay page
+    open_supervision: Callable[[], Supervise] | None = None  # function that waits for a supervisor, or None
 
-    - `task`: name of the task, or names of several for a set of environments; None with `resume`.
-    - `environment`: options of the environment by name.
-    - `imports`: modules or files (.py) that register the task, the learner, …
-    - `step_log`: True to write every control step to the step log; the default.
-    - `sb3_callbacks`: the `callbacks` of `train`.
-    - `open_supervision`: function that waits for a supervisor, and returns the start of the supervised episodes; the
-      run then has a human in the loop.
+    def start(self) -> Run:
+        """Train with a progress bar, and draw the learning curve and the replay page.
 
-    The task's scripted policy acts in the learner's `demonstration_episodes`.
+        A resumed run keeps its configuration; only `episodes` may change, to at least the number of finished episodes.
+        The task's scripted policy acts in the learner's `demonstration_episodes`.
+        """
+        imports, formats = import_modules(self.imports), check_log_formats(self.log)
+        folder = RunFolder(self.out)
+        config = self._config(folder, imports)
+        if not self.resume:
+            if "demonstrations" in self.environment or any(map(is_task_folder, imports)):
+                warn_of_deviation(config.resolved)
+            warn_of_unfinished_source(config)
+        from guiderail.tools.learning.trainer import Observers, run_training  # imports PyTorch: slow, so after checks
 
-    Raises:
-        InputError: As `train`, or if there is no task without `resume`.
-    """
-    folder = RunFolder(out)
-    episodes = None if episodes is None else check_episodes(episodes)
-    seed = None if seed is None else check_seed(seed)
-    imports, formats = import_modules(imports), check_log_formats(log)
-    choices = {"algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log}
-    choices["human_in_the_loop"] = None if open_supervision is None else True
-    given: dict[str, Any] = {key: value for key, value in choices.items() if value is not None}
-    tasks = [task] if isinstance(task, str) else list(task or ())
-    name = tasks[0] if tasks else None
-    members: tuple[SetMember, ...] = ()
-    if len(tasks) > 1 or (variants is not None and tasks):
-        members, folders = find_members(tasks, environment, load_variants(variants), imports)
-        imports = tuple(dict.fromkeys((*imports, *folders)))
-        name, environment = members[0].task, members[0].environment
-    if resume:
-        config = resumed_config(folder, name, environment, given, settings, members)
-    elif name is None:
-        raise InputError("training needs a task: name a task, such as guiderail train NarrowPassage --out RUN")
-    else:
-        folder.refuse_existing()
-        given["settings"] = settings
-        config = configure(name, environment, imports=imports, members=members, **with_defaults(name, given))
-    num_demonstrated = config.learner.demonstration_episodes
-    if isinstance(config.learner, OffPolicyConfig) and num_demonstrated >= config.episodes:
-        _LOGGER.warning(
-            "the scripted policy acts in every episode and the learned one in none, because demonstration_episodes is "
-            "%d: give more than %d episodes",
-            num_demonstrated,
-            num_demonstrated,
+        demonstrator = _make_demonstrator(config) if config.learner.demonstration_episodes else None
+        supervise = self.open_supervision() if config.human_in_the_loop and self.open_supervision is not None else None
+        label = f"{len(config.members)} environments" if config.members else config.task
+        with EpisodeProgress(config.episodes, name=label) as progress:
+            observers = Observers(progress.update, formats, self.callbacks)
+            run_training(
+                folder, config, resume=self.resume, demonstrator=demonstrator, supervise=supervise, observers=observers
+            )
+        if not self.pictures:
+            return Run(self.out)
+        _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", self.out)
+        return Run(self.out, draw_pictures(self.out))
+
+    def _config(self, folder: RunFolder, imports: Sequence[str]) -> RunConfig:
+        """Return the configuration of the run, new or resumed."""
+        choices = (
+            self.choices if self.open_supervision is None else Choices({**self.choices, "human_in_the_loop": True})
         )
-    if not resume:
-        warn_of_unfinished_source(config)
-    from guiderail.tools.learning.trainer import run_training  # imports PyTorch: slow, so after the input checks
-
-    demonstrator = _make_demonstrator(config) if num_demonstrated else None
-    supervise = open_supervision() if config.human_in_the_loop and open_supervision is not None else None
-    label = f"{len(config.members)} environments" if config.members else config.task
-    with EpisodeProgress(config.episodes, name=label) as progress:
-        run_training(
-            folder, config, resume=resume, report=progress.update, demonstrator=demonstrator, supervise=supervise,
-            log=formats, sb3_callbacks=sb3_callbacks,
-        )  # fmt: skip
-    if not pictures:
-        return Run(out)
-    _LOGGER.info("training is complete; drawing the learning curve and a replay page into %s", out)
-    return Run(out, draw_pictures(out))
+        task, environment = next(iter(self.tasks), None), self.environment
+        members: tuple[SetMember, ...] = ()
+        if len(self.tasks) > 1 or (self.variants is not None and self.tasks):
+            members, folders = find_members(self.tasks, environment, load_variants(self.variants), imports)
+            imports = tuple(dict.fromkeys((*imports, *folders)))
+            task, environment = members[0].task, members[0].environment
+        if self.resume:
+            config = resumed_config(folder, task, environment, choices, members)
+        elif task is None:
+            raise InputError("training needs a task: name a task, such as guiderail train NarrowPassage --out RUN")
+        else:
+            folder.refuse_existing()
+            config = configure(task, environment, imports=imports, members=members, **choices)
+        num_demonstrated = config.learner.demonstration_episodes
+        if isinstance(config.learner, OffPolicyConfig) and num_demonstrated >= config.episodes:
+            _LOGGER.warning(
+                "the scripted policy acts in every episode and the learned one in none, because demonstration_episodes "
+                "is %d: give more than %d episodes",
+                num_demonstrated,
+                num_demonstrated,
+            )
+        return config
 
 
 def _make_demonstrator(config: RunConfig) -> MakePolicy:
@@ -291,7 +285,7 @@ def draw_pictures(out: Path) -> dict[str, str]:
     If the replay page cannot be drawn on this machine, the reason is returned in place of its path.
     """
     from guiderail.tools.evaluation.subject import EpisodeSpec
-    from guiderail.tools.visualization.curves import plot_run
+    from guiderail.tools.visualization.figures import plot_run
     from guiderail.tools.visualization.replay import default_page, write_page
 
     try:

@@ -6,11 +6,10 @@ import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from numbers import Number
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
@@ -18,19 +17,19 @@ from threadpoolctl import threadpool_limits
 from guiderail.models.common.errors import InputError, brief, naming_failures
 from guiderail.models.policy import Policy
 from guiderail.tools.environments import trained_task
-from guiderail.tools.evaluation.episode import Callback, PolicyFn
+from guiderail.tools.evaluation.episode import Callback
 from guiderail.tools.evaluation.metrics import WORDS
 from guiderail.tools.evaluation.policies import is_compatible
-from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, remove_step_logs
 from guiderail.tools.files import write_atomically
-from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
+from guiderail.tools.learning.checkpoint import entries_of, load_checkpoint, save_checkpoint
 from guiderail.tools.learning.environment_set import (
     EnvironmentSet,
     make_run_environment,
     select_environment,
     trained_set,
 )
+from guiderail.tools.learning.episodes import Demonstrator, Episodes, Supervise
 from guiderail.tools.learning.learner import (
     LEARNERS,
     Learner,
@@ -43,8 +42,7 @@ from guiderail.tools.learning.run_folder import RunConfig, RunFolder
 from guiderail.tools.tables import table_text
 
 if TYPE_CHECKING:
-    from guiderail.tools.learning.actors import ParallelLearner
-    from guiderail.tools.learning.supervision import Supervise, SupervisedEpisodes
+    from guiderail.tools.learning.episodes import Sb3Callbacks
 
 # Largest fraction of the training time for the step log and checkpoints: small checkpoints are written after every
 # episode, large ones less often. The first and the last checkpoint are always written.
@@ -53,7 +51,16 @@ MAX_SAVING_FRACTION = 0.03
 # Errors of `Learner.restore` that mean that the state does not fit the learner.
 _UNFIT = (LookupError, TypeError, ValueError, OverflowError, RuntimeError)
 
-Demonstrator = Callable[[gymnasium.Env], PolicyFn]
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Observers:
+    """Observers of a run: progress, learning log, and callbacks of Stable-Baselines3."""
+
+    report: Callable[[Row], None] | None = None  # called with the row of each episode
+    log: Sequence[str] = ()  # formats of the learning log: tensorboard, wandb, csv, json, log or stdout
+    sb3_callbacks: Any = None  # callback of Stable-Baselines3, or a list; if one returns False, training ends
 
 
 def run_training(
@@ -61,13 +68,11 @@ def run_training(
     config: RunConfig,
     *,
     resume: bool = False,
-    report: Callable[[dict[str, Any]], None] | None = None,
     demonstrator: Demonstrator | None = None,
     supervise: Supervise | None = None,
-    log: Sequence[str] = (),
-    sb3_callbacks: Any = None,
-) -> list[dict[str, Any]]:
-    """Train a run to its last episode and write its folder.
+    observers: Observers | None = None,
+) -> list[Row]:
+    """Train a run to its last episode and write its folder; return the rows of `episodes.csv`.
 
     A run that was killed and resumed gives bit for bit the result of an uninterrupted run: a checkpoint is written at
     the end of an episode and has all state that later episodes depend on, including the random generators. The step log
@@ -77,41 +82,25 @@ def run_training(
         folder: Folder of the run; with `resume`, the folder of the run to continue.
         config: Configuration; with `resume` it must agree with the folder's.
         resume: Continue the run from its checkpoint.
-        report: Called with the row of each episode.
         demonstrator: Function from an environment to the policy that acts in the learner's `demonstration_episodes`.
             Its actions must not depend on earlier episodes. Off-policy learners also learn from these transitions
             (Vecerik et al., 2017).
         supervise: Start of the episodes of a run that is configured `human_in_the_loop`.
-        log: Formats of the learning log: tensorboard, wandb, csv, json, log or stdout.
-        sb3_callbacks: Callback of Stable-Baselines3, or a list of them; if one returns False, training ends after
-            the episode.
-
-    Returns:
-        The rows of `episodes.csv`.
-
-    Raises:
-        InputError: If the folder of a new run is not empty, another process writes into it, settings are incompatible,
-            or a demonstrator, a supervisor or the package of a log format is missing; or if an episode fails, learning
-            diverges, or the learner returns no `Policy`. If the first episode fails, a folder that did not exist
-            before is removed, unless learning diverged.
+        observers: Progress, learning log and callbacks.
     """
-    if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
-        raise InputError(
-            "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
-        )
-    if config.human_in_the_loop and config.members:
-        raise InputError("a supervisor corrects one environment: leave --human-in-the-loop out, or name one task")
-    if config.human_in_the_loop and supervise is None:
-        raise InputError("this run has a supervisor: give --human-in-the-loop")
-    if config.learner.demonstration_episodes and demonstrator is None:
-        raise InputError(
-            f"{config.task} has no scripted policy that demonstrates: leave the setting demonstration_episodes out"
-        )
-    learning_log = LearningLog(folder.logs, log)
+    _check_combination(config, has_demonstrator=demonstrator is not None, is_supervised=supervise is not None)
+    observers = observers or Observers()
+    learning_log = LearningLog(folder.logs, observers.log)
     torch.set_num_threads(1)  # faster for two runs at once, and sums do not depend on the number of cores
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1))
-        env = stack.enter_context(closing(make_run_environment(config)))
+        if config.human_in_the_loop and supervise is not None:
+            episodes = supervise(config)
+            episodes.demonstrator = demonstrator
+        else:
+            episodes = Episodes(config, make_run_environment(config), demonstrator)
+        stack.callback(lambda: episodes.close())
+        env = episodes.env
         if config.learner.demonstration_episodes and demonstrator is not None and not is_compatible(demonstrator, env):
             raise InputError(
                 f"the observations or actions of {config.task}'s scripted policy differ from this environment's: leave "
@@ -135,38 +124,33 @@ def run_training(
         closed_first.callback(lambda: learner.close())
         closed_first.callback(learning_log.close)
         callbacks = None
-        if sb3_callbacks is not None:
-            from guiderail.tools.learning.sb3 import Sb3Callbacks
+        if observers.sb3_callbacks is not None:
+            from guiderail.tools.learning.episodes import Sb3Callbacks
 
             if config.learner.pipelined or config.learner.num_envs:
                 raise InputError("callbacks need model and episodes in this process: leave pipelined and num_envs out")
-            callbacks = closed_first.enter_context(closing(Sb3Callbacks(sb3_callbacks, learner)))
+            callbacks = closed_first.enter_context(closing(Sb3Callbacks(observers.sb3_callbacks, learner)))
         stack.enter_context(folder.locked())
-        stack.enter_context(closed_first.pop_all())  # the lock is released last: all of these write into the folder
         if config.learner.pipelined:
             from guiderail.tools.learning.networks import SpacesOnlyEnv
-            from guiderail.tools.learning.pipelined import PipelinedLearner
+            from guiderail.tools.learning.processes import PipelinedLearner
 
             child_arguments = (config.learner, SpacesOnlyEnv(env)), arguments
             learner = PipelinedLearner(learner, child_arguments, waits=True, imports=config.imports)
         elif config.learner.num_envs:
-            from guiderail.tools.learning.actors import ParallelLearner
+            from guiderail.tools.learning.processes import ActorEpisodes
 
-            number = config.learner.demonstration_episodes
-            learner = ParallelLearner(
-                learner, env, num_envs=config.learner.num_envs, seed=config.seed, num_episodes=config.episodes,
-                demonstrator=(demonstrator, number) if demonstrator is not None and number else None,
-                callbacks=(StepLog(env, folder.steps),) if config.step_log else (),
-            )  # fmt: skip
-        learner.records_metrics = bool(log)
+            episodes = ActorEpisodes(episodes, learner)
+            closed_first.callback(episodes.end)
+        stack.enter_context(closed_first.pop_all())  # the lock is released last: all of these write into the folder
+        learner.records_metrics = bool(observers.log)
         if not hasattr(env.unwrapped, "trace"):
-            config = replace(config, step_log=False)  # only an environment of this package has a trace
+            episodes.config = config = replace(config, step_log=False)  # only an environment of guiderail has a trace
         if not resume:
             folder.create(config)
+        loop = TrainingLoop(folder, learner, episodes, observers.report, learning_log, callbacks)
         try:
-            return _train(
-                folder, config, env, learner, resume, report, demonstrator, supervise, learning_log, callbacks
-            )
+            return loop.run(resume=resume)
         except InputError:
             # The next attempt would refuse a folder that has only a configuration. If the learner diverged, the folder
             # stays.
@@ -175,99 +159,204 @@ def run_training(
             raise
 
 
-def _train(
-    folder: RunFolder,
-    config: RunConfig,
-    env: Any,
-    learner: Learner,
-    resume: bool,
-    report: Callable[[dict[str, Any]], None] | None,
-    demonstrator: Demonstrator | None,
-    supervise: Supervise | None,
-    learning_log: LearningLog,
-    sb3_callbacks: Any = None,
-) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = []
-    if resume:
-        rows, num_written = restore_checkpoint(folder, config, learner, env)
-        remove_step_logs(folder.steps, config.episodes)
-        if num_written < len(rows):
-            folder.write_episodes(rows)  # the loop below does not write the table of a complete run
-    num_restored, supervised = len(rows), None
-    if config.human_in_the_loop and supervise is not None:
-        supervised = supervise(config, load_checkpoint(folder.checkpoint)[1] if rows else {})
-        supervised.env.unwrapped.np_random.bit_generator.state = env.unwrapped.np_random.bit_generator.state
-        env, config = supervised.env, supervised.config
-    folder.write_config(config)
-    if resume and len(rows) < config.episodes and not _ends_with_successes(rows, config.learner.stop_after_successes):
-        folder.remove_policy()  # a run that is killed later must not leave an outdated policy
+def _check_combination(config: RunConfig, *, has_demonstrator: bool, is_supervised: bool) -> None:
+    """Raise an InputError if settings are incompatible, or a demonstrator or a supervisor is missing."""
+    if config.learner.num_envs and (config.learner.pipelined or config.human_in_the_loop):
+        raise InputError(
+            "num_envs does not work with pipelined=true or --human-in-the-loop: leave num_envs out, or the others"
+        )
+    if config.human_in_the_loop and config.members:
+        raise InputError("a supervisor corrects one environment: leave --human-in-the-loop out, or name one task")
+    if config.human_in_the_loop and not is_supervised:
+        raise InputError("this run has a supervisor: give --human-in-the-loop")
+    if config.learner.demonstration_episodes and not has_demonstrator:
+        raise InputError(
+            f"{config.task} has no scripted policy that demonstrates: leave the setting demonstration_episodes out"
+        )
 
-    step_log = StepLog(env, folder.steps)
-    callbacks: list[Callback] = [step_log] if config.step_log else []
-    callbacks += [] if sb3_callbacks is None else [sb3_callbacks]
-    num_demonstrated = 0 if demonstrator is None else config.learner.demonstration_episodes
-    training_time, saving_time, last_saving_time = 0.0, 0.0, 0.0
 
-    def learner_act(observation: np.ndarray) -> np.ndarray:
-        with _naming_failures(config, f"{type(learner).__name__}.act"):
-            return learner.act(observation)
+class TrainingLoop:
+    """Loop of episodes and training, in simulation and on a robot, which writes the files of a run.
 
-    for episode in range(len(rows), config.episodes):
-        if _ends_with_successes(rows, config.learner.stop_after_successes):
-            break
-        started = time.perf_counter()
-        environment_name = select_environment(env, episode)
-        act = demonstrator(env) if demonstrator is not None and episode < num_demonstrated else learner_act
-        if config.learner.num_envs:
-            row = cast("ParallelLearner", learner).episode(episode)
-        elif supervised is None:
-            row = rollout(env, act, learner, *callbacks, index=episode)
-        else:
-            row = supervised.rollout(act, learner, *callbacks, index=episode)
-            env = supervised.env
-        if _has_diverged(learner):
+    Attributes:
+        rows: Rows of the finished episodes.
+        remaining: Steps of saving the last episode that are not done.
+    """
+
+    def __init__(
+        self,
+        folder: RunFolder,
+        learner: Learner,
+        episodes: Episodes,
+        report: Callable[[Row], None] | None = None,
+        log: LearningLog | None = None,
+        sb3_callbacks: Sb3Callbacks | None = None,
+    ):
+        """Construct the loop; `report` is called with the row of each episode."""
+        self._folder, self._learner, self._episodes, self._report = folder, learner, episodes, report
+        self._log = LearningLog(folder.logs) if log is None else log
+        self._sb3_callbacks = sb3_callbacks
+        self.rows: list[Row] = []
+        self.remaining: list[Callable[[], None]] = []
+        self._num_restored = 0
+        self._last_saving_time = 0.0
+
+    def run(self, *, resume: bool = False) -> list[Row]:
+        """Run all episodes and save the policy; return the rows. With `resume`, continue from the checkpoint."""
+        folder, learner, episodes = self._folder, self._learner, self._episodes
+        if resume:
+            self.restore()
+        folder.write_config(episodes.config)
+        if resume and not self._is_complete() and not episodes.is_real_time:
+            folder.remove_policy()  # a run that is killed later must not leave an outdated policy
+        step_log = StepLog(episodes.env, folder.steps)
+        callbacks: list[Callback] = [step_log] if episodes.config.step_log and not episodes.is_real_time else []
+        callbacks += [] if self._sb3_callbacks is None else [self._sb3_callbacks]
+        training_time = saving_time = 0.0
+        while not self._is_complete():
+            started = time.perf_counter()
+            row = self._run_episode(callbacks)
+            training_time += time.perf_counter() - started
+            if self._report is not None:
+                self._report(row)
+            self._log.record(self.rows, learner.metrics)
+            time_with_next = step_log.seconds + saving_time + self._last_saving_time
+            is_due = time_with_next <= MAX_SAVING_FRACTION * training_time or len(self.rows) == 1
+            if is_due or self._is_complete() or episodes.is_real_time:
+                self._last_saving_time = 0.0
+                self.remaining = episodes.saving_steps(self.write_checkpoint, self._write_table, learner.submit_episode)
+                while self.remaining:
+                    self.remaining[0]()
+                    self.remaining.pop(0)
+                    episodes.idle()
+                saving_time += self._last_saving_time
+            else:
+                learner.submit_episode()
+            episodes.end_episode()
+        episodes.end()
+        learner.finish()
+        remove_step_logs(folder.steps, len(self.rows))  # episodes that actors simulated before training ended early
+        self._log.record(self.rows, learner.metrics, is_finished=True)
+        self.save_policy()
+        return self.rows
+
+    def _is_complete(self) -> bool:
+        """Return True if all episodes are done, a callback ended training, or enough last episodes are successes."""
+        if len(self.rows) >= self._episodes.config.episodes:
+            return True
+        number = self._episodes.config.learner.stop_after_successes
+        last = self.rows[-number:]
+        if len(last) == number > 0 and all(row["success"] and not row.get("is_demonstration") for row in last):
+            return True
+        return self._sb3_callbacks is not None and self._sb3_callbacks.is_stopped
+
+    def _run_episode(self, callbacks: Sequence[Callback]) -> Row:
+        started, index, config = time.perf_counter(), len(self.rows), self._episodes.config
+        environment_name = select_environment(self._episodes.env, index)
+        row = self._episodes.run(self._learner, *callbacks, index=index)
+        if self._learner.has_diverged():
             raise divergence_error()
         if environment_name is not None:
             row["environment"] = environment_name
-        if num_demonstrated:
-            row["is_demonstration"] = int(episode < num_demonstrated)
+        if self._episodes.demonstrator is not None and config.learner.demonstration_episodes:
+            row["is_demonstration"] = int(index < config.learner.demonstration_episodes)
         row["wall_time"] = time.perf_counter() - started
-        _check_columns(row, rows, num_restored, folder)
-        rows.append(row)
-        training_time += time.perf_counter() - started
-        if report is not None:
-            report(row)
-        learning_log.record(rows, learner.metrics)
-        saving_time_with_next = step_log.seconds + saving_time + last_saving_time
-        is_last = episode + 1 == config.episodes or (sb3_callbacks is not None and sb3_callbacks.is_stopped)
-        is_last = is_last or _ends_with_successes(rows, config.learner.stop_after_successes)
-        if saving_time_with_next <= MAX_SAVING_FRACTION * training_time or episode == 0 or is_last:
-            started = time.perf_counter()
-            _save(folder, config, rows, learner, env, supervised)
-            last_saving_time = time.perf_counter() - started
-            saving_time += last_saving_time
-        learner.submit_episode()
-        if is_last:
-            break
-    learner.finish()
-    remove_step_logs(folder.steps, len(rows))  # episodes that actors simulated ahead before training ended early
-    learning_log.record(rows, learner.metrics, is_finished=True)
-    learned_policy(config, learner, env).save(folder.path, write=write_atomically)
-    return rows
+        self._check_columns(row)
+        self.rows.append(row)
+        return row
 
+    def _check_columns(self, row: Row) -> None:
+        """Raise an `InputError` if a row has other columns than the first one, or a value is not a number."""
+        if self.rows and (changed := sorted(self.rows[0].keys() ^ row.keys())):
+            if len(self.rows) == self._num_restored:
+                raise InputError(
+                    f"the run in {self._folder.path} was begun by another version of guiderail or of its learner, "
+                    "whose episodes have other columns: resume it with that version, or train again in another folder"
+                )
+            raise InputError(
+                f"the column {changed[0]!r} is missing in some episodes: on_episode_end must always return the same "
+                "names"
+            )
+        for name, value in row.items():
+            if name not in WORDS and not isinstance(value, Number | None):
+                raise InputError(f"the column {name!r} of an episode must be a number, not {brief(value)}")
 
-def learned_policy(config: RunConfig, learner: Learner, env: Any) -> Policy:
-    """Return the policy of a learner; raise an `InputError` if `Learner.policy` fails or returns no `Policy`."""
-    try:
-        with _naming_failures(config, f"{type(learner).__name__}.policy", ValueError):
-            policy = learner.policy({"task": config.task, **described_observation(env)})
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{type(learner).__name__}.policy failed: {error}") from error
-    if not isinstance(policy, Policy):
-        raise InputError(f"{type(learner).__name__}.policy must return a Policy, not {brief(policy)}")
-    return policy
+    def _write_table(self) -> None:
+        """Write the table after the checkpoint, which includes it: a kill in between loses nothing."""
+        started = time.perf_counter()
+        if self._episodes.config.human_in_the_loop:
+            self._folder.write_config(self._episodes.config)
+        self._folder.write_episodes(self.rows)
+        self._last_saving_time += time.perf_counter() - started
+
+    def write_checkpoint(self) -> None:
+        """Write the checkpoint: the run's identity, the episodes' rows, and the states of learner and environment."""
+        started, name = time.perf_counter(), f"{type(self._learner).__name__}.state"
+        with _naming_failures(self._episodes.config, name):
+            state = self._learner.state()
+        arrays, values = _checked_state(name, state)
+        own_arrays, own_values = self._episodes.state()
+        stored = {
+            "run": self._episodes.config.identity,
+            "rows": self.rows,
+            "learner": values,
+            "environment": self._episodes.env.unwrapped.np_random.bit_generator.state,
+            "episodes": own_values,
+        }
+        arrays = {**arrays, **{f"episodes/{key}": array for key, array in own_arrays.items()}}
+        save_checkpoint(self._folder.checkpoint, arrays, stored)
+        self._last_saving_time += time.perf_counter() - started
+
+    def restore(self) -> None:
+        """Restore rows, learner and episodes from the checkpoint; without checkpoint and table, there are no rows."""
+        folder, config, table = self._folder, self._episodes.config, self._folder.path / "episodes.csv"
+        remove_step_logs(folder.steps, config.episodes)
+        if not folder.checkpoint.exists() and not table.exists():
+            return  # the run was killed in its first episode
+        arrays, values = load_checkpoint(folder.checkpoint)
+        try:
+            if values["run"] != config.identity:
+                raise InputError(
+                    f"{folder.path / 'config.yaml'} has another task, seed, environment or learner than its "
+                    "checkpoint: restore it, or train again in another folder"
+                )
+            rows = values["rows"]
+            written: Any = folder.episodes() if table.exists() else []
+            if table_text(written) != table_text(rows[: len(written)]):
+                raise InputError(
+                    f"{table} differs from the table in its checkpoint: restore it, or remove it to have it written "
+                    "again"
+                )
+            own = entries_of(arrays, "episodes")
+            learned = {name: array for name, array in arrays.items() if not name.startswith("episodes/")}
+            with _naming_failures(config, f"{type(self._learner).__name__}.restore", *_UNFIT):
+                self._learner.restore(learned, values["learner"])
+            self._episodes.restore(rows, own, values["episodes"])
+            self._episodes.env.unwrapped.np_random.bit_generator.state = values["environment"]
+        except InputError:
+            raise
+        except _UNFIT as error:  # the digest matches, so the content is complete, but of another learner
+            raise InputError(
+                f"the checkpoint {folder.checkpoint} belongs to other settings: give those of "
+                f"{folder.path / 'config.yaml'}"
+            ) from error
+        self.rows, self._num_restored = rows, len(rows)
+        if len(written) < len(rows):  # the run was killed between writing the two files
+            folder.write_episodes(rows)
+
+    def save_policy(self) -> None:
+        """Write the learned policy; raise an `InputError` if `Learner.policy` fails or returns no `Policy`."""
+        config, name = self._episodes.config, f"{type(self._learner).__name__}.policy"
+        try:
+            with _naming_failures(config, name, ValueError):
+                policy = self._learner.policy({"task": config.task, **described_observation(self._episodes.env)})
+        except InputError:
+            raise
+        except ValueError as error:
+            raise InputError(f"{name} failed: {error}") from error
+        if not isinstance(policy, Policy):
+            raise InputError(f"{name} must return a Policy, not {brief(policy)}")
+        policy.save(self._folder.path, write=write_atomically)
 
 
 def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -> AbstractContextManager[None]:
@@ -275,88 +364,21 @@ def _naming_failures(config: RunConfig, action: str, *passed: type[Exception]) -
     return nullcontext() if LEARNERS.is_packaged(config.learner.algorithm) else naming_failures(action, *passed)
 
 
-def _has_diverged(learner: Learner) -> bool:
-    diverged = learner.has_diverged()
-    if not isinstance(diverged, bool | np.bool_):
-        raise InputError(f"{type(learner).__name__}.has_diverged must return True or False, not {brief(diverged)}")
-    return bool(diverged)
-
-
-def _ends_with_successes(rows: Sequence[Mapping[str, Any]], number: int) -> bool:
-    """Return True if the last `number` episodes are successes of the learner itself; False if `number` is 0."""
-    last = rows[-number:]
-    return len(last) == number > 0 and all(row["success"] and not row.get("is_demonstration") for row in last)
-
-
-def _check_columns(row: dict[str, Any], rows: list[dict[str, Any]], num_restored: int, folder: RunFolder) -> None:
-    """Raise an `InputError` if an episode's columns differ from the first episode's, or a value is not a number."""
-    if rows and (changed := sorted(rows[0].keys() ^ row.keys())):
-        if len(rows) == num_restored:
-            raise InputError(
-                f"the run in {folder.path} was begun by another version of guiderail or of its learner, whose episodes "
-                "have other columns: resume it with that version, or train again in another folder"
-            )
-        raise InputError(
-            f"the column {changed[0]!r} is missing in some episodes: on_episode_end must always return the same names"
-        )
-    for name, value in row.items():
-        if name not in WORDS and not isinstance(value, Number | None):
-            raise InputError(f"the column {name!r} of an episode must be a number, not {brief(value)}")
-
-
-def _save(
-    folder: RunFolder,
-    config: RunConfig,
-    rows: list[dict[str, Any]],
-    learner: Learner,
-    env: Any,
-    supervised: SupervisedEpisodes | None,
-) -> None:
-    """Write the checkpoint, which includes the table, and then the table: a kill in between loses nothing."""
-    write_checkpoint(folder, config, rows, learner, env, {} if supervised is None else supervised.state())
-    if supervised is not None:
-        folder.write_config(supervised.config)
-    folder.write_episodes(rows)
-
-
-def write_checkpoint(
-    folder: RunFolder,
-    config: RunConfig,
-    rows: list[dict[str, Any]],
-    learner: Learner,
-    env: Any,
-    more: Mapping[str, Any] | None = None,
-) -> None:
-    """Write the checkpoint: the run's identity, the episodes' rows, the states of learner and environment, and `more`.
-
-    Raises:
-        InputError: If `Learner.state` does not return arrays of numbers by name and values that JSON stores unchanged,
-            or if `Learner.state` of a user's learner fails.
-    """
-    with _naming_failures(config, f"{type(learner).__name__}.state"):
-        state = learner.state()
-    if not (isinstance(state, tuple) and len(state) == 2 and all(isinstance(part, Mapping) for part in state)):
-        raise InputError(f"{type(learner).__name__}.state must return two dictionaries, not {brief(state)}")
+def _checked_state(name: str, state: Any) -> tuple[Mapping[str, np.ndarray], Mapping[str, Any]]:
+    """Return a learner's arrays and values; raise an InputError if a checkpoint would change them."""
     arrays, values = state
-    for name, array in arrays.items():
+    for key, array in arrays.items():
         if np.asarray(array).dtype.kind not in "fiub":
-            raise InputError(f"the array {name!r} of {type(learner).__name__}.state has no numbers: {brief(array)}")
+            raise InputError(f"the array {key!r} of {name} has no numbers: {brief(array)}")
     try:
         json.dumps(values)
     except (TypeError, ValueError) as error:
-        raise InputError(f"the values of {type(learner).__name__}.state must be values of JSON: {error}") from error
+        raise InputError(f"the values of {name} must be values of JSON: {error}") from error
     if changed := next(_changed_by_json(values), None):
         raise InputError(
-            f"the values of {type(learner).__name__}.state must not contain {changed}, because JSON changes it: use "
-            "lists, and text as keys"
+            f"the values of {name} must not contain {changed}, because JSON changes it: use lists, and text as keys"
         )
-    stored = {
-        "run": config.identity,
-        "rows": rows,
-        "learner": values,
-        "environment": env.unwrapped.np_random.bit_generator.state,
-    }
-    save_checkpoint(folder.checkpoint, arrays, stored | dict(more or {}))
+    return arrays, values
 
 
 def _changed_by_json(value: Any) -> Iterator[str]:
@@ -370,44 +392,3 @@ def _changed_by_json(value: Any) -> Iterator[str]:
     elif isinstance(value, list):
         for entry in value:
             yield from _changed_by_json(entry)
-
-
-def restore_checkpoint(
-    folder: RunFolder, config: RunConfig, learner: Learner, env: Any
-) -> tuple[list[dict[str, Any]], int]:
-    """Restore learner and environment from the checkpoint.
-
-    Returns:
-        The rows up to the checkpoint, and the number of rows in `episodes.csv`, which is smaller if the run was killed
-        between writing the two files. Without both files, there are no rows.
-
-    Raises:
-        InputError: If the checkpoint is missing or damaged, belongs to another task, seed, environment or learner than
-            `config`, or contains rows that differ from `episodes.csv`.
-    """
-    table = folder.path / "episodes.csv"
-    if not folder.checkpoint.exists() and not table.exists():
-        return [], 0  # the run was killed in its first episode
-    arrays, values = load_checkpoint(folder.checkpoint)
-    try:
-        if values["run"] != config.identity:
-            raise InputError(
-                f"{folder.path / 'config.yaml'} has another task, seed, environment or learner than its checkpoint: "
-                "restore it, or train again in another folder"
-            )
-        rows = values["rows"]
-        written: Sequence[Mapping[str, Any]] | Any = folder.episodes() if table.exists() else []
-        if table_text(written) != table_text(rows[: len(written)]):
-            raise InputError(
-                f"{table} differs from the table in its checkpoint: restore it, or remove it to have it written again"
-            )
-        with _naming_failures(config, f"{type(learner).__name__}.restore", *_UNFIT):
-            learner.restore(arrays, values["learner"])
-        env.unwrapped.np_random.bit_generator.state = values["environment"]
-    except InputError:
-        raise
-    except _UNFIT as error:  # the digest matches, so the content is complete, but of another learner
-        raise InputError(
-            f"the checkpoint {folder.checkpoint} belongs to other settings: give those of {folder.path / 'config.yaml'}"
-        ) from error
-    return rows, len(written)

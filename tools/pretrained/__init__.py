@@ -18,11 +18,7 @@ def pretrained_names() -> list[str]:
 
 
 def find_run(source: str | Path) -> Path:
-    """Return the folder of a run; that of `pretrained:NAME` is in the package.
-
-    Raises:
-        InputError: If no pretrained policy has the name.
-    """
+    """Return the folder of a run; that of `pretrained:NAME` is in the package."""
     if not str(source).startswith(PRETRAINED):
         return Path(source)
     name = str(source).removeprefix(PRETRAINED)

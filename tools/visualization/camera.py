@@ -16,7 +16,7 @@ from guiderail.tools.evaluation.episode import EnvCallback, Transition
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec, outcome
 from guiderail.tools.files import check_picture, check_video, write_atomically
-from guiderail.tools.visualization.style import new_figure, save_figure
+from guiderail.tools.visualization.figures import new_figure, save_figure
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -66,11 +66,7 @@ class Frames(EnvCallback):
 
 
 def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write `ROWS` × `COLUMNS` of its camera frames as one picture; return the row of its metrics.
-
-    Raises:
-        InputError: If this machine cannot render, or the picture cannot be written.
-    """
+    """Run an episode and write `ROWS` × `COLUMNS` of its camera frames as one picture; return its row."""
     check_picture(picture)
     row, frames = record_frames(episode, ROWS * COLUMNS)
     figure, axes = new_figure(ROWS, COLUMNS, (3.6 * COLUMNS, 2.95 * ROWS))
@@ -81,11 +77,7 @@ def write_image(picture: Path, episode: EpisodeSpec) -> dict[str, Any]:
 
 
 def write_video(video: Path, episode: EpisodeSpec) -> dict[str, Any]:
-    """Run an episode and write its camera frames as an animated image in real time; return the row of its metrics.
-
-    Raises:
-        InputError: If this machine cannot render, or the video cannot be written.
-    """
+    """Run an episode and write its camera frames as an animated image in real time; return the row of its metrics."""
     from PIL import Image
 
     check_video(video)
@@ -110,9 +102,6 @@ def record_frames(episode: EpisodeSpec, number: int) -> tuple[dict[str, Any], li
     """Run an episode; return the row of its metrics and `number` camera frames: time, force, image and path of each.
 
     The path (n, 2) is the robot's path up to the frame, in pixels of the image.
-
-    Raises:
-        InputError: If this machine cannot render.
     """
     row, frames = _run(episode, MAX_FRAMES)
     path = path_in_picture(frames.base)
@@ -138,7 +127,7 @@ def path_in_picture(base: Any) -> np.ndarray:
     The result is empty if the task has no camera.
     """
     task = base.diagram.task
-    camera = None if task is None else task.camera()
+    camera = None if task is None else task.scene().camera
     return np.empty((0, 2)) if camera is None else camera.project(task.scene().to_world(base.trace.measured))
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from pydrake.geometry import Cylinder, Rgba, Role
 from pydrake.systems.framework import Context, EventStatus
 
+from guiderail.diagrams.envs.assemble import template_of
 from guiderail.diagrams.envs.scene import NEWTONS_PER_METER, Scene, contact_forces, in_plane
 from guiderail.diagrams.guidance.registry import is_demonstrated
 from guiderail.diagrams.tasks.registry import environment_id, is_task_folder
@@ -201,9 +202,6 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
         html: File of the page, .html or .htm.
         episode: First episode; the others have the following seeds.
         episodes: Number of episodes, at least 1; None for `EPISODES`.
-
-    Raises:
-        InputError: If the task has no animation, or an argument is invalid.
     """
     if environment_id(episode.task) == episode.task:
         raise InputError(f"{episode.task} is an environment of another package, which has no animation of guiderail")
@@ -221,7 +219,7 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
 
     task = base.diagram.task
     scene = Scene(to_world=in_plane) if task is None else task.scene()
-    constraints = None if task is None else task.constraints()
+    constraints = None if task is None else base.diagram.config.constraints()
     is_demonstration = is_demonstrated(episode.environment.get("guidance"))
     before: PolicyFn = zero_policy(env) if is_demonstration else BaselinePolicy(uniform_random, env, episode.seed)
     sides = {
@@ -257,13 +255,13 @@ def write_page(html: Path, episode: EpisodeSpec, *, episodes: int | None = None)
     camera = next(iter(views.values()), scene.viewpoint)
     if camera is not None:
         meshcat.SetCameraPose(*(np.array(point) for point in camera))
-    has_template = task is not None and "template" in type(task).provides()
+    placed = None if task is None else template_of(base.diagram.config)
     data = {
         "sides": recorded,
         "violation": {"unit": unit, "scale": scale},
         "contact_path": CONTACT_PATH,
         "newtons_per_meter": NEWTONS_PER_METER,
-        "states": [state.name for state in task.template().template.states] if has_template else [],
+        "states": [] if placed is None else [state.name for state in placed.template.states],
         "pale_opacity": PALE_OPACITY,
         "transparent_opacity": TRANSPARENT_OPACITY,
     }

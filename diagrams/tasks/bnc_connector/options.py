@@ -15,8 +15,7 @@ from guiderail.diagrams.tasks.options import (
     COLLISION_FORCE,
     FORCE_LIMITS,
     NEGLIGIBLE_OFFSET,
-    OBSERVATIONS,
-    REWARDS,
+    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
     PriorOptions,
@@ -87,10 +86,8 @@ NOMINAL = BncDimensions()
 SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
 
 
-class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
+class BncOptions(DemonstratedOptions, FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
-
-    rewards, observations = REWARDS, OBSERVATIONS
 
     start_offset_max: Number = Field(
         0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"

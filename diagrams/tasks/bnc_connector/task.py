@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.observation import Observed
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import (
     ARM_VIEW,
     TOOL_VIEW,
-    Camera,
     Scene,
     box_edges,
     front_camera,
@@ -39,8 +38,9 @@ from guiderail.diagrams.tasks.options import (
     REPEATABILITY_STD,
 )
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
@@ -48,11 +48,6 @@ from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, 
 from guiderail.models.objects.bnc_connector.sdf import FRICTION, TOUCHING, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
-
 
 # Size of the task board [m], its distance below the jack [m], and its color. The board has no collision geometry,
 # because the locked plug's mouth reaches slightly below the jack's bottom.
@@ -216,94 +211,80 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 
 
 @register_task("BncConnector")
-class BncConnector(DemonstratedInsertion):
+class BncConnector(BncOptions, DemonstratedInsertion):
     """Insert, align and lock the connector.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28); "shaped" and "aligned" add terms to it.
     """
 
-    Options = BncOptions
-    options: BncOptions
     workpiece, fixture = "plug", "jack"
-    insertion_length = 12.0 * MM
     simulated_rewards = ("aligned",)
-    rewards, observations = BncOptions.rewards, BncOptions.observations
-    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
-    defaults = {
-        "guidance": "skgrl",
-        "station": "gantry",
-        "action_repeat": 10,
-        "action_dims": (0, 1),
-        "history.variance": HISTORY_VARIANCE,
-    }
+    presets = {"hard": HARD}
+    defaults = {"guidance": "skgrl", "action_repeat": 10, "action_dims": (0, 1), "history.variance": HISTORY_VARIANCE}
 
-    def __init__(self, config: EnvConfig):
-        super().__init__(config)
-        o = self.options
-        self.offsets = BncUncertainty(o.fixture_offset, offset_range=o.offset_range)
-        self.collision = Threshold("impedance_force", o.largest_force_limit)
-        dimensions = NOMINAL.with_bore_clearance(o.bore_clearance)
-        dimensions = replace(dimensions, mouth_chamfer=o.mouth_chamfer)
-        self._workcell = BncWorkcell(dimensions, friction=o.friction)
-        if o.demonstrations in DEMONSTRATIONS:
-            # The duration of the shipped demonstrations is known without a fit, which would take seconds.
-            self.num_steps = round(NUM_STEPS * CONTROL_PERIOD / self.control_period)
-        else:
-            self.num_steps = self.reference().num_steps
+    @property
+    def insertion_length(self) -> float:
+        """Length of the insertion [m]."""
+        return 12.0 * MM
+
+    @property
+    def offsets(self) -> BncUncertainty:
+        """Sampler of the offsets."""
+        return BncUncertainty(self.fixture_offset, offset_range=self.offset_range)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the demonstrations [s]; that of the shipped ones is known without a fit, which takes seconds."""
+        is_shipped = self.demonstrations in DEMONSTRATIONS
+        return (NUM_STEPS if is_shipped else self.reference().num_steps) * CONTROL_PERIOD
 
     def workcell(self) -> BncWorkcell:
         """Return the jack in the world and the plug in the tool."""
-        return self._workcell
+        dimensions = replace(NOMINAL.with_bore_clearance(self.bore_clearance), mouth_chamfer=self.mouth_chamfer)
+        return BncWorkcell(dimensions, friction=self.friction)
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the demonstrations in the options."""
-        o = self.options
-        return self.on_clock(reference_trajectory(o.demonstrations, o.num_demonstrations, o.prior_std))
+        return reference_trajectory(self.demonstrations, self.num_demonstrations, self.prior_std)
 
-    def constraints(self) -> LinearConstraints:
+    def constraints(self, num_steps: int = 0) -> LinearConstraints:
         """Return |x|, |y| ≤ `bound`: 2 mm in equation 4.26."""
-        bound = np.array([self.options.bound, self.options.bound, np.inf, np.inf, np.inf, np.inf])
+        bound = np.array([self.bound, self.bound, np.inf, np.inf, np.inf, np.inf])
         return LinearConstraints.box(-bound, bound)
 
     def rim_contact(self) -> RimContact:
         """Return the place on the barrel's rim, with the lugs above the entries of the slots."""
-        return RimContact(RIM, 3.0 * MM, self.options.friction, self._workcell.dimensions.detent_angle)
+        return RimContact(RIM, 3.0 * MM, self.friction, self.workcell().dimensions.detent_angle)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D and y0 that estimate height and turn; a pull confirms the lock instead of the lateral offset."""
-        size = self._workcell.dimensions
+        size = self.workcell().dimensions
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = D[5, 3] = 1.0
         y0[[2, 5]] = size.locked_height, -size.detent_angle
         return D, y0
 
-    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+    def observe(self) -> Observed:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
-        return self.scaled_terms(POSE_CENTER, POSE_SCALE, WRENCH_SCALE)
+        return self.observed(POSE_CENTER, POSE_SCALE, WRENCH_SCALE)
 
-    def termination_terms(self) -> list[TerminationTerm]:
+    def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return success of a locked plug, and collision above the force limit."""
-        return [
-            TerminationTerm("success", {"plug": 6}, self._workcell.locks, steps=self.steps_of(LOCKED_STEPS)),
-            self.force_limit(),
-        ]
+        locked = Condition(self.workcell().locks, seconds=LOCKED_STEPS * CONTROL_PERIOD)
+        return {Termination.SUCCESS: locked, Termination.COLLISION: self.exceeds_force_limit()}
 
-    def symmetry(self) -> Symmetry | None:
-        """Return half a turn about the jack's axis; None if the observation has an image, which is not transformed."""
+    def symmetries(self) -> tuple[Symmetry | None, Symmetry | None]:
+        """Return half a turn about the jack's axis, and the quarter turns and reflections of a plug on the rim.
+
+        An observation with an image has none, because the image is not transformed.
+        """
         if self.has_image:
-            return None
-        across = () if self.config.observation == "state" else (-1.0,) * 4
+            return None, None
+        across = () if self.observation == "state" else (-1.0,) * 4
         observation = (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
-        privileged = (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH)
-        signs = Symmetry.of_signs(observation, HALF_TURN[self.action_dims()], privileged)
-        return signs.pad(len(self.force_limit_terms()))
-
-    def near_symmetry(self) -> Symmetry | None:
-        """Return the half turn, and the quarter turns and reflections that hold while the plug stands on the rim."""
-        if self.has_image:
-            return None
-        sides = sides_of_the_rim(self.config.observation, self.action_dims())
-        return self.symmetry() if sides is None else Symmetry(*sides).pad(len(self.force_limit_terms()))
+        half = Symmetry.of_signs(observation, HALF_TURN, (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH))
+        more = len(self.force_limit_terms())
+        return half.pad(more), Symmetry(*sides_of_the_rim(self.observation)).pad(more)
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
@@ -311,19 +292,17 @@ class BncConnector(DemonstratedInsertion):
         default = scripted_center_of_pressure if difficulty == "hard" else scripted_torque_search
         return {policy.__name__: policy for policy in (default, scripted_torque_search, scripted_center_of_pressure)}
 
-    def camera(self) -> Camera:
-        """Return a camera that looks slightly down at the jack."""
-        return front_camera(np.array(self._workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04)
-
     def scene(self) -> Scene:
-        """Return the demonstrations and the box of the alignment constraint."""
-        to_world = in_frame(self._workcell.X_WT)
+        """Return the demonstrations, the box of the alignment constraint and a camera that looks down at the jack."""
+        workcell = self.workcell()
+        to_world = in_frame(workcell.X_WT)
         near = viewpoint(*to_world(np.array([[0.021, -0.029, 0.029], [0.0, 0.0, 0.017]])))
-        bound, name = self.options.bound, self.options.demonstrations
+        bound, name = self.bound, self.demonstrations
         demonstrations = Demonstrations.load(DEMONSTRATIONS.get(name, Path(name)))
         return Scene(
             to_world=to_world,
-            demonstrations=tuple(demonstrations.first(self.options.num_demonstrations).outputs),
+            camera=front_camera(np.array(workcell.p_WJ) + [0.0, 0.0, 0.022], distance=0.085, height=0.04),
+            demonstrations=tuple(demonstrations.first(self.num_demonstrations).outputs),
             constraint=tuple(to_world(edge) for edge in box_edges((-bound, -bound, 0.0), (bound, bound, 0.015))),
             viewpoint=near,
             arm_views={"the tool": TOOL_VIEW, "the connector": near, "the arm": ARM_VIEW},

@@ -26,9 +26,7 @@ StartHeight = Annotated[
 class GridClampOptions(ForceOptions):
     """Options of GridClamp."""
 
-    rewards = ("shaped", "no_force", "sparse", "aligned")
-    observations = ("state",)
-
+    reward: Literal["shaped", "no_force", "sparse", "aligned"] = Field("shaped", description="name of the reward")
     fixture_offset: Literal["per_run", "per_episode", "none"] = Field(
         "per_run", description="offsets of table and clamp: sampled per run or per episode; none: clamp within 0.15 mm"
     )

@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 
-from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.observation import ObservationTerm, Observed
 from guiderail.diagrams.envs.options import STANDARD
-from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
-from guiderail.diagrams.guidance.prior import PlacedTemplate, ScriptedApproach
-from guiderail.diagrams.stations.station import Impedance
+from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
+from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior, ScriptedApproach
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.grid_clamp.options import HARD, NOMINAL, GridClampOptions
-from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.insertion import PRIVILEGED, InsertionTask
 from guiderail.diagrams.tasks.offsets import HiddenOffsets, in_ring
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold, terminal_reward
+from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy, terminal_reward
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import MM, POSE_SIZE
 from guiderail.models.objects.grid_clamp.geometry import CLAMP_SDF, TABLE_SDF, GridClampDimensions
 from guiderail.models.objects.grid_clamp.sdf import FRICTION, clamp_surfaces, folder_of, table_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.templates import load_template
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
-
 
 STICTION_TOLERANCE = 1e-5
 """Largest creep of a sticking contact [m/s].
@@ -230,7 +225,7 @@ def straight_descent(observation: np.ndarray) -> np.ndarray:
 
 
 @register_task("GridClamp")
-class GridClamp(InsertionTask):
+class GridClamp(GridClampOptions, InsertionTask):
     """Insert the clamp.
 
     Rewards: "shaped" is the thesis's reward (3.11, 3.12). "no_force" is "shaped" without the cost of force, and
@@ -240,90 +235,80 @@ class GridClamp(InsertionTask):
     Without `active_constraints`, only the impedance limits the forces.
     """
 
-    Options = GridClampOptions
-    options: GridClampOptions
     workpiece, fixture = "clamp", "table"
-    rewards, observations = GridClampOptions.rewards, GridClampOptions.observations
     simulated_rewards = ("aligned",)
     snaps_in = True
-    difficulties: ClassVar[Mapping[str, Mapping[str, Any]]] = {STANDARD: {}, "hard": HARD}
-    defaults = {"guidance": "sct", "station": "gantry", "action_repeat": 5, "active_constraints": True}
+    presets = {"hard": HARD}
+    defaults = {"guidance": "sct", "action_repeat": 5, "active_constraints": True}
     learner = {"algorithm": "sac", "preset": "sac_gridclamp"}
 
-    def __init__(self, config: EnvConfig):
-        super().__init__(config)
-        self.offsets = GridClampUncertainty(self.options.fixture_offset)
-        self.collision = Threshold("impedance_force", self.options.largest_force_limit)
-        # The default is 100 actions at 10 Hz; the thesis's episodes have 140 actions on average.
-        self.num_steps = round(self.options.seconds / self.control_period)
-        o, dimensions = self.options, NOMINAL.with_clearance(self.options.clearance)
-        dimensions = replace(dimensions, hole_chamfer=o.hole_chamfer, peg_chamfer=o.peg_chamfer)
-        self._workcell = GridClampWorkcell(dimensions, friction=o.friction)
+    @property
+    def offsets(self) -> GridClampUncertainty:
+        """Sampler of the offsets."""
+        return GridClampUncertainty(self.fixture_offset)
+
+    @property
+    def duration(self) -> float:
+        """Duration of an episode [s]; 100 actions at 10 Hz by default, and 140 on average in the thesis."""
+        return self.seconds
 
     def workcell(self) -> GridClampWorkcell:
         """Return the table with holes and the clamp in the tool."""
-        return self._workcell
+        dimensions = NOMINAL.with_clearance(self.clearance)
+        dimensions = replace(dimensions, hole_chamfer=self.hole_chamfer, peg_chamfer=self.peg_chamfer)
+        return GridClampWorkcell(dimensions, friction=self.friction)
 
-    def template(self) -> PlacedTemplate:
-        """Return the template with one state: an upright clamp in a cuboid around the axis of the middle hole."""
-        active = self.config.options["active_constraints"]
-        return PlacedTemplate(TEMPLATE, {"hole": RigidTransform()}, active, MAX_TRACKING_ERROR)
-
-    def approach(self) -> ScriptedApproach:
-        """Return a straight descent into the hole."""
-        heights = (max(self.options.start_height), -TEMPLATE.parameters["push_m"])
-        return ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2)
+    def prior(self) -> Prior:
+        """Return a template with one state, an upright clamp in a cuboid around the middle hole, and a descent."""
+        heights = (max(self.start_height), -TEMPLATE.parameters["push_m"])
+        return Prior(
+            template=PlacedTemplate(TEMPLATE, {"hole": RigidTransform()}, max_tracking_error=MAX_TRACKING_ERROR),
+            approach=ScriptedApproach(heights, speed=SPEED, reach=TEMPLATE.parameters["width_m"] / 2),
+        )
 
     def rim_contact(self) -> RimContact:
         """Return the place at which the pegs stand on the faces around their holes."""
-        return RimContact(self._workcell.dimensions.peg_length, 2.5 * MM, self.options.friction)
+        return RimContact(self.workcell().dimensions.peg_length, 2.5 * MM, self.friction)
 
     def observable_success(self) -> tuple[np.ndarray, np.ndarray]:
         """Return D (6, 6) and y0 (6,) of an estimate of the height; a pull checks the lateral offset instead."""
         D, y0 = np.zeros((POSE_SIZE, POSE_SIZE)), np.zeros(POSE_SIZE)
         D[2, 2] = 1.0
-        y0[2] = self._workcell.X_FT.translation()[2]
+        y0[2] = self.workcell().X_FT.translation()[2]
         return D, y0
 
-    def observation_terms(self) -> Sequence[ObservationTerm]:
+    def observe(self) -> Observed:
         """Return the terms of the tool's position (3,) in the target frame, the force (3,) and a sampled limit."""
-        return (
+        terms = (
             ObservationTerm("pose", CENTER[:3], SCALE[:3], (0, 1, 2)),
             ObservationTerm("wrench", 0.0, SCALE[3:], (0, 1, 2)),
             *self.force_limit_terms(),
         )
+        return Observed(terms, privileged=PRIVILEGED)
 
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of the reward `config.reward`.
-
-        Values per action in the thesis are divided among the `action_repeat` control steps.
-        """
-        reward, action_repeat = self.config.reward, self.config.action_repeat
-        terms = [
-            terminal_reward({"success": SUCCESS_REWARD}),
-            RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
-        ]
-        if reward != "no_force":
-            terms.append(
-                RewardTerm("force_cost", {"wrench": 6}, lambda wrench: _force_cost(wrench[:3]) / action_repeat)
-            )
-        if reward != "sparse":
-            terms.append(RewardTerm("shaping", {"pose": POSE_SIZE, "last_pose": POSE_SIZE}, _distance_gained))
-        if reward == "aligned":
-            terms.append(RewardTerm("alignment", {"clamp": POSE_SIZE, "last_clamp": POSE_SIZE}, _alignment_gained))
-            terms.append(terminal_reward({"collision": COLLISION_REWARD}, "collision_cost"))
+    def rewards(self) -> Mapping[str, Callable[..., float]]:
+        """Return the terms of the reward; values per action in the thesis are divided among the control steps."""
+        terms: dict[str, Callable[..., float]] = {
+            "terminal_reward": terminal_reward({"success": SUCCESS_REWARD}),
+            "action_cost": lambda action, action_repeat: -float(action @ action) / action_repeat[0],
+        }
+        if self.reward != "no_force":
+            terms["force_cost"] = lambda wrench, action_repeat: _force_cost(wrench[:3]) / action_repeat[0]
+        if self.reward != "sparse":
+            terms["shaping"] = _distance_gained
+        if self.reward == "aligned":
+            terms["alignment"] = _alignment_gained
+            terms["collision_cost"] = terminal_reward({"collision": COLLISION_REWARD})
         return terms
 
-    def termination_terms(self) -> list[TerminationTerm]:
+    def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return success of a seated clamp, and collision above the force limit."""
-        seated = TerminationTerm(
-            "success", {"clamp": POSE_SIZE}, self._workcell.is_seated, steps=self.steps_of(SEATED_STEPS)
-        )
-        return [seated, self.force_limit()]
+        seated = Condition(self.workcell().is_seated, seconds=SEATED_STEPS * CONTROL_PERIOD)
+        return {Termination.SUCCESS: seated, Termination.COLLISION: self.exceeds_force_limit()}
 
     def start_pose(self, rng: np.random.Generator) -> np.ndarray:
         """Return a sampled start pose (6,) [m, rad], at which the preceding skill ends."""
-        start, (lowest, highest) = np.zeros(POSE_SIZE), self.options.start_height
+        start, (lowest, highest) = np.zeros(POSE_SIZE), self.start_height
         start[:3] = *rng.uniform(-START_OFFSET, START_OFFSET, 2), rng.uniform(lowest, highest)
         return start
 
@@ -334,18 +319,16 @@ class GridClamp(InsertionTask):
         policies = (default, scripted_search, scripted_gentle_search, straight_descent)
         return {policy.__name__: policy for policy in policies}
 
-    def camera(self) -> Camera:
-        """Return a camera that looks slightly down at the holes."""
-        return front_camera(np.array(self._workcell.p_WG) + [0.0, 0.0, 0.01], distance=0.17, height=0.075)
-
     def scene(self) -> Scene:
-        """Return the drawing of the cuboid that bounds commands, up to 25 mm above the target."""
-        to_world, parameters = in_frame(self._workcell.X_WT), TEMPLATE.parameters
+        """Return the cuboid that bounds commands, up to 25 mm above the target, and a camera at the holes."""
+        workcell, parameters = self.workcell(), TEMPLATE.parameters
+        to_world = in_frame(workcell.X_WT)
         half = 0.5 * parameters["width_m"]
         edges = box_edges((-half, -half, -parameters["push_m"]), (half, half, 0.025))
         near = viewpoint(*to_world(np.array([[0.045, -0.065, 0.045], [0.0, 0.0, 0.008]])))
         return Scene(
             to_world=to_world,
+            camera=front_camera(np.array(workcell.p_WG) + [0.0, 0.0, 0.01], distance=0.17, height=0.075),
             constraint=tuple(to_world(edge) for edge in edges),
             viewpoint=near,
             arm_views={"the clamp": near, "the arm": ARM_VIEW},

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
-from guiderail.diagrams.envs.options import Number, Options
+from guiderail.diagrams.envs.options import Number, TaskOptions
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
@@ -23,11 +23,11 @@ HARD: Mapping[str, Any] = {
 """Options of difficulty="hard": half the gap width, and two obstacles on sampled sides that must not be touched."""
 
 
-class NarrowPassageOptions(Options):
+class NarrowPassageOptions(TaskOptions):
     """Options of NarrowPassage."""
 
-    rewards = ("sparse", "shaped")
-    observations = ("state", "image")
+    reward: Literal["sparse", "shaped"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "image"] = Field("state", description="name of the observation")
 
     gap_width: Number = Field(
         round(DEFAULT_GEOMETRY.gap_x[1] - DEFAULT_GEOMETRY.gap_x[0], 9),
@@ -63,8 +63,9 @@ class NarrowPassageOptions(Options):
         """True if a reset sets the obstacles; otherwise there is one fixed obstacle, which does not end the episode."""
         return self.obstacle_beside > 0 or self.obstacles_end or self.second_obstacle
 
-    def workcell(self) -> PassageGeometry:
-        """Return the nominal geometry with these options."""
+    @property
+    def geometry(self) -> PassageGeometry:
+        """Nominal geometry with these options."""
         middle = 0.5 * (DEFAULT_GEOMETRY.gap_x[0] + DEFAULT_GEOMETRY.gap_x[1])
         is_default = self.gap_width == type(self).model_fields["gap_width"].default
         half = 0.5 * self.gap_width

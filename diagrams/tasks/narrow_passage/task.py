@@ -3,37 +3,41 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 
-from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.envs.observation import ObservationTerm, Observed
 from guiderail.diagrams.envs.options import STANDARD, Pair, ResetOptions
 from guiderail.diagrams.envs.scene import Camera, Scene, in_plane
 from guiderail.diagrams.envs.trace import Metric
+from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.plane import PlaneStation
-from guiderail.diagrams.stations.station import Station
+from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
 from guiderail.diagrams.tasks.offsets import episode_stream
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, terminal_reward
+from guiderail.diagrams.tasks.task import (
+    Condition,
+    ScriptedPolicy,
+    Task,
+    Threshold,
+    World,
+    add_constant,
+    terminal_reward,
+)
 from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.common.termination import Termination
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.objects.narrow_passage import demonstrations
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
-from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.models.primitives import ReferenceTrajectory
 
 
 def avoids_obstacle_from(rows: Any) -> int | None:
@@ -54,7 +58,7 @@ class NarrowPassageReset(ResetOptions):
 SUCCESS_REWARD = 200.0
 PROGRESS = 100.0  # shaped reward for progress [1/m]
 
-BLOCKED_STEPS = 20  # control steps at a wall without progress after which the robot is blocked
+BLOCKED_TIME = 20 * CONTROL_PERIOD  # time at a wall without progress after which the robot is blocked [s]
 BLOCKED_PROGRESS = 1e-4  # [m] smallest increase of y that counts as progress
 
 # Phases, from −1 to 1, in which the demonstrations pass the first and the second obstacle.
@@ -89,7 +93,7 @@ def reference_trajectory() -> ReferenceTrajectory:
 
 
 @register_task("NarrowPassage")
-class NarrowPassage(Task):
+class NarrowPassage(NarrowPassageOptions, Task):
     """Pass the gap to the goal.
 
     Rewards: "sparse" is the thesis's reward (4.22 to 4.25). "shaped" adds the distance gained towards the goal [cm].
@@ -97,14 +101,11 @@ class NarrowPassage(Task):
     `obstacle_beside` is positive; "image" is 110 × 144 × 3.
     """
 
-    workcell_kind = "plane"
-    Options = NarrowPassageOptions
+    station = PlaneStation
     Reset = NarrowPassageReset
     has_held_out_distribution = True
-    options: NarrowPassageOptions
-    rewards, observations = NarrowPassageOptions.rewards, NarrowPassageOptions.observations
-    defaults = {"station": "plane", "guidance": "skgrl", "action_repeat": 5}
-    difficulties = {STANDARD: {}, "hard": HARD}
+    defaults = {"guidance": "skgrl", "action_repeat": 5}
+    presets = {"hard": HARD}
     clip = 1.0
     statistics = (
         Metric(
@@ -115,60 +116,63 @@ class NarrowPassage(Task):
         ),
     )
 
-    def __init__(self, config: EnvConfig):
-        super().__init__(config)
-        if self.options.obstacles_constrain and self.options.has_sampled_obstacles:
+    def check(self) -> None:
+        """Refuse obstacles that constrain the motion and are sampled."""
+        if self.obstacles_constrain and self.has_sampled_obstacles:
             raise InputError(
                 "obstacles_constrain needs a single fixed obstacle: leave out second_obstacle, obstacle_beside and "
                 "obstacles_end"
             )
-        self._geometry = self.options.workcell()
-        self.num_steps = round(demonstrations.NUM_STEPS * self.default_control_period / self.control_period)
+
+    @property
+    def duration(self) -> float:
+        """Duration of the demonstrations [s]."""
+        return demonstrations.NUM_STEPS * CONTROL_PERIOD
+
+    @property
+    def collision(self) -> Threshold:
+        """Any contact."""
+        return Threshold()
 
     def workcell(self) -> PassageGeometry:
         """Return the walls, the restricted zone, the obstacle and the goal."""
-        return self._geometry
+        return self.geometry
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the obstacles' positions, one after the other, if a reset sets them."""
-        if not self.options.has_sampled_obstacles:
+        if not self.has_sampled_obstacles:
             return {}
-        self.episode_constants["obstacles"] = EpisodeConstant(builder, "obstacles", self._geometry.obstacles.size)
-        return {"obstacles": self.episode_constants["obstacles"].port}
+        return {"obstacles": add_constant(builder, "obstacles", np.zeros(self.geometry.obstacles.size))}
 
-    def reference(self) -> ReferenceTrajectory:
-        """Return the reference trajectory of the nine demonstrations."""
-        return self.on_clock(reference_trajectory())
+    def prior(self) -> Prior:
+        """Return the nine demonstrations, the restricted zone, the walls and the obstacle of `obstacles_constrain`."""
+        geometry = self.geometry
+        motion = None
+        if self.obstacles_constrain:
+            from guiderail.models.control.shapes import Sphere
 
-    def constraints(self) -> LinearConstraints:
-        """Return the constraint that keeps commands out of the restricted zone."""
-        return self._geometry.constraints
+            discs = [Sphere(obstacle, geometry.obstacle_radius) for obstacle in geometry.obstacles]
+            motion = MotionConstraints(geometry.constraints, outside=discs)
+        return Prior(
+            reference=reference_trajectory,
+            constraints=geometry.constraints,
+            motion=motion,
+            keep_out=geometry.keep_out(),
+            start_within=MAX_DEVIATIONS * max(self._start_deviation(held_out) for held_out in (False, True)),
+        )
 
-    def motion_constraints(self) -> MotionConstraints | None:
-        """Return the obstacle as a disc to stay outside of; None without the option `obstacles_constrain`."""
-        if not self.options.obstacles_constrain:
-            return None
-        from guiderail.models.control.shapes import Sphere
-
-        discs = [Sphere(obstacle, self._geometry.obstacle_radius) for obstacle in self._geometry.obstacles]
-        return MotionConstraints(self.constraints(), outside=discs)
-
-    def keep_out(self) -> KeepOut:
-        """Return the walls and the restricted zone."""
-        return self._geometry.keep_out()
-
-    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+    def observe(self) -> Sequence[ObservationTerm] | Observed:
         """Return the phase and sampled obstacles, or the camera above the plane, whose image has +y to the right."""
-        if self.config.observation == "state":
-            offset = self.options.obstacle_beside
-            obstacles = ObservationTerm("obstacles", self._geometry.obstacles.ravel(), offset or 1.0)
+        if self.observation == "state":
+            offset = self.obstacle_beside
+            obstacles = ObservationTerm("obstacles", self.geometry.obstacles.ravel(), offset or 1.0)
             return (ObservationTerm("phase"), obstacles) if offset else (ObservationTerm("phase"),)
         R_WC = RotationMatrix(np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))
-        return Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5]))
+        return Observed(camera=Camera(IMAGE_SIZE, np.deg2rad(30), RigidTransform(R_WC, [0.42, 0.5, 1.5])))
 
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
+    def rewards(self) -> Mapping[str, Callable[..., float]]:
         """Return costs of motion and obstacles and the terminal reward; "shaped" adds the reward for progress."""
-        geometry, poses = self._geometry, {"pose": 2, "last_pose": 2}
+        geometry = self.geometry
 
         def costs(pose: np.ndarray, obstacles: np.ndarray) -> float:
             return sum(geometry.obstacle_cost(pose, obstacle) for obstacle in obstacles.reshape(-1, 2))
@@ -176,22 +180,19 @@ class NarrowPassage(Task):
         def progress(pose: np.ndarray, last_pose: np.ndarray) -> float:
             return PROGRESS * (math.dist(last_pose, geometry.goal) - math.dist(pose, geometry.goal))
 
-        obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2}, geometry.obstacle_cost)
-        if self.options.has_sampled_obstacles:
-            obstacle_cost = RewardTerm("obstacle_cost", {"pose": 2, "obstacles": geometry.obstacles.size}, costs)
-        terms = [
-            RewardTerm("action_cost", poses, lambda pose, last_pose: action_cost(pose - last_pose)),
-            obstacle_cost,
-            terminal_reward({"success": SUCCESS_REWARD}),
-        ]
-        return [*terms, RewardTerm("progress", poses, progress)] if self.config.reward == "shaped" else terms
+        terms = {
+            "action_cost": lambda pose, last_pose: action_cost(pose - last_pose),
+            "obstacle_cost": costs if self.has_sampled_obstacles else geometry.obstacle_cost,
+            "terminal_reward": terminal_reward({"success": SUCCESS_REWARD}),
+        }
+        return {**terms, "progress": progress} if self.reward == "shaped" else terms
 
-    def termination_terms(self) -> list[TerminationTerm]:
+    def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return success at the goal, "blocked" at a wall without progress, and collision if obstacles end episodes.
 
         In a collision, the robot's center is inside an obstacle; this term takes precedence.
         """
-        geometry = self._geometry
+        geometry = self.geometry
 
         def is_blocked(pose: np.ndarray, contact_force: np.ndarray, fallback: np.ndarray) -> bool:
             return (contact_force[0] > 0 or fallback[0] > 0) and geometry.in_passage(pose)
@@ -199,71 +200,56 @@ class NarrowPassage(Task):
         def is_touching(pose: np.ndarray, obstacles: np.ndarray) -> bool:
             return any(geometry.obstacle_distance(pose, obstacle) < 0.0 for obstacle in obstacles.reshape(-1, 2))
 
-        terms = [
-            TerminationTerm("success", {"pose": 2}, geometry.at_goal),
-            TerminationTerm(
-                "blocked",
-                {"pose": 2, "contact_force": 1, "fallback": 1},
-                is_blocked,
-                steps=BLOCKED_STEPS,
-                progress=lambda pose, contact_force, fallback: pose[1],
-                min_progress=BLOCKED_PROGRESS,
-            ),
-        ]
-        collision = TerminationTerm("collision", {"pose": 2, "obstacles": geometry.obstacles.size}, is_touching)
-        return [collision, *terms] if self.options.obstacles_end else terms
+        blocked = Condition(
+            is_blocked,
+            seconds=BLOCKED_TIME,
+            progress=lambda pose, contact_force, fallback: pose[1],
+            min_progress=BLOCKED_PROGRESS,
+        )
+        collision = {Termination.COLLISION: is_touching} if self.obstacles_end else {}
+        return {**collision, Termination.SUCCESS: geometry.at_goal, Termination.BLOCKED: blocked}
 
-    def reset(
-        self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
-    ) -> dict[str, Any]:
+    def reset(self, world: World, rng: np.random.Generator, given: Any) -> dict[str, Any]:
         """Put the robot at the demonstrations' start plus a sampled deviation, and the obstacles on sampled sides.
 
         Raises:
             InputError: If the absolute value of a coordinate of the start is larger than `MAX_START`.
         """
-        start, obstacles = reference_trajectory().means[0].copy(), self._geometry.obstacles
-        deviation = self._start_deviation(options.held_out)
-        if self.options.has_sampled_obstacles or self.options.start_deviation > 0:
-            rng = episode_stream(rng, options.held_out)
-        if self.options.has_sampled_obstacles:
+        start, obstacles = reference_trajectory().means[0].copy(), self.geometry.obstacles
+        deviation = self._start_deviation(given.held_out)
+        if self.has_sampled_obstacles or self.start_deviation > 0:
+            rng = episode_stream(rng, given.held_out)
+        if self.has_sampled_obstacles:
             sides = (-1.0) ** (rng.integers(2) + np.arange(len(obstacles)))
-            obstacles[:, 0] += self.options.obstacle_beside * sides
+            obstacles[:, 0] += self.obstacle_beside * sides
         if deviation:
             start = start + deviation * np.clip(rng.standard_normal(2), -MAX_DEVIATIONS, MAX_DEVIATIONS)
-        if options.start is not None:
-            start = np.array(options.start)
+        if given.start is not None:
+            start = np.array(given.start)
         if np.abs(start).max() > MAX_START:
             raise InputError(f"the reset option 'start' is at most {MAX_START:g} m along x and y, not {start.tolist()}")
-        station.set_pose(context, start)
-        if not self.options.has_sampled_obstacles:
+        world.set_pose(start)
+        if not self.has_sampled_obstacles:
             return {"start": start}
-        assert isinstance(station, PlaneStation)
-        self.episode_constants["obstacles"].set(context, obstacles.ravel())
-        station.set_obstacles(context, obstacles)
+        world.set("obstacles", obstacles.ravel())
+        world.station.set_obstacles(world.context, obstacles)
         return {"start": start, "obstacles": obstacles}
 
-    def start_within(self) -> float:
-        """Return the largest start offset along x and y of a reset, training or held-out [m]."""
-        return MAX_DEVIATIONS * max(self._start_deviation(held_out) for held_out in (False, True))
-
     def _start_deviation(self, held_out: bool) -> float:
-        return self.options.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
+        return self.start_deviation or (HELD_OUT_DEVIATION if held_out else 0.0)
 
     @classmethod
     def scripted_policies(cls, difficulty: str = STANDARD) -> Mapping[str, ScriptedPolicy]:
         """Return the scripted policy by its name."""
         return {"scripted_slalom": scripted_slalom}
 
-    def camera(self) -> Camera:
-        """Return a camera above the plane."""
-        X_WC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.4, 0.5, 1.5])
-        return Camera((480, 640), np.deg2rad(40), X_WC)
-
     def scene(self) -> Scene:
-        """Return the demonstrations and the edge of the restricted zone."""
-        edge = np.array([[self._geometry.zone_x, -0.1, 0.0], [self._geometry.zone_x, 1.1, 0.0]])
+        """Return the demonstrations, the edge of the restricted zone, and a camera above the plane."""
+        edge = np.array([[self.geometry.zone_x, -0.1, 0.0], [self.geometry.zone_x, 1.1, 0.0]])
+        X_WC = RigidTransform(RotationMatrix(np.diag([1.0, -1.0, -1.0])), [0.4, 0.5, 1.5])
         return Scene(
             to_world=in_plane,
+            camera=Camera((480, 640), np.deg2rad(40), X_WC),
             demonstrations=tuple(demonstrations.load().outputs),
             constraint=(edge,),
             viewpoint=((0.4, 0.35, 0.78), (0.4, 0.48, 0.0)),

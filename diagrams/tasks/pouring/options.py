@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from annotated_types import Len
 from pydantic import Field
 from pydrake.math import RigidTransform
 
-from guiderail.diagrams.envs.options import Integer, Number, Numbers, Options, Pair, ResetOptions
+from guiderail.diagrams.envs.options import Integer, Number, Numbers, Pair, ResetOptions, TaskOptions
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import MUG, Ball
@@ -19,7 +19,7 @@ from guiderail.models.templates import SharedControlTemplate, load_template
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]
 FULL_TILT = 0.8  # tilting speed at an input of 1 [rad/s]
 NO_FUNNEL = 0.24  # height of a funnel that has no effect, that of the template's ceiling [m]
-# Default input_speed of "sct" with the sparse reward, at which random inputs sometimes succeed.
+# Default input_speed with the sparse reward, at which random inputs sometimes succeed.
 SPARSE_INPUT_SPEED = 1.7
 
 
@@ -91,12 +91,10 @@ inputs then move the thermos four times less, and a success needs four times as 
 MOST_BALLS = 8  # largest number of balls
 
 
-class PouringOptions(Options):
+class PouringOptions(TaskOptions):
     """Options of Pouring."""
 
-    rewards = ("shaped", "sparse", "hand_shaped")
-    observations = ("state",)
-
+    reward: Literal["shaped", "sparse", "hand_shaped"] = Field("shaped", description="name of the reward")
     balls: Integer = Field(2, ge=2, le=MOST_BALLS, description="number of balls")
     balls_in: Integer | None = Field(
         None, ge=1, le=MOST_BALLS, description="balls that have to be in the mug; default: all"
@@ -106,7 +104,7 @@ class PouringOptions(Options):
         None,
         ge=0.2,
         le=2.0,
-        description="factor of the template's input speed; default: 1, or 1.7 with guidance=sct and the sparse reward",
+        description="factor of the template's input speed; default: 1, or 1.7 with the sparse reward",
     )
     mug_inner_diameter: Number = Field(MUG.inner_diameter, description="inner diameter of the mug [m]")
     mug_depth: Number = Field(MUG.depth, description="inner depth of the mug [m]")

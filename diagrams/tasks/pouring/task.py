@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, OutputPort
+from pydrake.systems.framework import DiagramBuilder, OutputPort
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.envs.observation import ObservationTerm
 from guiderail.diagrams.envs.options import STANDARD
 from guiderail.diagrams.envs.scene import Camera, Scene, in_frame, look_at, viewpoint
 from guiderail.diagrams.guidance.guidance import Guidance
-from guiderail.diagrams.guidance.prior import PlacedTemplate
+from guiderail.diagrams.guidance.prior import PlacedTemplate, Prior
 from guiderail.diagrams.stations.pouring import PouringConfig, PouringStation, make_mug
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.tasks.offsets import episode_stream, in_ring
@@ -31,15 +32,19 @@ from guiderail.diagrams.tasks.pouring.options import (
     make_template,
 )
 from guiderail.diagrams.tasks.registry import register_task
-from guiderail.diagrams.tasks.task import EpisodeConstant, ScriptedPolicy, Task, Threshold, terminal_reward
+from guiderail.diagrams.tasks.task import (
+    Condition,
+    ScriptedPolicy,
+    Task,
+    Threshold,
+    World,
+    add_constant,
+    terminal_reward,
+)
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
-
+from guiderail.models.templates import SharedControlTemplate
 
 TERMINAL = {"success": 200.0, "collision": -10.0}  # equation 3.5
 SHAPING = 200.0  # reward per progress of the template, equation 3.7
@@ -62,6 +67,13 @@ def _aiming(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, state: np.ndarr
         return 0.0
     before, after = (float(np.linalg.norm(tip[:2] - AIM)) for tip in (last_tip_in_mug, tip_in_mug))
     return AIMING * (before - after)
+
+
+def _approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray, action_repeat: np.ndarray) -> float:
+    """Return the reward of equation 3.9."""
+    distance = np.linalg.norm(tip_in_mug[:3])
+    bonus = NEAR_BONUS / action_repeat[0] if distance <= NEAR else 0.0
+    return float(APPROACH * (np.linalg.norm(last_tip_in_mug[:3]) - distance) + bonus)
 
 
 def _tilting(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
@@ -96,7 +108,7 @@ def sample_mug_error(episode: np.random.Generator, options: PouringOptions, rese
 
 
 MAX_TRACKING_ERROR = 0.05  # largest distance between robot and command [m]
-POURED_STEPS = 10  # consecutive steps with the balls in the mug that count as success, at the default control period
+POURED_TIME = 10 * PouringConfig().control_period  # time with the balls in the mug that counts as success [s]
 # Range of the thermos's start in the frame of the mug's tip, inside the template's workspace.
 START_AZIMUTH_DEG = (-120.0, -75.0)
 START_RADIUS = (0.24, 0.30)  # [m]
@@ -181,7 +193,7 @@ def _tilt(observation: np.ndarray) -> float:
 
 
 @register_task("Pouring")
-class Pouring(Task):
+class Pouring(PouringOptions, Task):
     """Pour both balls into the mug.
 
     Rewards: "sparse" follows equations 3.5 and 3.6, "shaped" adds the template's transition distances (3.7), and
@@ -190,110 +202,89 @@ class Pouring(Task):
     template's inputs are as slow as in the thesis, and its state Pour begins so early that a constant action spills.
     """
 
-    workcell_kind = "pouring"
-    Options = PouringOptions
+    station = PouringStation
     Reset = PouringReset
     has_held_out_distribution = True
-    options: PouringOptions
-    rewards, observations = PouringOptions.rewards, PouringOptions.observations
-    defaults = {"guidance": "sct", "station": "pouring", "action_repeat": 10}
-    difficulties = {STANDARD: {}, "hard": HARD, "thesis": THESIS}
+    defaults = {"guidance": "sct", "action_repeat": 10}
+    presets = {"hard": HARD, "thesis": THESIS}
     learner = {"algorithm": "sac", "preset": "pouring"}
-    num_steps: int  # default: 1500, which is 150 actions at 10 Hz, about as many as in the thesis
     clip = 10.0
-    collision = Threshold("touched")
-    pushable = False  # the balls in the thermos would not move with the robot
 
-    def __init__(self, config: EnvConfig):
-        super().__init__(config)
-        self.options.check()
-        self._scene_config = PouringConfig(
-            mug=make_mug(self.options.mug_inner_diameter, self.options.mug_depth, self.options.ball),
-            ball=self.options.ball,
-            num_balls=self.options.balls,
-            substeps=round(self.control_period / PouringConfig.plant_period),
-        )
-        self.num_steps = round(self.options.time_limit / self.control_period)
-        is_sparse_sct = (config.guidance, config.reward) == ("sct", "sparse")
-        speed = self.options.input_speed or (SPARSE_INPUT_SPEED if is_sparse_sct else 1.0)
-        aiming = {"aim_speed": self.options.aim_speed, "pour_speed": self.options.pour_speed}
-        self._template = make_template(
-            self._scene_config,
-            speed,
-            shield=self.options.shield,
-            pour_distance=self.options.pour_distance,
-            funnel=self.options.funnel,
-            **(aiming if self.options.aim else {}),
-        )
+    @property
+    def duration(self) -> float:
+        """Duration of an episode [s]; by default 150 actions at 10 Hz, about as many as in the thesis."""
+        return self.time_limit
+
+    @property
+    def collision(self) -> Threshold:
+        """Any contact since the start of the episode."""
+        return Threshold("touched")
 
     def workcell(self) -> PouringConfig:
         """Return the vessels and their poses."""
-        return self._scene_config
+        mug = make_mug(self.mug_inner_diameter, self.mug_depth, self.ball)
+        return PouringConfig(mug=mug, ball=self.ball, num_balls=self.balls)
+
+    @cached_property
+    def template(self) -> SharedControlTemplate:
+        """Template of the thesis (figure 2.2, table 3.3), or the template with aiming in the state Pour."""
+        speed = self.input_speed or (SPARSE_INPUT_SPEED if self.reward == "sparse" else 1.0)
+        aiming = {"aim_speed": self.aim_speed, "pour_speed": self.pour_speed} if self.aim else {}
+        return make_template(
+            self.workcell(),
+            speed,
+            shield=self.shield,
+            pour_distance=self.pour_distance,
+            funnel=self.funnel,
+            **aiming,
+        )
+
+    def prior(self) -> Prior:
+        """Return the template, whose objects are at their nominal poses."""
+        frames = partial(frames_of, X_TMug=RigidTransform())
+        return Prior(
+            template=lambda: PlacedTemplate(self.template, frames(self.template), max_tracking_error=MAX_TRACKING_ERROR)
+        )
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the error of the estimated mug position, if the option `aim` is set."""
-        if not self.options.aim:
-            return {}
-        self.episode_constants["mug_error"] = EpisodeConstant(builder, "mug_error", 2)
-        return {"mug_error": self.episode_constants["mug_error"].port}
+        return {"mug_error": add_constant(builder, "mug_error", np.zeros(2))} if self.aim else {}
 
-    def template(self) -> PlacedTemplate:
-        """Return the template of the thesis (figure 2.2, table 3.3), or the template with aiming in the state Pour."""
-        active = self.config.options["active_constraints"]
-        return PlacedTemplate(
-            self._template,
-            frames_of(self._template, RigidTransform()),
-            active_constraints=active,
-            max_tracking_error=MAX_TRACKING_ERROR,
-        )
-
-    def observation_terms(self) -> Sequence[ObservationTerm]:
+    def observe(self) -> Sequence[ObservationTerm]:
         """Return the tip's pose in the frame of the mug's tip: position in units of 0.2 m, then rotation vector.
 
         With the option `aim`, the error of the estimated mug position and the template's state, from −1 to 1, follow.
         """
         tip = ObservationTerm("tip_in_mug", 0.0, [1.0 / POSITION_SCALE] * 3 + [1.0] * 3)
-        return (
-            (tip, ObservationTerm("mug_error", 0.0, MAX_MUG_ERROR), ObservationTerm("state", 1.0))
-            if self.options.aim
-            else (tip,)
-        )
+        more = ObservationTerm("mug_error", 0.0, MAX_MUG_ERROR), ObservationTerm("state", 1.0)
+        return (tip, *more) if self.aim else (tip,)
 
-    def reward_terms(self, num_actions: int) -> list[RewardTerm]:
-        """Return the terms of the reward `config.reward`.
+    def rewards(self) -> Mapping[str, Callable[..., float]]:
+        """Return the terms of the reward.
 
         The reward of an action is the sum over its control steps. Values that the thesis defines per action are
         therefore divided by `action_repeat`. With the option `aim`, "shaped" includes the distance gained towards `AIM`
         in the state Pour; the progress of the shielded template includes the distance gained in its state aim.
         """
-        reward, action_repeat = self.config.reward, self.config.action_repeat
-        poses = {"tip_in_mug": 6, "last_tip_in_mug": 6}
-        terms = [
-            terminal_reward(TERMINAL),
-            RewardTerm("action_cost", {"action": num_actions}, lambda action: -float(action @ action) / action_repeat),
-        ]
-        if reward == "shaped":
-            terms.append(RewardTerm("shaping", {"progress": 1, "last_progress": 1}, _progress_gained))
-            if self.options.aim and not self.options.shield:
-                terms.append(RewardTerm("aiming", {**poses, "state": 1}, _aiming))
-        if reward == "hand_shaped":
-
-            def approach(tip_in_mug: np.ndarray, last_tip_in_mug: np.ndarray) -> float:
-                """Return the reward of equation 3.9."""
-                distance = np.linalg.norm(tip_in_mug[:3])
-                bonus = NEAR_BONUS / action_repeat if distance <= NEAR else 0.0
-                return float(APPROACH * (np.linalg.norm(last_tip_in_mug[:3]) - distance) + bonus)
-
-            terms += [RewardTerm("approach", poses, approach), RewardTerm("tilting", poses, _tilting)]
+        terms: dict[str, Callable[..., float]] = {
+            "terminal_reward": terminal_reward(TERMINAL),
+            "action_cost": lambda action, action_repeat: -float(action @ action) / action_repeat[0],
+        }
+        if self.reward == "shaped":
+            terms["shaping"] = _progress_gained
+            if self.aim and not self.shield:
+                terms["aiming"] = _aiming
+        if self.reward == "hand_shaped":
+            terms |= {"approach": _approach, "tilting": _tilting}
         return terms
 
-    def termination_terms(self) -> list[TerminationTerm]:
+    def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return collision, success and spill; a collision takes precedence over a success.
 
         An episode ends as a spill if so many balls have fallen that fewer than `needed` balls can be in the mug. It is
-        a success after `needed` balls have been in the mug for `POURED_STEPS`, because a ball can bounce out again.
+        a success after `needed` balls have been in the mug for `POURED_TIME`, because a ball can bounce out again.
         """
-        config, needed = self._scene_config, self.options.needed
+        config, needed = self.workcell(), self.needed
         mug, thermos, radius = config.mug, config.thermos, config.ball.diameter / 2
         fall = config.mug.height + config.stand_height
 
@@ -311,16 +302,13 @@ class Pouring(Task):
             )
             return bool(fallen > config.num_balls - needed)
 
-        size, steps = 6 * config.num_balls, self.steps_of(POURED_STEPS)
-        return [
-            TerminationTerm("collision", {"touched": 1}, lambda touched: touched[0] > 0),
-            TerminationTerm("success", {"balls_in_mug": size}, is_poured, steps=steps),
-            TerminationTerm("spill", {"balls_in_mug": size, "balls_in_thermos": size}, is_spilled),
-        ]
+        return {
+            Termination.COLLISION: lambda touched: touched[0] > 0,
+            Termination.SUCCESS: Condition(is_poured, seconds=POURED_TIME),
+            Termination.SPILL: is_spilled,
+        }
 
-    def reset(
-        self, station: Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
-    ) -> dict[str, Any]:
+    def reset(self, world: World, rng: np.random.Generator, given: Any) -> dict[str, Any]:
         """Place the mug, the upright thermos and the balls at sampled poses; an unreachable start is sampled again.
 
         Values that a reset option replaces are also sampled. The start is inside the constraints of the template's
@@ -331,23 +319,22 @@ class Pouring(Task):
             InputError: If a reset option is too large, the option `start` is outside the constraints, or the arm
                 reaches no sampled start.
         """
-        assert isinstance(station, PouringStation)
-        episode = episode_stream(rng, options.held_out)
+        template, episode = self.template, episode_stream(rng, given.held_out)
         for _ in range(MAX_START_SAMPLES):
             azimuth = np.deg2rad(episode.uniform(*START_AZIMUTH_DEG))
             radius, height = episode.uniform(*START_RADIUS), episode.uniform(*START_HEIGHT)
             p_MP = np.array([radius * np.cos(azimuth), radius * np.sin(azimuth), height])
-            p_TMug = self.options.mug_offset * episode.uniform(-1.0, 1.0, 2)
-            p_MP = p_MP if options.start is None else np.array(options.start)
-            p_TMug = p_TMug if options.mug_position is None else np.array(options.mug_position)
+            p_TMug = self.mug_offset * episode.uniform(-1.0, 1.0, 2)
+            p_MP = p_MP if given.start is None else np.array(given.start)
+            p_TMug = p_TMug if given.mug_position is None else np.array(given.mug_position)
             if np.abs(p_TMug).max() > MAX_MUG_OFFSET:
                 raise InputError(f"the mug can be moved by at most {MAX_MUG_OFFSET} m along x and y")
-            error = sample_mug_error(episode, self.options, options)
+            error = sample_mug_error(episode, self, given)
             # The error moves the actual mug, so that the estimated mug position stays within reach.
             estimated, p_TMug = RigidTransform([*p_TMug, 0.0]), p_TMug - error
-            frames = frames_of(self._template, estimated, RigidTransform([*p_TMug, 0.0]))
+            frames = frames_of(template, estimated, RigidTransform([*p_TMug, 0.0]))
             # The thermos is oriented as in the template's first state, so that all guidance has the same start pose.
-            X_TP = self._template.project(self._template.initial_state, RigidTransform(estimated @ p_MP), frames)
+            X_TP = template.project(template.initial_state, RigidTransform(estimated @ p_MP), frames)
             nearest = estimated.inverse() @ X_TP.translation()
             if np.abs(nearest - p_MP).max() > START_TOLERANCE:
                 raise InputError(
@@ -355,17 +342,17 @@ class Pouring(Task):
                     f"{p_MP.tolist()}: the nearest start is {nearest.round(4).tolist()}"
                 )
             try:
-                station.set_pose(context, transform_to_pose(X_TP))
+                world.set_pose(transform_to_pose(X_TP))
                 break
             except InputError as error_of_reach:
                 unreachable = error_of_reach
         else:
             raise unreachable
-        station.set_mug(context, RigidTransform([*p_TMug, 0.0]))
-        if isinstance(guidance, Guidance):
-            guidance.set_frames(context, frames)
-        if self.options.aim:
-            self.episode_constants["mug_error"].set(context, error)
+        world.station.set_mug(world.context, RigidTransform([*p_TMug, 0.0]))
+        if isinstance(world.guidance, Guidance):
+            world.guidance.set_frames(world.context, frames)
+        if self.aim:
+            world.set("mug_error", error)
         return {"start": p_MP, "mug_position": p_TMug} | ({"mug_error": error} if error.any() else {})
 
     @classmethod
@@ -376,14 +363,12 @@ class Pouring(Task):
         policies = (default, scripted_pour, scripted_pour_from_above, scripted_pour_aimed, scripted_pour_blind)
         return {policy.__name__: policy for policy in policies}
 
-    def camera(self) -> Camera:
-        """Return a camera in front of the mug, slightly above it."""
-        forward = np.array([-0.55, 0.75, -0.35]) / np.linalg.norm([-0.55, 0.75, -0.35])
-        target = self._scene_config.X_WT.translation() + [0.0, -0.05, 0.08]
-        return Camera((480, 360), np.deg2rad(40), look_at(target - forward, target))
-
     def scene(self) -> Scene:
-        """Return the frame, viewpoint and line width in which the tip's paths are drawn."""
-        center = self._scene_config.X_WT.translation()
-        to_world = in_frame(self._scene_config.X_WT)
-        return Scene(to_world, viewpoint=viewpoint(center + [0.25, -0.5, 0.25], center), line_radius=0.001)
+        """Return the frame, viewpoint and line width in which the tip's paths are drawn, and a camera at the mug."""
+        X_WT = self.workcell().X_WT
+        center = X_WT.translation()
+        forward = np.array([-0.55, 0.75, -0.35]) / np.linalg.norm([-0.55, 0.75, -0.35])
+        target = center + [0.0, -0.05, 0.08]
+        camera = Camera((480, 360), np.deg2rad(40), look_at(target - forward, target))
+        near = viewpoint(center + [0.25, -0.5, 0.25], center)
+        return Scene(in_frame(X_WT), camera=camera, viewpoint=near, line_radius=0.001)

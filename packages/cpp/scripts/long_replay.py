@@ -11,7 +11,7 @@ from importlib.resources import files
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from random_laws import LAWS
+from random_laws import LAWS, TOLERANCE, TOLERANCES
 from test_laws import FLAGS
 
 
@@ -31,7 +31,8 @@ def main() -> int:
             for path, content in zip(("data", "recording"), LAWS[law](arguments.steps), strict=True):
                 (folder / path).write_bytes(content)
             for flags_name in FLAGS:
-                command = [folder / flags_name, folder / "data", folder / "recording", "1e-12"]
+                command = [folder / flags_name, folder / "data", folder / "recording"]
+                command.append(str(TOLERANCES.get(law, TOLERANCE)))
                 result = subprocess.run(command, capture_output=True, text=True, check=False)
                 failed |= result.returncode != 0
                 verdict = "equal" if result.returncode == 0 else "DIFFERENT"

@@ -45,6 +45,17 @@ def test_controller_and_node_run_the_skill_with_a_double_of_ros2(tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+@needs_compiler
+def test_runner_survives_wrong_measurements_and_keeps_its_limits(tmp_path):
+    folder = tmp_path / "skill"
+    export_cpp("pretrained:connector", folder)
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
+    command = [tmp_path / "runner_test", folder / "skill.safetensors", folder / "test/recording.safetensors"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
 def test_description_lists_signals_and_action(tmp_path):
     export_cpp("pretrained:clamp", tmp_path / "skill")
     skill = json.loads((tmp_path / "skill/skill.json").read_text())
@@ -53,11 +64,11 @@ def test_description_lists_signals_and_action(tmp_path):
     assert [entry["name"] for entry in skill["action"]] == ["input 0", "input 1", "input 2"]
 
 
-def test_export_refuses_equal_bounds():
+def test_export_refuses_equal_bounds_when_it_has_a_history():
     reference = ReferenceTrajectory(np.arange(4.0), np.zeros((4, 2)), np.tile(1e-4 * np.eye(2), (4, 1, 1)))
     constraints = LinearConstraints.box([0.0, -1.0], [0.0, 1.0])
     with pytest.raises(InputError, match="equal lower and upper bounds"):
-        primitive_arrays(PrimitiveLaw(LcNsKmp(reference, constraints=constraints)))
+        primitive_arrays(PrimitiveLaw(LcNsKmp(reference, constraints=constraints, history=2)))
 
 
 def test_export_refuses_a_folder_that_exists(tmp_path):

@@ -136,6 +136,15 @@ def test_import_reads_an_export_whose_folder_ends_in_mcap(tmp_path):
         import_recording(tmp_path / "empty.mcap", tmp_path / "none.npz")
 
 
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("a.db3", "metadata.yaml"), ("a.hdf5", "to a CSV file"), ("a.npy", "x_m")]
+)
+def test_import_of_another_format_states_a_remedy(name, remedy, tmp_path):
+    (tmp_path / name).write_bytes(b"0")
+    with pytest.raises(InputError, match=remedy):
+        import_recording(tmp_path / name, tmp_path / "out.npz")
+
+
 def test_import_refuses_two_measured_poses_without_signal(tmp_path):
     pytest.importorskip("rosbags")
     write_bag(tmp_path / "bag", {"/a/pose": "base", "/b/pose": "base"})

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
-from guiderail.tools.files import load_demonstrations
+from guiderail_data.reading import load_demonstrations
 from guiderail_data.validate import fit_bounds, validate_demonstrations
 
 CLOCK = np.linspace(0, 1, 30)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.files import load_demonstrations
 from guiderail_data.convert import import_recording
+from guiderail_data.reading import load_demonstrations
 from guiderail_data.validate import fit_bounds
 
 

@@ -51,7 +51,7 @@ def test_train_passes_robot_and_imports_to_hardware(options, robot, capsys, tmp_
         passed.update(keywords, connection=connection)
         return {"run": str(out)}
 
-    monkeypatch.setattr("guiderail_hardware.robot.train.train_on_robot", train_on_robot)
+    monkeypatch.setattr("guiderail_hardware.robot.robot_training.train_on_robot", train_on_robot)
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "desk.py"
     file.write_text(STATION)
@@ -68,7 +68,7 @@ def test_deploy_imports_the_station_before_its_use(capsys, tmp_path, monkeypatch
         passed.update(keywords)
         return {"episodes": episodes}
 
-    monkeypatch.setattr("guiderail_hardware.robot.evaluate.evaluate_on_robot", evaluate_on_robot)
+    monkeypatch.setattr("guiderail_hardware.robot.robot_evaluation.evaluate_on_robot", evaluate_on_robot)
     monkeypatch.setattr(STATIONS, "_entries", {**STATIONS._entries})  # restored after the test
     file = tmp_path / "other_desk.py"
     file.write_text(STATION)

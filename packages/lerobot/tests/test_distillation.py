@@ -9,7 +9,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import FORMAT, Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.config import make_config
+from guiderail.tools.learning.learner_config import make_config
 from guiderail.tools.learning.train import train
 from guiderail_lerobot.base_policy import chunk_samples, find_base_policy
 from guiderail_lerobot.config import DistillationConfig

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, stations_of
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import InsertionReset
@@ -20,9 +20,8 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import Demonstrations
 from guiderail.tools.cli.main import main
 from guiderail.tools.environments import task_named
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.learning.train import train
 from guiderail_parts import create_task as create_task_module
 from guiderail_parts import trial
 from guiderail_parts.contact import rank
@@ -43,6 +42,14 @@ pytest.importorskip("trimesh")
 pytest.importorskip("manifold3d")
 
 from oracles.parts import PARTS, screw
+
+RUN = {}
+
+
+@pytest.fixture(autouse=True)
+def new_run():
+    """Clear the hidden values of a run before each test."""
+    RUN.clear()
 
 
 def call(*arguments, code=0):
@@ -156,12 +163,16 @@ def test_created_task_can_be_trained_and_evaluated(folder, tmp_path, capsys):
 def test_created_task_has_its_own_learner_and_symmetry(folder):
     name, _ = task_named(str(folder))
     recommended = yaml.safe_load((folder / "task.yaml").read_text())["recommended"]
-    config = configure(name, {}, **with_defaults(name, {"settings": {"batch_size": 32}}))
+    config = configure(name, {}, **{"settings": {"batch_size": 32}})
     for key, value in recommended["environment"].items():
         assert config.environment[key] == (tuple(value) if isinstance(value, list) else value)
     assert (config.learner.symmetry, config.learner.batch_size) == ("near", 32)
-    task = EnvConfig.resolve(name, {}).make_task()
-    assert task.symmetry().actions.shape == (7, 2, 2)  # a square has eight symmetries, one of which is the identity
+    task = EnvConfig.resolve(name, {}).declared
+    assert task.symmetries()[0].actions.shape == (
+        7,
+        6,
+        6,
+    )  # a square has eight symmetries, one of which is the identity
     changed = yaml.safe_load((folder / "task.yaml").read_text())
     for wrong in ({"sides": ["upside down"]}, {"time_step": 0.003}):
         with pytest.raises(InputError, match=next(iter(wrong))):
@@ -176,9 +187,9 @@ def test_difficulties_of_a_created_task_bound_offset_command(folder):
         ("hard", lambda x, y, z: low <= np.hypot(x, y) <= high and abs(z) <= np.deg2rad(turn), hard["bound"]),
         ("automate", lambda x, y, z: max(abs(x), abs(y)) <= 2e-3 and abs(z) <= np.deg2rad(5.0), 3.5e-3),
     ):
-        task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).make_task()
+        task = EnvConfig.resolve(str(folder), {"difficulty": difficulty}).declared
         rng = np.random.default_rng(0)
-        offsets = np.array([task.offsets.draw(rng, InsertionReset())[0] for _ in range(200)])
+        offsets = np.array([task.offsets.draw(rng, InsertionReset(), RUN)[0] for _ in range(200)])
         assert all(is_inside(*offset) for offset in offsets)
         assert (np.ptp(offsets[:, :2], axis=0) > 0.9 * 2.0 * min(high, 2e-3)).all()
         np.testing.assert_allclose(task.constraints().nearest(np.full(6, 9e-3))[:3], [bound, bound, 9e-3])
@@ -200,7 +211,7 @@ def test_hard_is_calibrated_with_a_single_episode(folder):
 def test_parts_of_convex_pieces_are_simulated_in_mujoco(folder):
     pytest.importorskip("guiderail_mujoco.station", reason="needs guiderail-mujoco")
     file = read_task_file(folder)
-    assert "mujoco" in load_task_folder(folder).stations()
+    assert "mujoco" in stations_of(load_task_folder(folder))
     assert len(file.plug.convex) >= 1
     assert len(file.socket.convex) >= 5  # four walls and the bottom
     assert trial.insert_in_mujoco(folder, file) == (True, False)
@@ -258,13 +269,13 @@ def test_real_time_factor_counts_only_simulated_time(folder, monkeypatch, offset
 
 
 def test_seated_plug_may_be_turned_by_up_to_20_degrees(folder):
-    task = EnvConfig.resolve(str(folder), {}).make_task()
+    task = EnvConfig.resolve(str(folder), {}).declared
     turned = [task.file.tolerance.accepts(np.array([*[0.0] * 5, np.deg2rad(turn)])) for turn in (19.0, 21.0)]
     assert turned == [True, False]
 
 
 def test_bound_is_refused_when_the_file_has_phases(folder):
-    task = EnvConfig.resolve(str(folder), {"bound": 3e-3}).make_task()
+    task = EnvConfig.resolve(str(folder), {"bound": 3e-3}).declared
     lower, upper = ((x, x, *[None] * 4) for x in (-1e-3, 1e-3))
     phases = Bounds.model_validate({"lower": (lower,) * 2, "upper": (upper,) * 2, "phases": (0.0, 0.5)})
     task.file = task.file.model_copy(update={"bounds": phases})
@@ -331,16 +342,16 @@ def turning(tmp_path_factory):
 
 
 def test_unknown_turn_is_demonstrated_and_reached_by_actions(turning):
-    task = EnvConfig.resolve(str(turning), {"difficulty": "hard"}).make_task()
+    task = EnvConfig.resolve(str(turning), {"difficulty": "hard"}).declared
     rng = np.random.default_rng(0)
-    turns = np.rad2deg([task.offsets.draw(rng, InsertionReset())[0][2] for _ in range(200)])
+    turns = np.rad2deg([task.offsets.draw(rng, InsertionReset(), RUN)[0][2] for _ in range(200)])
     assert 4.3 < np.abs(turns).max() <= 4.5
     assert list(task.action_dims()) == [0, 1, 3]
     limit = np.rad2deg(task.constraints().nearest(np.full(6, 1.0))[3])
     assert limit == pytest.approx(6.75)  # [°]; 1.5 times the unknown turn
     outputs = np.array(Demonstrations.load(turning / "demonstrations.npz").outputs)
     assert np.rad2deg(outputs[:, -1, 3].std()) > 2.5
-    assert task.symmetry() is None  # a reflection would reverse the turn
+    assert task.symmetries()[0] is None  # a reflection would reverse the turn
 
 
 def test_scripted_search_turns_a_blocked_plug_back_and_forth(turning):
@@ -458,7 +469,7 @@ def test_fitted_bounds_are_written_to_the_task_file(folder, task_file, capsys):
     pytest.importorskip("guiderail_data", reason="needs guiderail-data")
     call("dataset", "fit-bounds", folder / "demonstrations.npz", "--phases", 3, "--outputs", "0,1", "--task", folder)
     assert str(task_file) in capsys.readouterr().out.splitlines()[-1]
-    constraints = EnvConfig.resolve(str(folder), {}).make_task().constraints()
+    constraints = EnvConfig.resolve(str(folder), {}).declared.constraints()
     assert constraints.G.shape[0] > 1
     np.testing.assert_array_equal(constraints.G[0, [0, 2], :2], np.eye(2))
     env = make_env(str(folder), horizon=4)
@@ -620,7 +631,7 @@ def test_parts_are_a_set_of_environments(folder, tmp_path, capsys):
     changed = (other / "task.yaml").read_text().replace("force_limit: 35.0", "force_limit: 30.0", 1)
     (other / "task.yaml").write_text(changed)
     with pytest.raises(InputError, match="the files of parts/other are not those that the run"):
-        start_or_resume(None, tmp_path / "run", environment={}, episodes=3, resume=True)
+        train(out=tmp_path / "run", episodes=3, resume=True)
 
 
 def shared(folder, **options):

@@ -10,7 +10,7 @@ import yaml
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, MultibodyPlant
 from pydrake.systems.framework import DiagramBuilder
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, stations_of
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE
@@ -146,8 +146,8 @@ def test_message_names_the_path_of_an_invalid_option(changes, message, tmp_path)
 def test_bound_with_phases_is_refused_with_its_remedy(options, remedy, tmp_path):
     folder = str(write(tmp_path / "by_phase", bounds=BY_PHASE))
     with pytest.raises(InputError, match=remedy):
-        EnvConfig.resolve(folder, options).make_task().constraints()
-    EnvConfig.resolve(folder, options | {"bound": None}).make_task().constraints()
+        EnvConfig.resolve(folder, options).declared.constraints()
+    EnvConfig.resolve(folder, options | {"bound": None}).declared.constraints()
 
 
 def test_bounds_change_between_phases():
@@ -205,9 +205,9 @@ def test_measured_clearance_changes_the_digest(tmp_path):
 @pytest.mark.parametrize("kind", ["per_run", "none"])
 def test_square_of_offsets_requires_sampling_per_episode(tmp_path, kind):
     folder = str(write(tmp_path / "square"))
-    assert EnvConfig.resolve(folder, {"difficulty": "automate"}).make_task().offsets.is_square
+    assert EnvConfig.resolve(folder, {"difficulty": "automate"}).declared.offsets.is_square
     with pytest.raises(InputError, match="choose fixture_offset=per_episode"):
-        EnvConfig.resolve(folder, {"difficulty": "automate", "fixture_offset": kind}).make_task()
+        EnvConfig.resolve(folder, {"difficulty": "automate", "fixture_offset": kind})
 
 
 def test_sdf_file_is_written_again_when_damaged(tmp_path):
@@ -221,7 +221,7 @@ def test_sdf_file_is_written_again_when_damaged(tmp_path):
 
 def test_task_has_no_mujoco_station_without_convex_pieces(tmp_path):
     folder = write(tmp_path / "stations")
-    assert [name for name in load_task_folder(folder).stations() if name != "hardware"] == ["arm", "gantry"]
+    assert [name for name in stations_of(load_task_folder(folder)) if name != "hardware"] == ["arm", "gantry"]
     with pytest.raises(InputError, match="has no station 'mujoco': choose one of arm, gantry"):
         EnvConfig.resolve(str(folder), {"station": "mujoco"})
 
@@ -231,15 +231,15 @@ def test_task_has_a_mujoco_station_with_convex_pieces(tmp_path):
     both = {name: part(name, convex=[f"{name}.obj"]) for name in ("plug", "socket")}
     for number, (parts, has_mujoco) in enumerate(((both, True), ({"plug": both["plug"]}, False))):
         folder = write(tmp_path / f"convex_{number}", **parts)
-        assert ("mujoco" in load_task_folder(folder).stations()) is has_mujoco
-        workcell = EnvConfig.resolve(str(folder), {}).make_task().workcell()
+        assert ("mujoco" in stations_of(load_task_folder(folder))) is has_mujoco
+        workcell = EnvConfig.resolve(str(folder), {}).declared.workcell()
         (plug,) = workcell.workpiece_surfaces()
         assert np.ptp(plug.shape.vertices, axis=0)[2] == pytest.approx(0.02)
         with nullcontext() if has_mujoco else pytest.raises(InputError, match=r"the socket .* has no convex pieces"):
             workcell.fixture_surfaces()
     folder = write(tmp_path / "crowded", **both, scenario=["table.dmd.yaml"])
     (folder / "table.dmd.yaml").write_text("directives: []")
-    assert "mujoco" not in load_task_folder(folder).stations()
+    assert "mujoco" not in stations_of(load_task_folder(folder))
 
 
 def test_scenario_adds_its_models_to_the_plant(tmp_path):
@@ -248,7 +248,7 @@ def test_scenario_adds_its_models_to_the_plant(tmp_path):
     (folder / "package.xml").write_text("<package><name>surroundings</name></package>")
     model = "{name: table, file: 'package://surroundings/table.sdf'}"
     (folder / "table.dmd.yaml").write_text(f"directives:\n- add_model: {model}\n")
-    workcell = EnvConfig.resolve(str(folder), {}).make_task().workcell()
+    workcell = EnvConfig.resolve(str(folder), {}).declared.workcell()
     plant, _ = AddMultibodyPlantSceneGraph(DiagramBuilder(), time_step=0.01)
     workcell.add_fixture(plant)
     assert plant.HasModelInstanceNamed("table")
@@ -298,27 +298,27 @@ def test_file_of_a_task_is_refused_outside_its_folder(name, is_accepted, tmp_pat
 
 def test_models_are_written_once_or_failure_is_refused(tmp_path):
     folder = write(tmp_path / "written")
-    task = EnvConfig.resolve(str(folder), {}).make_task()
+    task = EnvConfig.resolve(str(folder), {}).declared
     assert task.workcell() is task.workcell()
     assert "from task.yaml; change the dimensions there" in (folder / "plug.sdf").read_text()
     assert sorted(path.name for path in folder.glob("*.sdf*")) == ["plug.sdf", "socket.sdf"]
     (folder / "plug.sdf").unlink()
     (folder / "plug.sdf").mkdir()
     with pytest.raises(InputError, match=r"plug\.sdf cannot be written"):
-        EnvConfig.resolve(str(folder), {}).make_task().workcell()
+        EnvConfig.resolve(str(folder), {}).declared.workcell()
 
 
 def test_center_of_mass_is_that_of_the_task_file(tmp_path):
     center = [0.001, -0.002, 0.003]
     folder = write(tmp_path / "centered", plug=part("plug", center=center))
     plant = MultibodyPlant(0.0)
-    plug = EnvConfig.resolve(str(folder), {}).make_task().workcell().add_workpiece(plant, plant.world_frame())
+    plug = EnvConfig.resolve(str(folder), {}).declared.workcell().add_workpiece(plant, plant.world_frame())
     np.testing.assert_allclose(plug.default_com(), center)
 
 
 def test_start_pose_is_within_the_bounds(tmp_path):
     bounds = {"lower": [*[None] * 3, *[-0.01] * 3], "upper": [0.0001, None, 0.0195, *[0.01] * 3]}
-    task = EnvConfig.resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_offset_max": 0.002}).make_task()
+    task = EnvConfig.resolve(str(write(tmp_path / "low", bounds=bounds)), {"start_offset_max": 0.002}).declared
     for seed in range(5):
         start = task.start_pose(np.random.default_rng(seed))
         assert task.constraints().violation(start) <= 1e-9
@@ -388,27 +388,27 @@ def test_bounds_at_the_command_of_a_push_are_accepted(tmp_path):
     # At the end, the demonstrated command is 4 mm below the seated pose.
     upper = [[*row[:2], height, *row[3:]] for row, height in zip(BY_PHASE["upper"], (0.03, -0.003), strict=True)]
     folder = write(tmp_path / "accepted", bounds=BY_PHASE | {"upper": upper}, tolerance={"steps": 51})
-    assert EnvConfig.resolve(str(folder), {}).make_task().file.tolerance.steps == 51
+    assert EnvConfig.resolve(str(folder), {}).declared.file.tolerance.steps == 51
 
 
 def test_scene_has_the_box_of_each_phase(tmp_path):
     lower, upper = [[-0.001, -0.003], [0.0, -0.003]], [[0.002, 0.001], [0.0005, 0.001]]
     bounds = {"lower": [[*row, *FREE[2:]] for row in lower], "upper": [[*row, *FREE[2:]] for row in upper]}
-    task = EnvConfig.resolve(str(write(tmp_path / "phases", bounds=bounds | {"phases": [0.0, 0.5]})), {}).make_task()
+    task = EnvConfig.resolve(str(write(tmp_path / "phases", bounds=bounds | {"phases": [0.0, 0.5]})), {}).declared
     edges = np.array(task.scene().constraint) - task.file.place
     for number, box in enumerate(np.split(edges, 2)):
         np.testing.assert_allclose(box.min(axis=(0, 1)), [*lower[number], 0.0], atol=1e-12)
         np.testing.assert_allclose(box.max(axis=(0, 1)), [*upper[number], 0.02], atol=1e-12)
     task = EnvConfig.resolve(
         str(write(tmp_path / "open", bounds={"lower": [0.0, *5 * [None]], "upper": 6 * [0.1]})), {}
-    ).make_task()
+    ).declared
     assert task.scene().constraint == ()
-    task = EnvConfig.resolve(str(write(tmp_path / "replaced")), {"bound": 0.0035}).make_task()
+    task = EnvConfig.resolve(str(write(tmp_path / "replaced")), {"bound": 0.0035}).declared
     assert np.ptp(np.array(task.scene().constraint)[..., 0]) == pytest.approx(0.007)
 
 
 def test_success_on_hardware_is_estimated_from_height_and_turn(tmp_path):
-    task = EnvConfig.resolve(str(write(tmp_path / "hardware")), {"reward": "shaped"}).make_task()
+    task = EnvConfig.resolve(str(write(tmp_path / "hardware")), {"reward": "shaped"}).declared
     D, y0 = task.observable_success()
     np.testing.assert_array_equal(D @ [1.0, 2.0, 3.0, 4.0, 5.0, 6.0] + y0, [0.0, 0.0, 3.0, 0.0, 0.0, 4.0])
     assert "aligned" in task.simulated_rewards
@@ -430,7 +430,7 @@ def test_pushes_of_a_hold_test_are_within_the_bounds(x, clearance, pushes, tmp_p
         bounds={"lower": [-0.002, -0.002, *4 * [None]], "upper": [0.002, 0.002, *4 * [None]]},
         measured={"clearance_mm": clearance},
     )
-    task = EnvConfig.resolve(str(folder), {}).make_task()
+    task = EnvConfig.resolve(str(folder), {}).declared
     pose = np.array([1e-3 * x, 0.0, 0.0, 0.0, 0.0, 0.0])
     tests = task.hold_tests(pose)
     assert [tuple(1e3 * displacement for displacement in test.displacement[:2]) for test in tests] == [
@@ -445,5 +445,5 @@ def test_pushes_of_a_hold_test_are_within_the_bounds(x, clearance, pushes, tmp_p
 def test_turned_plug_is_pulled_by_the_hold_test(tmp_path):
     task = EnvConfig.resolve(
         str(write(tmp_path / "turned", motion={"travel": 0.02, "first_contact": 0.01, "turn": 30.0})), {}
-    ).make_task()
+    ).declared
     assert [test.displacement for test in task.hold_tests(np.zeros(6))] == [(0.0, 0.0, HOLD_DISTANCE)]

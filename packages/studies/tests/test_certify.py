@@ -126,7 +126,7 @@ def test_held_out_episodes_stay_in_the_bounds(tmp_path, monkeypatch, difficulty,
 def declared_start(task, **environment):
     """Return the start offset of a certificate for a task."""
     config = EnvConfig.resolve(task, environment)
-    return _declared_start(config, config.make_task().reference().num_outputs)
+    return _declared_start(config, config.reference().num_outputs)
 
 
 def test_declared_start_adds_pose_bias_and_start_offset():

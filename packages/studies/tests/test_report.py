@@ -20,12 +20,10 @@ from guiderail.tools.evaluation.baselines import BaselinePolicy, uniform_random
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import StepLog, read_step_log
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.trainer import run_training
 from guiderail.tools.tables import read_table, write_table
-from guiderail.tools.visualization.curves import plot_run
-from guiderail.tools.visualization.style import new_figure
+from guiderail.tools.visualization.figures import new_figure, plot_run
 from guiderail_studies.report import SAFETY_COLUMNS, _safety, _svg, write_report
 from guiderail_studies.report_data import command, gather
 
@@ -50,6 +48,18 @@ def study_folder(tmp_path_factory):
 def text_of(page):
     """Return the text of an HTML page without figures and styles."""
     return " ".join(re.sub(r"<[^>]+>", " ", re.sub(r"<(svg|style).*?</\1>", " ", page, flags=re.S)).split())
+
+
+def test_report_executes_no_code_that_a_run_names(study_folder, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(study_folder / "skgrl-1", run)
+    (tmp_path / "mine.py").write_text("raise SystemExit('the code of the run was executed')")
+    text = (run / "config.yaml").read_text().replace("imports: []", f"imports: [{tmp_path / 'mine.py'}]")
+    (run / "config.yaml").write_text(re.sub("algorithm: .*", "algorithm: my_learner\n  my_setting: 0.123", text))
+    page = write_report([run], tmp_path / "report.html").read_text()
+    assert "my_learner" in page
+    with pytest.raises(InputError, match="which would execute code"):
+        write_report([run], tmp_path / "again.html", episodes=1)
 
 
 def test_report_of_a_study_is_one_self_contained_page(study_folder, tmp_path):

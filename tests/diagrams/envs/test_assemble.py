@@ -1,48 +1,38 @@
 """Prior knowledge of a task for a station, and log output of environments."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from pydrake.systems.primitives import ConstantVectorSource
 
 from guiderail import make_env
 from guiderail.diagrams.envs.assemble import Loop, build_prior_knowledge
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_guidance, make_station
+from guiderail.diagrams.envs.options import Options, PrimitiveOptions
+from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
+from guiderail.diagrams.tasks.task import add_constant
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.wrench import MAX_WRENCH_SIZE
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail_hardware.station import HardwareStation
 
 PERIOD = 0.02
 
 
-def make_prior(turn, station, period=PERIOD):
-    """Return the prior knowledge of a turn by `turn` [rad] about z, for a station with the period `period` [s]."""
+def make_prior(turn, station):
+    """Return the prior knowledge of a turn by `turn` [rad] about z, for a class of stations."""
     means = np.zeros((30, 6))
     means[:, 3] = np.linspace(0.0, turn, 30)
     reference = ReferenceTrajectory(PERIOD * np.arange(30), means, np.tile(1e-6 * np.eye(6), (30, 1, 1)))
-    task = SimpleNamespace(
-        provides=lambda: {"demonstrations"},
-        reference=lambda: reference,
-        constraints=lambda: None,
-        motion_constraints=lambda: None,
-        isotropic_groups=None,
-        config=SimpleNamespace(part=lambda name: {}),
+    parts = {name: Options() for name in ("template", "guidance")} | {"primitive": PrimitiveOptions()}
+    config = SimpleNamespace(
+        declared=SimpleNamespace(prior=Prior), reference=lambda: reference, constraints=lambda: None, parts=parts
     )
-    ports = SimpleNamespace(
-        wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=period, nominal_period=period
-    )
-    return build_prior_knowledge(task, ports)
-
-
-@pytest.mark.parametrize("period", [0.01, 0.1])
-def test_prior_is_refused_when_the_control_period_differs(period):
-    with pytest.raises(InputError, match="would not have the demonstrated speed"):
-        make_prior(1.0, GantryStation, period)
+    ports = SimpleNamespace(wraps_angles=station.wraps_angles, pose_size=6, wrench_size=6, control_period=PERIOD)
+    return build_prior_knowledge(config, ports)
 
 
 def test_prior_is_accepted_when_clock_factor_changes_the_period():
@@ -61,15 +51,15 @@ def test_half_turn_is_refused_on_stations_with_wrapped_angles(turn):
 
 
 def test_signal_is_refused_when_the_station_has_no_input():
-    class BoundedPassage(type(EnvConfig.resolve("NarrowPassage").make_task())):
+    class BoundedPassage(type(EnvConfig.resolve("NarrowPassage").declared)):
         def signals(self, builder, station):
-            bound = builder.AddSystem(ConstantVectorSource(np.ones(MAX_WRENCH_SIZE)))
-            return {**super().signals(builder, station), "max_wrench": bound.get_output_port()}
+            return {**super().signals(builder, station), "max_wrench": add_constant(builder, "bound", np.ones(8))}
 
-    task = BoundedPassage(EnvConfig.resolve("NarrowPassage"))
-    station = make_station(task)
+    config = EnvConfig.resolve("NarrowPassage")
+    config = replace(config, parts={**config.parts, "task": BoundedPassage()})
+    station = make_station(config)
     with pytest.raises(InputError, match="station='plane' has no input for the signal 'max_wrench' of NarrowPassage"):
-        Loop(task, station, make_guidance(task, station))
+        Loop(config, station, make_guidance(config, station))
 
 
 def test_make_env_prints_no_log_message_of_drake(forks, tmp_path):

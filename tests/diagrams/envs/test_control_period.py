@@ -7,7 +7,8 @@ import pytest
 from guiderail import make_env
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_prior_knowledge, make_skill
-from guiderail.diagrams.envs.observation import ObservationTerm
+from guiderail.diagrams.guidance.prior import Prior
+from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.stations.station import (
     CONTROL_PERIOD,
     PLANT_PERIOD,
@@ -21,24 +22,22 @@ from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.reward_system import RewardTerm
 
 
-def make_task(name, **options):
-    return EnvConfig.resolve(name, options).make_task()
+def configure(name, **options):
+    return EnvConfig.resolve(name, options)
 
 
 @pytest.mark.parametrize("name", ["NarrowPassage", "BncConnector", "GridClamp", "Pouring"])
 def test_episode_duration_is_equal_when_the_period_is_longer(name):
-    standard, slow = make_task(name), make_task(name, control_period=0.1)
-    assert slow.control_period == pytest.approx(0.1, rel=1e-9)
-    assert slow.num_steps * slow.control_period == pytest.approx(standard.num_steps * standard.control_period, rel=1e-6)
+    standard, slow = configure(name), configure(name, control_period=0.1)
+    assert slow.period == pytest.approx(0.1, rel=1e-9)
+    assert slow.num_steps * slow.period == pytest.approx(standard.num_steps * standard.period, rel=1e-6)
 
 
 def test_shipped_reference_is_used_at_the_default_period():
-    assert make_task("BncConnector").reference() is reference_trajectory("insert")
-    assert make_task("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
+    assert configure("BncConnector").reference() is reference_trajectory("insert")
+    assert configure("BncConnector", control_period=0.02).reference() is reference_trajectory("insert")
 
 
 def test_step_and_reference_have_the_given_control_period():
@@ -49,7 +48,7 @@ def test_step_and_reference_have_the_given_control_period():
         assert env.simulator.get_context().get_time() == (number + 1) * env.diagram.control_period
     primitive = make_prior_knowledge("NarrowPassage", control_period=0.1).primitive
     np.testing.assert_allclose(np.diff(primitive.reference.times), primitive.control_period, rtol=1e-9)
-    assert primitive.control_period == env.diagram.control_period == 50 * env.diagram.task.time_unit
+    assert primitive.control_period == env.diagram.control_period == 50 * env.diagram.config.station_kind.time_unit
 
 
 @pytest.mark.parametrize(
@@ -78,7 +77,7 @@ def test_hardware_period_is_a_multiple_of_the_drivers():
     )
     station = skill.diagram.GetSubsystemByName("station")
     assert skill.control_period == station.control_period == 20 * station.period
-    assert station.clone(make_task("GridClamp").workcell()).control_period == station.control_period
+    assert station.clone(configure("GridClamp").declared.workcell()).control_period == station.control_period
     with pytest.raises(InputError, match=r"whole multiple of 0\.005 s"):
         whole_multiple(0.0125, station.period)
 
@@ -126,70 +125,42 @@ def test_whole_multiple_is_refused_when_not_positive(invalid):
 
 
 class Lane(Task):
-    """Straight motion in a plane, resampled to the control period."""
+    """Straight motion in a plane."""
 
-    workcell_kind, num_steps = "plane", 20
+    station, duration = PlaneStation, 0.4
 
     def workcell(self):
         return PassageGeometry()
 
-    def reference(self):
+    def prior(self):
         means = np.column_stack([np.full(41, 0.35), np.linspace(0.1, 0.5, 41)])
-        return self.on_clock(ReferenceTrajectory(0.02 * np.arange(41), means, np.tile(1e-3 * np.eye(2), (41, 1, 1))))
+        return Prior(ReferenceTrajectory(0.02 * np.arange(41), means, np.tile(1e-3 * np.eye(2), (41, 1, 1))))
 
-    def observation_terms(self):
-        return (ObservationTerm("pose"),)
+    def rewards(self):
+        return {"none": lambda: 0.0}
 
-    def reward_terms(self, num_actions):
-        return [RewardTerm("none", {}, lambda: 0.0)]
-
-    def termination_terms(self):
-        return [TerminationTerm("success", {"pose": 2}, lambda pose: False)]
-
-    def reset(self, station, guidance, context, rng, options):
-        station.set_pose(context, np.array([0.35, 0.1]))
-        return {}
+    def done(self):
+        return {"success": lambda pose: False}
 
 
 @pytest.fixture
-def own_tasks():
-    """Register lab/Lane, and lab/Units with `time_unit` 0.01 s; remove both after the test."""
-    names = "lab/Lane", "lab/Units"
-    register_task(names[0])(Lane)
-    register_task(names[1])(type("Units", (Lane,), {"time_unit": 0.01}))
+def own_task():
+    """Register lab/Lane; remove it after the test."""
+    register_task("lab/Lane")(Lane)
     yield
-    for name in names:
-        TASKS._entries.pop(name)
-        gymnasium.registry.pop(environment_id(name))
+    TASKS._entries.pop("lab/Lane")
+    gymnasium.registry.pop(environment_id("lab/Lane"))
 
 
 @pytest.mark.parametrize("period", [None, 0.012, 0.04, 0.05])
-def test_own_task_has_the_given_control_period(own_tasks, period):
+def test_own_task_has_the_given_control_period(own_task, period):
     env = make_env("lab/Lane", guidance="kmp", action_repeat=1, control_period=period)
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(2))
-    assert env.diagram.task.control_period == env.diagram.control_period == pytest.approx(period or 0.02, rel=1e-9)
+    assert env.diagram.config.period == env.diagram.control_period == pytest.approx(period or 0.02, rel=1e-9)
     # The demonstrated speed is 0.5 m/s at every control period.
     assert env.trace.commanded[4, 1] - env.trace.commanded[3, 1] == pytest.approx(0.5 * (period or 0.02), rel=0.1)
-
-
-def test_period_is_refused_when_task_and_station_units_differ(own_tasks):
-    with pytest.raises(InputError, match=r"^time_unit of lab/Units is 0\.01 s, .* leave time_unit out"):
-        make_env("lab/Units", guidance="kmp", control_period=0.05)
-
-
-def test_reference_is_refused_when_not_resampled():
-    class UnresampledPassage(make_task("NarrowPassage").__class__):
-        def on_clock(self, reference):
-            return reference
-
-    from guiderail.diagrams.envs.assemble import build_prior_knowledge
-    from guiderail.diagrams.envs.make import make_station
-
-    task = UnresampledPassage(EnvConfig.resolve("NarrowPassage", {"control_period": 0.1}))
-    with pytest.raises(InputError, match="would not have the demonstrated speed"):
-        build_prior_knowledge(task, make_station(task))
 
 
 def test_timeout_and_tare_follow_the_period():

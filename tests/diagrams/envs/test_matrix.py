@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from guiderail.diagrams.envs.config import EnvConfig
+from guiderail.diagrams.envs.config import EnvConfig, prior_of, stations_of
 from guiderail.diagrams.envs.make import make_env, make_skill
 from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS
 from guiderail.diagrams.guidance.registry import GUIDANCE, REQUIREMENTS, possible_guidance
@@ -25,7 +25,7 @@ def test_task_is_registered_as_an_environment(task):
 
 @pytest.mark.parametrize(("task", "guidance"), PAIRS)
 def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
-    provides = TASKS.get(task).provides()
+    provides = prior_of(TASKS.get(task)).provides
     if guidance not in possible_guidance(provides):
         with pytest.raises(InputError) as error:
             make_env(task, guidance=guidance)
@@ -48,7 +48,7 @@ def test_task_and_guidance_run_or_name_missing_requirements(task, guidance):
 
 @pytest.mark.parametrize("task", SHIPPED)
 def test_station_and_guidance_have_the_declared_ports(task):
-    for name in TASKS.get(task).stations():
+    for name in stations_of(TASKS.get(task)):
         if STATIONS.get(name).is_simulated:
             diagram = make_env(task, station=name).diagram.diagram
         else:

@@ -11,7 +11,7 @@ from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector.demonstrations import CLEAR, insert_and_lock, poses
 from guiderail.models.objects.bnc_connector.geometry import BncDimensions
 
-HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+HARD = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 WORKCELL = HARD.workcell()
 STIFFNESS = Impedance().stiffness[2]
 # Height of the plug's mouth on top of the lugs, relative to the locked pose [m].

@@ -20,7 +20,7 @@ STATIONS = [
 
 @pytest.mark.parametrize(("task", "name"), STATIONS)
 def test_set_pose_raises_when_the_pose_is_not_finite(task, name):
-    station = make_station(EnvConfig.resolve(task, {"station": name}).make_task())
+    station = make_station(EnvConfig.resolve(task, {"station": name}))
     context = station.CreateDefaultContext()
     zero = np.zeros(station.pose_size)
     invalid = [np.r_[np.nan, zero[1:]], np.r_[zero[1:], -np.inf], zero[1:], [*zero, 0.0], ["a"] * len(zero), None]

@@ -23,6 +23,14 @@ from guiderail.tools.evaluation.evaluate import evaluate_policy
 
 NEW_RUN = {"new_run": True}  # the hidden offsets are sampled again in every episode
 
+RUN = {}
+
+
+@pytest.fixture(autouse=True)
+def new_run():
+    """Clear the hidden values of a run before each test."""
+    RUN.clear()
+
 
 def play(env, policy, *, seed=None, options=None):
     """Run an episode; return the last info, the return, and all observations."""
@@ -230,7 +238,7 @@ def test_push_displaces_the_robot(kgrl):
 class TestUncertainty:
     def test_per_run_jack_offset_is_constant_during_a_run(self):
         fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
-        draws = [fixture_offset.draw(rng, InsertionReset()) for _ in range(20)]
+        draws = [fixture_offset.draw(rng, InsertionReset(), RUN) for _ in range(20)]
         jacks, grasps = (np.array(column) for column in zip(*draws, strict=True))
         assert (jacks == jacks[0]).all()
         assert 1.0 * MM <= np.linalg.norm(jacks[0]) <= 1.5 * MM
@@ -239,20 +247,22 @@ class TestUncertainty:
 
     def test_new_run_samples_another_jack_offset(self):
         fixture_offset, rng = BncUncertainty("per_run"), np.random.default_rng(0)
-        first, _ = fixture_offset.draw(rng, InsertionReset())
-        second, _ = fixture_offset.draw(rng, InsertionReset(new_run=True))
+        first, _ = fixture_offset.draw(rng, InsertionReset(), RUN)
+        second, _ = fixture_offset.draw(rng, InsertionReset(new_run=True), RUN)
         assert (first != second).any()
 
     def test_held_out_episode_differs_only_in_the_grasp_offset(self):
         fixture_offset = BncUncertainty("per_run")
-        jack, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset())
-        jack_held_out, grasp_held_out = fixture_offset.draw(np.random.default_rng(7), InsertionReset(held_out=True))
+        jack, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset(), RUN)
+        jack_held_out, grasp_held_out = fixture_offset.draw(
+            np.random.default_rng(7), InsertionReset(held_out=True), RUN
+        )
         np.testing.assert_array_equal(jack, jack_held_out)
         assert (grasp != grasp_held_out).any()
 
     def test_per_episode_jack_offset_is_uniform_in_a_disc(self):
         fixture_offset, rng = BncUncertainty("per_episode"), np.random.default_rng(1)
-        radii = np.array([np.linalg.norm(fixture_offset.draw(rng, InsertionReset())[0]) for _ in range(2000)])
+        radii = np.array([np.linalg.norm(fixture_offset.draw(rng, InsertionReset(), RUN)[0]) for _ in range(2000)])
         assert radii.max() <= 1.5 * MM
         # A disc of 1/√2 of the radius has half the area.
         assert np.mean(radii < 1.5 * MM / np.sqrt(2)) == pytest.approx(0.5, abs=0.04)

@@ -10,7 +10,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import sdf
 
-CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).make_task()
+CONNECTOR = EnvConfig.resolve("BncConnector", {"difficulty": "hard"}).declared
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def test_contact_of_the_connector_has_converged_at_the_default_step(probes):
 
 def test_drag_of_the_clamp_is_its_friction_at_20_mm_per_s():
     """At 40 mm/s it is 1.0 at the default time step, and the friction at a quarter of it."""
-    clamp = EnvConfig.resolve("GridClamp", {"difficulty": "hard"}).make_task()
+    clamp = EnvConfig.resolve("GridClamp", {"difficulty": "hard"}).declared
     contact = clamp.rim_contact()
     assert drag(clamp.workcell(), contact, 0.02) == pytest.approx(contact.friction, rel=0.15)
     fine = drag(clamp.workcell(), contact, 0.04, time_step=PLANT_PERIOD / 4)
@@ -52,4 +52,4 @@ def test_drag_is_infinite_error_without_contact():
 
 def test_probe_raises_for_a_task_without_rim():
     with pytest.raises(InputError, match="no rim"):
-        probe_contact(EnvConfig.resolve("NarrowPassage", {}).make_task())
+        probe_contact(EnvConfig.resolve("NarrowPassage", {}).declared)

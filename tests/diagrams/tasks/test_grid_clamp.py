@@ -27,6 +27,14 @@ NEW_RUN = {"new_run": True}  # the hidden offsets are sampled again in every epi
 GUIDANCE = ("sct", "residual", "none")
 DOWN = np.array([0.0, 0.0, -1.0])
 
+RUN = {}
+
+
+@pytest.fixture(autouse=True)
+def new_run():
+    """Clear the hidden values of a run before each test."""
+    RUN.clear()
+
 
 def play(env, policy, *, seed=None, options=None):
     """Run an episode; return the last info, the return, and the sum of each reward term."""
@@ -176,7 +184,7 @@ class TestUncertainty:
         fixture_offset, rng = GridClampUncertainty("per_run"), np.random.default_rng(0)
         tables, grasps = (
             np.array(column)
-            for column in zip(*[fixture_offset.draw(rng, InsertionReset()) for _ in range(60)], strict=True)
+            for column in zip(*[fixture_offset.draw(rng, InsertionReset(), RUN) for _ in range(60)], strict=True)
         )
         assert (tables == tables[0]).all()
         assert 1.8 * MM <= np.linalg.norm(tables[0]) <= 2.2 * MM
@@ -188,14 +196,16 @@ class TestUncertainty:
     @pytest.mark.parametrize("kind", ["per_run", "per_episode", "none"])
     def test_cuboid_contains_every_sampled_hole(self, kind):
         fixture_offset, rng = GridClampUncertainty(kind), np.random.default_rng(1)
-        draws = [fixture_offset.draw(rng, InsertionReset(new_run=True)) for _ in range(500)]
+        draws = [fixture_offset.draw(rng, InsertionReset(new_run=True), RUN) for _ in range(500)]
         worst = max(np.abs(table - grasp).max() for table, grasp in draws)
         assert worst < TEMPLATE.parameters["width_m"] / 2 - 0.2 * MM
 
     def test_held_out_episode_differs_only_in_the_grasp_offset(self):
         fixture_offset = GridClampUncertainty("per_run")
-        table, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset())
-        table_held_out, grasp_held_out = fixture_offset.draw(np.random.default_rng(7), InsertionReset(held_out=True))
+        table, grasp = fixture_offset.draw(np.random.default_rng(7), InsertionReset(), RUN)
+        table_held_out, grasp_held_out = fixture_offset.draw(
+            np.random.default_rng(7), InsertionReset(held_out=True), RUN
+        )
         np.testing.assert_array_equal(table, table_held_out)
         assert (grasp != grasp_held_out).any()
 

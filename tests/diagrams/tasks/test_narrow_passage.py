@@ -11,13 +11,14 @@ from stable_baselines3.common.env_checker import check_env as sb3_check
 
 import guiderail
 from guiderail.diagrams.envs import scene
+from guiderail.diagrams.envs.config import prior_of
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 
 WORLD = PassageGeometry()
-GUIDANCE = possible_guidance(NarrowPassage.provides())
+GUIDANCE = possible_guidance(prior_of(NarrowPassage).provides)
 NULL_SPACE = ("kgrl", "skgrl")
 
 

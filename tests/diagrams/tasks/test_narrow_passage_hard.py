@@ -74,7 +74,7 @@ def test_standard_has_the_default_geometry_and_start():
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
     _, info = standard.reset(seed=3)
-    np.testing.assert_array_equal(info["start"], standard.diagram.task.reference().means[0])
+    np.testing.assert_array_equal(info["start"], standard.diagram.config.reference().means[0])
 
 
 @pytest.mark.parametrize(

@@ -169,5 +169,5 @@ def test_limit_is_refused_when_not_positive(force):
 
 
 def test_shipped_template_of_the_clamp_has_no_limits():
-    task = EnvConfig.resolve("GridClamp", {}).make_task()
-    assert make_phase_wrench_limit(task.template().template, None, 0.01) is None
+    template = EnvConfig.resolve("GridClamp", {}).declared.prior().template
+    assert make_phase_wrench_limit(template.template, None, 0.01) is None

@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.task import Pouring, scripted_pour_aimed
+from guiderail.diagrams.tasks.pouring.task import scripted_pour_aimed
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 
@@ -19,8 +19,8 @@ def outcome(in_mug, fallen):
     """Return success and spill of the task with six balls, of which five are required; the rest are in the thermos."""
     positions = [IN_MUG] * in_mug + [FALLEN] * fallen + [IN_THERMOS] * (6 - in_mug - fallen)
     balls = np.array([[*position, 0.0, 0.0, 0.0] for position in positions]).ravel()
-    _, success, spill = Pouring(EnvConfig.resolve("Pouring", OPTIONS)).termination_terms()
-    return success.condition(balls), spill.condition(balls, balls)
+    conditions = EnvConfig.resolve("Pouring", OPTIONS).declared.done()
+    return conditions["success"].holds(balls), conditions["spill"](balls, balls)
 
 
 @pytest.mark.parametrize(
@@ -51,9 +51,9 @@ def test_balls_start_inside_the_thermos_without_overlap(number, diameter):
 
 @pytest.mark.parametrize("control_period", [0.01, 0.02, 0.05])
 def test_success_requires_balls_in_the_mug_for_0_1_s(control_period):
-    task = Pouring(EnvConfig.resolve("Pouring", {"control_period": control_period}))
-    _, success, _ = task.termination_terms()
-    assert success.steps * control_period == pytest.approx(0.1)
+    config = EnvConfig.resolve("Pouring", {"control_period": control_period})
+    steps = config.steps_of(config.declared.done()["success"].seconds)
+    assert steps * control_period == pytest.approx(0.1)
 
 
 def test_numbers_of_balls_are_refused_when_too_large():

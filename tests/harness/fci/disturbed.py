@@ -24,8 +24,8 @@ from pydrake.math import RigidTransform
 
 from guiderail_hardware.drivers.fci import FciDriver
 from guiderail_hardware.robot.connection import RobotConnection
-from guiderail_hardware.robot.evaluate import evaluate_on_robot
-from guiderail_hardware.robot.train import train_on_robot
+from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
+from guiderail_hardware.robot.robot_training import train_on_robot
 
 REFERENCE_PERIOD = 0.01  # period of the references [s]
 FORCE_LIMIT = 20.0  # force limit [N]; contact at the default of 35 N can exceed the limits of external joint torques

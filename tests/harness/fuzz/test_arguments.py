@@ -13,8 +13,8 @@ from guiderail.diagrams.envs.options import option_fields
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import as_value, check_environment
-from guiderail.tools.learning.config import PRESETS, OffPolicyConfig
-from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.learner_config import PRESETS, OffPolicyConfig
+from guiderail.tools.learning.run_folder import configure
 
 TASK_NAMES = ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"]
 NUMBERS = st.integers(-3, 300).map(str) | st.floats().map(repr) | st.integers().map(str)

@@ -21,12 +21,12 @@ from guiderail.models.policy import FORMAT, Policy, _digest
 from guiderail.tools.environments import check_environment
 from guiderail.tools.evaluation.metrics import summary
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.config import config_values, resolve_preset
-from guiderail.tools.learning.configure import configure
+from guiderail.tools.learning.episodes import Episodes
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.learner_config import config_values, resolve_preset
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.learning.train import SUMMARY
-from guiderail.tools.learning.trainer import restore_checkpoint
+from guiderail.tools.learning.trainer import TrainingLoop
 from guiderail.tools.tables import table_text
 
 
@@ -227,8 +227,15 @@ def resumable(folder):
         "rows": ROWS,
         "learner": values,
         "environment": env.np_random.bit_generator.state,
+        "episodes": {},
     }
     return env, learner, arrays, json.loads(json.dumps(values))
+
+
+def restored(folder, learner, env):
+    loop = TrainingLoop(folder, learner, Episodes(CONFIGS[0], env))
+    loop.restore()
+    return loop
 
 
 class SpacesOnlyEnv(gymnasium.Env):
@@ -259,12 +266,9 @@ def test_checkpoint_with_changed_content_is_exact_or_refused(folder, resumable, 
     tree = values if data.draw(st.booleans()) and changed.keys() else data.draw(changed_trees([values]))
     save_checkpoint(folder.checkpoint, changed, tree)
     folder.write_episodes(ROWS[: data.draw(st.sampled_from([3, len(ROWS)]))])
-    resumed = attempt(
-        "checkpoint, other content", InputError, lambda: restore_checkpoint(folder, CONFIGS[0], learner, env)
-    )
+    resumed = attempt("checkpoint, other content", InputError, lambda: restored(folder, learner, env))
     if resumed is not None:
-        rows, _ = resumed
-        assert rows == tree["rows"]
+        assert resumed.rows == tree["rows"]
         restored_arrays, restored_values = learner.state()
         assert json.loads(json.dumps(restored_values)) == tree["learner"]
         assert restored_arrays.keys() == changed.keys()
@@ -280,4 +284,4 @@ def test_negative_number_in_a_generators_state_is_refused(folder, resumable):
     save_checkpoint(folder.checkpoint, arrays, tree)
     folder.write_episodes(ROWS)
     with pytest.raises(InputError, match="belongs to other settings"):
-        restore_checkpoint(folder, CONFIGS[0], learner, env)
+        restored(folder, learner, env)

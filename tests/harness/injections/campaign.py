@@ -23,7 +23,7 @@ import struct
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -179,9 +179,9 @@ def random_pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> It
             yield first, second
 
 
-def print_table(results: dict[str, list[Result]]) -> int:
-    """Print a row for each kind; return the number of failed injections."""
-    bounds = {kind.name: kind.bound for kind in KINDS}
+def print_table(results: dict[str, list[Result]], kinds: Sequence[Kind] = KINDS) -> int:
+    """Print a row for each of the kinds; return the number of failed injections."""
+    bounds = {kind.name: kind.bound for kind in kinds}
     print(
         f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'failed':>7}"
     )

@@ -4,32 +4,36 @@
     python tests/harness/mutation/mutate.py --every 8               # an eighth, chosen by hashes of their names
     python tests/harness/mutation/mutate.py qp window               # mutants of these files
     python tests/harness/mutation/mutate.py --results mutants.json  # resumes an interrupted run
+    python tests/harness/mutation/mutate.py --only mutants.json     # the mutants in the results of another run
 
 The operators in `mutations.py` change comparisons, arithmetic, logic, numbers, branches, statements, calls with a
 counterpart, slices and keyword arguments, and multiply limits and constants by 1.001. A mutant is tested in a fork of a
 process that has collected the tests. The tests that execute its line run until the first failure, fast tests and
-tests that have killed many mutants first. A mutant that passes all of them survives. `survivors.yaml` explains why a
-survivor makes no difference. A survivor without an explanation is an error, and so is an explanation without a
-surviving mutant.
+tests that have killed many mutants first. A mutant that passes all of them survives. A mutant counts as killed only if
+the same tests pass, in the same order and process, with the unchanged file in place of the mutant; otherwise the run
+stops. `survivors.yaml` explains why a survivor makes no difference. A survivor without an explanation is an error, and
+so is an explanation without a surviving mutant.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import json
 import os
+import re
 import resource
 import sys
 import tempfile
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from enum import Enum
 from functools import cached_property
 from inspect import unwrap
 from pathlib import Path
-from types import FunctionType
+from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
@@ -38,6 +42,13 @@ import yaml
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from mutation.mutations import ROOT, Mutant, mutants
+
+
+def _systems(path: Path) -> list[str]:
+    """Return the names of the systems of a file, in snake case, by which their test files are named."""
+    names = re.findall(r"^class (\w+)\((?:LeafSystem|ConvertibleSystem)\)", path.read_text(), re.MULTILINE)
+    return [re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower() for name in names]
+
 
 CONSTANTS = (bool, int, float, str, tuple, list, frozenset, set, np.ndarray)
 WRAPPERS = (property, classmethod, staticmethod, cached_property)
@@ -49,7 +60,7 @@ TARGETS = {
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("qp", "window", "lc_ns_kmp", "constraints")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("gains", "features", "kernels", "kmp")},
     **{f"models/primitives/{name}.py": PRIMITIVES for name in ("poses", "reference", "mixture", "demonstrations")},
-    "models/templates/constraints.py": TEMPLATES,
+    "models/templates/active_constraints.py": TEMPLATES,
     "models/templates/template.py": TEMPLATES,
     "models/templates/geometry.py": TEMPLATES,
     "models/control/keep_out.py": ["tests/models/control/test_keep_out.py"],
@@ -64,7 +75,7 @@ TARGETS = {
     f"{HARDWARE}/src/guiderail_hardware/drivers/driver_guard.py": [f"{HARDWARE}/tests/drivers/test_driver_guard.py"],
     f"{HARDWARE}/src/guiderail_hardware/monitor.py": [f"{HARDWARE}/tests/drivers/test_monitor.py"],
     **{
-        f"systems/{path.name}": [f"tests/systems/test_{path.name}"]
+        f"systems/{path.name}": [f"tests/systems/test_{name}.py" for name in _systems(path)]
         for path in sorted((ROOT / "systems").glob("*.py"))
         if path.stem != "__init__"
     },
@@ -104,15 +115,28 @@ SLOW_IMPORTS += (
 # --- tests ---
 
 
-def graft(mutant: Mutant) -> None:
-    """Replace the code, defaults and constants that a mutant changes in the modules of this process.
+def graft(file: str, tree: ast.Module) -> None:
+    """Replace the code, defaults and constants of a file by those of `tree` in the modules of this process.
 
     The module cannot be imported again, because the tests have already imported it and its names.
     """
-    name = "guiderail." + mutant.file.removesuffix(".py").replace("/", ".")
-    module, names = sys.modules[name], {"__name__": name, "__file__": str(ROOT / mutant.file)}
-    exec(compile(mutant.tree(), names["__file__"], "exec"), names)
+    module = _module(file)
+    name, names = module.__name__, {"__name__": module.__name__, "__file__": str(ROOT / file)}
+    exec(compile(tree, names["__file__"], "exec"), names)
     _graft_all(vars(module), {key: value for key, value in names.items() if not key.startswith("__")}, name)
+
+
+def _module(file: str) -> ModuleType:
+    """Return the imported module of a file of this tree."""
+    module = next((each for each in list(sys.modules.values()) if _is_of(each, file)), None)
+    if module is None:
+        raise SystemExit(f"{file}: the tests import another copy of this file, or none: set PYTHONPATH to this tree")
+    return module
+
+
+def _is_of(module: object, file: str) -> bool:
+    path = getattr(module, "__file__", None)
+    return isinstance(path, str) and path.endswith(Path(file).name) and os.path.realpath(path) == str(ROOT / file)
 
 
 def _graft_all(old: Mapping[str, Any], new: Mapping[str, Any], module: str, owner: type | None = None) -> None:
@@ -268,23 +292,44 @@ def _newest(tests: list[str]) -> float:
     return max(file.stat().st_mtime for file in files)
 
 
-def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[str]) -> str:
-    """Return the first test that fails with a mutant, or "" if all tests that execute its line pass."""
+def killer(mutant: Mutant, items: dict[str, Any], covered: dict, kills: Counter[str], passing: set[tuple]) -> str:
+    """Return the first test that fails with a mutant, or "" if all tests that execute its line pass.
+
+    `passing` stores the sequences of tests that have passed with the unchanged file.
+    """
     mutated, seconds = range(mutant.line, mutant.last_line + 1), covered["seconds"]
     lines = covered["lines"].get(mutant.file, {})
     chosen = {test for test in seconds if any(line in mutated for line in lines.get(test, ()))}
     # Only the first test executes a shared fixture, and no test executes constants and defaults. Therefore all tests of
     # the test file with the same name are added.
-    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem == f"test_{Path(mutant.file).stem}"}
+    own = {f"test_{Path(mutant.file).stem}", *(Path(name).stem for name in TARGETS[mutant.file])}
+    chosen |= {test for test in seconds if Path(test.split("::")[0]).stem in own}
     chosen = sorted(chosen or seconds, key=lambda test: (seconds[test] + 1e-3) / (1.0 + kills[test]))
     limit = 10 + 5 * sum(seconds[test] for test in chosen)
+    failed = _first_failure(mutant.file, mutant.tree(), chosen, items, limit)
+    if failed < 0:
+        return ""
+    sequence = tuple(chosen[: failed + 1])
+    if sequence not in passing:
+        unchanged = ast.parse((ROOT / mutant.file).read_text())
+        if _first_failure(mutant.file, unchanged, sequence, items, limit) >= 0:
+            print(f"{mutant.file}: {', '.join(sequence)} fails without a mutation", file=sys.__stderr__, flush=True)
+            raise SystemExit(1)
+        passing.add(sequence)
+    return sequence[-1]
+
+
+def _first_failure(file: str, tree: ast.Module, tests: Sequence[str], items: dict[str, Any], limit: float) -> int:
+    """Return the index of the first test that fails in a fork with the code of `tree`, -1 if all pass.
+
+    If the process ends before a test has failed, in an import, by a crash or by the limit of CPU time, it is the last.
+    """
 
     def work():
-        graft(mutant)
-        return run([items[test] for test in chosen])
+        graft(file, tree)
+        return run([items[test] for test in tests])
 
-    failed = _forked(work, limit, 0)
-    return chosen[failed] if failed >= 0 else ""
+    return _forked(work, limit, len(tests) - 1)
 
 
 def main() -> int:
@@ -292,6 +337,7 @@ def main() -> int:
     parser.add_argument("files", nargs="*", help="names of files without .py (default: all)")
     parser.add_argument("--every", type=int, default=1, help="try one mutant of this many")
     parser.add_argument("--results", type=Path, help="JSON file of results; an interrupted run is resumed from it")
+    parser.add_argument("--only", type=Path, help="try only the mutants in this JSON file of results")
     parser.add_argument("--again", action="store_true", help="try survivors again")
     arguments = parser.parse_args()
     if unknown := {*arguments.files} - {Path(file).stem for file in TARGETS}:
@@ -302,25 +348,32 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as folder:
         results = arguments.results.absolute() if arguments.results else Path(folder) / "mutants.json"
         files = [file for file in TARGETS if not arguments.files or Path(file).stem in arguments.files]
-        problems, total, killed = np.sum(
-            [try_file(file, arguments.every, results, arguments.again) for file in files], 0
-        )
+        only = json.loads(arguments.only.read_text()) if arguments.only else None
+        counts = []
+        for file in files if only is None else [file for file in files if file in only]:
+            is_chosen = (lambda mutant: mutant.is_in_sample(arguments.every)) if only is None else _named(only[file])
+            counts.append(try_file(file, is_chosen, results, arguments.again))
+        problems, total, killed = np.sum(counts, 0)
     print(f"total: {killed} of {total} killed ({killed / max(total, 1):.1%}); {problems} to be explained or fixed")
     return min(int(problems), 1)
+
+
+def _named(names: Collection[str]) -> Callable[[Mutant], bool]:
+    return lambda mutant: mutant.name in names
 
 
 def try_mutants(file: str, sample: list[Mutant], store: Path, again: bool) -> None:
     """Try the mutants of a file that have no result yet, in a process that has collected its tests."""
     stored = json.loads(store.read_text()) if store.exists() else {}
     results, reasons = stored.setdefault(file, {}), _reasons(file)
-    recorder, kills = _Coverage(), Counter[str]()
+    recorder, kills, passing = _Coverage(), Counter[str](), set[tuple]()
 
     def work(items):
         covered = coverage(TARGETS[file], items, recorder, store.with_suffix(".coverage"))
         for mutant in sample:
             if mutant.name in results and not (again and results[mutant.name] == "survived"):
                 continue
-            test = killer(mutant, items, covered, kills)
+            test = killer(mutant, items, covered, kills, passing)
             kills[test] += 1
             results[mutant.name] = f"killed by {test}" if test else "survived"
             if not test and mutant.name not in reasons:
@@ -334,13 +387,13 @@ def _reasons(file: str) -> dict[str, str]:
     return yaml.safe_load(SURVIVORS.read_text()).get(file, {})
 
 
-def try_file(file: str, every: int, store: Path, again: bool) -> tuple[int, int, int]:
-    """Try a sample of a file's mutants; return the numbers of problems, of mutants, and of killed mutants.
+def try_file(file: str, is_chosen: Callable[[Mutant], bool], store: Path, again: bool) -> tuple[int, int, int]:
+    """Try the chosen mutants of a file; return the numbers of problems, of mutants, and of killed mutants.
 
     Problems are unexplained survivors and stale explanations.
     """
     all_mutants, reasons = mutants(file), _reasons(file)
-    sample = [mutant for mutant in all_mutants if mutant.is_in_sample(every)]
+    sample = [mutant for mutant in all_mutants if is_chosen(mutant)]
     child = os.fork()
     if child == 0:
         status = 1

@@ -12,6 +12,7 @@ from guiderail.models.control.cartesian_impedance import (
     HEAVY,
     LEVER,
     LIGHT,
+    ArmImpedance,
     damping_matrix,
     impedance_torques,
     reachable_inertia,
@@ -53,6 +54,10 @@ def arm(seed, joints=7, **changes):
         "torque_limits": np.full(joints, 1e9),
         **changes,
     }
+
+
+def torques(bound=None, **arguments):
+    return impedance_torques(ArmImpedance(**arguments), bound)
 
 
 @given(SEEDS)
@@ -99,7 +104,7 @@ def test_every_mode_has_the_damping_ratio(seed, ratio, scale):
 @given(SEEDS)
 def test_torques_are_the_wrench_and_gravity_in_joint_space(seed):
     arguments = arm(seed, posture_torque=np.zeros(7))
-    result = impedance_torques(**arguments)
+    result = torques(**arguments)
     Lambda_inverse = arguments["J"] @ np.linalg.solve(arguments["M"], arguments["J"].T)
     spring = spring_wrench(arguments["K"], arguments["p_error"], arguments["eta"], arguments["epsilon"])
     wrench = spring - damping_matrix(arguments["K"], Lambda_inverse, 0.7) @ (arguments["J"] @ arguments["v"])
@@ -114,8 +119,8 @@ def test_posture_torque_does_not_accelerate_the_tool(seed):
     Lambda_inverse = arguments["J"] @ np.linalg.solve(arguments["M"], arguments["J"].T)
     # Near a singular posture a part of the posture torque accelerates the tool, so that the arm leaves the posture.
     assume(np.allclose(reachable_inertia(Lambda_inverse) @ Lambda_inverse, np.eye(6)))
-    with_posture = impedance_torques(**arguments)
-    without = impedance_torques(**arm(seed, posture_torque=np.zeros(7)))
+    with_posture = torques(**arguments)
+    without = torques(**arm(seed, posture_torque=np.zeros(7)))
     np.testing.assert_array_equal(with_posture.wrench, without.wrench)
     added = with_posture.torque - without.torque
     acceleration = arguments["J"] @ np.linalg.solve(arguments["M"], added)
@@ -127,18 +132,18 @@ def test_posture_torque_does_not_accelerate_the_tool(seed):
 @given(SEEDS, st.floats(0.01, 3.0))
 def test_wrench_is_clipped_per_axis(seed, share):
     """Spring and damper are clipped together, and each axis separately."""
-    unlimited = impedance_torques(**arm(seed))
+    unlimited = torques(**arm(seed))
     limits = share * np.abs(unlimited.wrench).max() * np.linspace(0.2, 1, 6)
-    result = impedance_torques(**arm(seed, wrench_limits=limits))
+    result = torques(**arm(seed, wrench_limits=limits))
     np.testing.assert_allclose(result.wrench, np.clip(unlimited.wrench, -limits, limits), rtol=1e-12)
     assert result.is_saturated == bool((np.abs(unlimited.wrench) >= limits).any())
 
 
 @given(SEEDS, st.floats(0.01, 3.0))
 def test_torques_are_clipped_to_the_motor_limits(seed, share):
-    unlimited = impedance_torques(**arm(seed))
+    unlimited = torques(**arm(seed))
     limits = share * np.abs(unlimited.torque).max() * np.linspace(0.2, 1, 7)
-    result = impedance_torques(**arm(seed, torque_limits=limits))
+    result = torques(**arm(seed, torque_limits=limits))
     np.testing.assert_allclose(result.torque, np.clip(unlimited.torque, -limits, limits), rtol=1e-12)
     assert result.is_saturated == bool((np.abs(unlimited.torque) > limits).any())
 
@@ -149,9 +154,9 @@ def test_law_in_rotated_axes_equals_the_rotated_law(seed):
     rng = np.random.default_rng([seed, 1])
     R = Rotation.random(rng=rng).as_matrix()
     R6 = np.kron(np.eye(2), R)
-    limits = np.abs(impedance_torques(**arm(seed)).wrench).max() * np.array([0.1, 0.5, 2, 0.1, 0.5, 2])
+    limits = np.abs(torques(**arm(seed)).wrench).max() * np.array([0.1, 0.5, 2, 0.1, 0.5, 2])
     arguments = arm(seed, wrench_limits=limits)
-    rotated = impedance_torques(
+    rotated = torques(
         **{
             **arguments,
             "R_axes": R,
@@ -160,7 +165,7 @@ def test_law_in_rotated_axes_equals_the_rotated_law(seed):
             "J": R6 @ arguments["J"],
         }
     )
-    unrotated = impedance_torques(**arguments)
+    unrotated = torques(**arguments)
     scale = np.abs(unrotated.torque).max()
     np.testing.assert_allclose(rotated.wrench, R6 @ unrotated.wrench, atol=1e-6 * scale)
     np.testing.assert_allclose(rotated.torque, unrotated.torque, atol=1e-6 * scale)
@@ -188,7 +193,7 @@ def test_bound_limits_spring_and_damper_along_the_axes(name, is_turned, seed):
     damping = damping_matrix(K, Lambda_inverse, 0.7) @ V
     mass = (V[:3] @ V[:3]) / (V[:3] @ Lambda_inverse[:3, :3] @ V[:3])
     expected = bounded_wrench(R6.T @ spring, R6.T @ damping, R.T @ V[:3], mass, bound)
-    result = impedance_torques(**arguments | {"R_axes": R if is_turned else None, "bound": bound})
+    result = torques(**arguments | {"R_axes": R if is_turned else None, "bound": bound})
     np.testing.assert_allclose(R6.T @ result.wrench, expected, rtol=1e-6, atol=1e-6 * np.abs(expected).max())
     assert result.is_saturated == (np.abs(expected - R6.T @ (spring - damping)).max() > 1e-6)
     if name == "wide":
@@ -202,7 +207,7 @@ def test_rounding_by_a_bound_is_no_saturation(sign, force, is_saturated):
     K, error = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), np.array([0.0, 0.5 * sign * force, 0.0])
     arguments = arm(0, K=K, v=np.zeros(7), p_error=error, eta=1.0, epsilon=np.zeros(3))
     axes = np.array([1.0, 0.0, 1.0, 1.0, 1.0, 1.0])
-    result = impedance_torques(**arguments | {"bound": WrenchBound(axes, np.inf, np.inf, **STIFF)})
+    result = torques(**arguments | {"bound": WrenchBound(axes, np.inf, np.inf, **STIFF)})
     assert result.is_saturated == is_saturated
 
 
@@ -219,7 +224,7 @@ def test_wrench_at_its_limit_is_saturated(number, size):
     error = 1.0 * (np.arange(6) == number)
     errors = {"p_error": error[:3], "eta": 0.0, "epsilon": error[3:]}
     arguments = arm(0, K=K, v=np.zeros(7), wrench_limits=np.full(6, size), **errors)
-    assert impedance_torques(**arguments).is_saturated == (size == 1.0 and number < 3)
+    assert torques(**arguments).is_saturated == (size == 1.0 and number < 3)
 
 
 def test_law_refuses_an_inertia_that_is_not_positive():
@@ -235,7 +240,7 @@ def test_law_refuses_a_stiffness_that_is_not_finite():
 def test_singular_arm_gets_finite_torques():
     J = np.zeros((6, 7))
     J[:5, :5] = np.eye(5)
-    result = impedance_torques(**arm(0, J=J))
+    result = torques(**arm(0, J=J))
     assert np.isfinite(result.torque).all()
     assert np.isfinite(result.wrench).all()
 
@@ -285,7 +290,7 @@ def test_reachable_inertia_halves_a_mass_in_the_middle(axis):
 def torques_at_rest(J, posture_torque, M=None):
     """Return the torques of an arm at rest without a pose error."""
     n = J.shape[1]
-    return impedance_torques(
+    return torques(
         K=np.diag([1500.0] * 3 + [30.0] * 3),
         damping_ratio=1.0,
         wrench_limits=np.full(6, 40.0),

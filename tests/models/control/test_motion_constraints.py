@@ -196,12 +196,6 @@ def test_constraints_raise_when_an_argument_is_out_of_range(arguments, match):
         MotionConstraints(**{"linear": LINEAR, **arguments})
 
 
-@pytest.mark.parametrize("period", [0.0, np.nan, np.inf])
-def test_filter_raises_when_the_period_is_not_positive(period):
-    with pytest.raises(InputError, match="period"):
-        MotionConstraintFilter(MotionConstraints(LINEAR), period)
-
-
 class FirstOutputLimit:
     """State constraint with the linear constraints of its argument."""
 

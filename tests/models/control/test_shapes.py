@@ -137,7 +137,6 @@ def test_linearize_returns_the_constraints_without_shapes():
         (lambda: Cylinder([0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.1), "different points"),
         (lambda: Cylinder([0.0, 0.0], [0.0, 1.0], 0.1), "different points"),
         (lambda: Cylinder([0.0, 0.0, 0.0], [0.0, 0.0, 1.0], np.inf), "radius"),
-        (lambda: linearize([Sphere([0.0, 0.0, 0.0], 0.1)], path()), "3 dimensions"),
         (lambda: linearize([Sphere([0.5, 0.0], 2.0)], path(), LinearConstraints.box([0.0, -0.1], [1.0, 0.4])), "contr"),
     ],
 )

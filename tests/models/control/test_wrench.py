@@ -122,12 +122,6 @@ def test_norm_limits_bound_every_wrench_within_the_axes(force, torque):
         norm_limits(force, np.nan)
 
 
-@pytest.mark.parametrize("numbers", [np.ones(6), np.ones(9), 1.0])
-def test_lowered_to_refuses_other_than_eight_numbers(numbers):
-    with pytest.raises(InputError, match="max_wrench must be 8 numbers, not"):
-        BOUND.lowered_to(numbers)
-
-
 @pytest.mark.parametrize("value", [np.inf, np.nan])
 def test_approach_refuses_bounds_that_are_not_finite(value):
     finite, infinite = np.ones(8), np.r_[np.ones(7), value]

@@ -15,7 +15,7 @@ from guiderail.models.primitives import (
     ReferenceTrajectory,
     UnsolvableError,
 )
-from guiderail.systems.history_buffer import HistoryBuffer
+from guiderail.systems.history import HistoryBuffer
 from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
 
 PERIOD, STEPS = 0.02, 40
@@ -135,17 +135,6 @@ def test_step_refuses_invalid_arguments_without_advancing():
     with pytest.raises(InputError, match="measured pose at every step"):
         stepper.step([0.0, 0.0])
     assert stepper.num_steps == 1
-
-
-def test_filter_of_another_type_or_size_is_refused():
-    p = primitive()
-    larger = MotionConstraintFilter(MotionConstraints(LinearConstraints.none(3)), PERIOD)
-    for motion in (5, MotionConstraints(p.constraints), larger):
-        with pytest.raises(InputError, match="command_filter is a"):
-            make_stepper(p, command_filter=motion)
-    for arguments in ((p.constraints, PERIOD), (MotionConstraints(p.constraints), "0.02")):
-        with pytest.raises(InputError, match=r"needs MotionConstraints|must be a number, not '0.02'"):
-            MotionConstraintFilter(*arguments)
 
 
 @pytest.mark.parametrize("history", [0, 1])

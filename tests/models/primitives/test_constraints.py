@@ -42,18 +42,6 @@ def test_constructor_refuses_contradictions(G, c):
         LinearConstraints(G, c)
 
 
-@pytest.mark.parametrize(
-    ("lower", "upper", "message"),
-    [
-        ([np.nan, 0.0], [1.0, 1.0], "the lower bound of output 0 is NaN"),
-        ([[0.0, 0.0]] * 2, [[1.0, 1.0], [1.0, np.nan]], "the upper bound of output 1 at step 1 is NaN"),
-    ],
-)
-def test_box_names_a_nan_bound(lower, upper, message):
-    with pytest.raises(InputError, match=message):
-        LinearConstraints.box(lower, upper)
-
-
 @pytest.mark.parametrize(("G", "c"), [([[1.0]], [1.0, 2.0]), ([1.0], [1.0]), ([[np.nan]], [0.0]), ([[1.0]], [np.inf])])
 def test_constructor_refuses_invalid_shapes_and_values(G, c):
     with pytest.raises(InputError):
@@ -244,13 +232,8 @@ def test_box_rows_are_ordered_by_output_lower_bound_first():
     [
         ([np.nan], [1.0]),
         ([0.0], [np.nan]),
-        (0.0, 1.0),
-        (np.zeros((2, 2, 2)), np.ones((2, 2, 2))),
         ([[0.0], [-np.inf]], [[1.0], [1.0]]),
         ([1.0], [0.0]),
-        ([0.0, 0.0], [1.0, 1.0, 1.0]),
-        (["a"], [1.0]),
-        ([1j], [2.0]),
     ],
 )
 def test_box_refuses_invalid_bounds(lower, upper):
@@ -279,12 +262,6 @@ def test_nearest_uses_the_first_step_by_default():
     assert box.nearest(inside) is not inside
 
 
-@pytest.mark.parametrize("output", [[1.0, 2.0], 1.0, "a", ["a"]])
-def test_nearest_refuses_an_output_of_wrong_shape_or_type(output):
-    with pytest.raises(InputError, match="an output"):
-        LinearConstraints.box([0.0], [1.0]).nearest(output)
-
-
 def test_fallback_uses_the_first_step_before_the_motion(monkeypatch):
     box = LinearConstraints.box([[0.0, 0.0], [0.0, 8.0]], [[2.0, 1.0], [2.0, 9.0]])
 
@@ -311,14 +288,3 @@ def test_constraints_of_the_end_steps_apply_beyond_the_motion():
     assert [box.violation(np.array([0.0]), step) for step in (-2, 0, 2, 5)] == [0.0, 0.0, -2.0, -2.0]
     _, c = box.window(np.array([-1, 0, 1, 3]))
     np.testing.assert_array_equal(c[:, 0], [0.0, 0.0, -1.0, -2.0])
-
-
-@pytest.mark.parametrize("shape", [(0,), (2, 0), (0, 2)])
-def test_constraints_need_an_output_and_a_step(shape):
-    with pytest.raises(InputError, match="at least one output and one step"):
-        LinearConstraints.box(np.zeros(shape), np.ones(shape))
-    if shape != (0, 2):
-        with pytest.raises(InputError, match="at least one output and one step"):
-            LinearConstraints(np.zeros((*shape[:-1], 1, 0)), np.zeros((*shape[:-1], 1)))
-    with pytest.raises(InputError, match="at least one output and one step"):
-        LinearConstraints(np.zeros((0, 1, 2)), np.zeros((0, 1)))

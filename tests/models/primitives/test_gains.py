@@ -64,22 +64,14 @@ def test_gains_are_zero_for_unexplored_outputs(primitive):
 def test_gains_refuse_invalid_arguments(primitive):
     with pytest.raises(InputError, match="action_scale"):
         authority_gains(primitive, action_scale=0)
-    for outputs in ([2], [0.5], [], [True], [True, False, True], [[0]], 0, "a"):
+    for outputs in ([2], [0.5], [], [True], [True, False, True]):
         with pytest.raises(InputError, match="outputs"):
             rms_gains(primitive, outputs=outputs)
-    for gains in ([1.0] * 3, np.ones((2, 1)), 1.0, "a"):
-        for measure in (exploration_rms, authority):
-            with pytest.raises(InputError, match="gains"):
-                measure(primitive, gains)
-    for groups in ([[2]], [[-1]], [[0.5]], [[]], [0]):
+    for groups in ([[2]], [[-1]], [[0.5]], [[]]):
         with pytest.raises(InputError, match="a group of outputs must be indices among"):
             residual_gains(primitive.reference, 1.0, groups)
     with pytest.raises(InputError, match="action_scale"):
         residual_gains(primitive.reference, -1.0)
-    for action_repeat in (0, 1.5, np.nan, np.inf):
-        with pytest.raises(InputError, match="action_repeat"):
-            rms_gains(primitive, action_repeat=action_repeat)
-    np.testing.assert_array_equal(rms_gains(primitive, action_repeat=2.0), rms_gains(primitive, action_repeat=2))
     without_null_space = LcNsKmp(primitive.reference, beta=0.0, lambda_=12.0, horizon=20)
     with pytest.raises(InputError, match="beta"):
         authority_gains(without_null_space)

@@ -112,11 +112,3 @@ def test_search_ends_after_two_criteria_above_the_minimum(monkeypatch):
 def test_one_to_twenty_components_are_searched(criteria, expected, monkeypatch):
     fit_with_criteria(monkeypatch, criteria)
     assert fit_new_mixture(np.arange(100.0), np.zeros((2, 100, 1)), None, 0).weights == expected
-
-
-@pytest.mark.parametrize("seed", [-1, 2**32])
-def test_seed_must_have_32_bits(seed):
-    times, outputs = np.linspace(0, 1, 12), np.random.default_rng(0).normal(size=(3, 12, 1))
-    assert len(fit_mixture(times, outputs, components=1, seed=2**32 - 1).weights) == 1
-    with pytest.raises(InputError, match="seed must be from 0 to"):
-        fit_mixture(times, outputs, components=1, seed=seed)

@@ -89,29 +89,14 @@ def test_pose_outputs_refuse_invalid_poses():
         pose_outputs(positions, quaternions, np.zeros(3), [1, 0, 0, 0], "quaternion")
     with pytest.raises(InputError, match="choose euler_zyx or rotation_vector"):
         pose_rotation(np.zeros(3), "quaternion")
-    with pytest.raises(InputError, match="positions"):
-        pose_outputs(positions[:, :2], quaternions, np.zeros(3), [1, 0, 0, 0])
     for array in (positions, quaternions):
         poses = [positions.copy(), quaternions.copy()]
         poses[0 if array is positions else 1][3, 1] = np.nan
         with pytest.raises(InputError, match="NaN"):
             pose_outputs(*poses, np.zeros(3), [1, 0, 0, 0])
     for target in ([0.0, np.nan, 0.0], [1, 0, 0, 0]), (np.zeros(3), [np.nan, 0, 0, 0]):
-        with pytest.raises(InputError, match="target's pose must be finite"):
-            pose_outputs(positions, quaternions, *target)
-    for target in (np.zeros(2), [1, 0, 0, 0]), (np.zeros(3), [1, 0, 0]):
-        with pytest.raises(InputError, match=r"the target needs a position \(3,\) and a quaternion \(4,\), not"):
+        with pytest.raises(InputError, match="NaN"):
             pose_outputs(positions, quaternions, *target)
     with pytest.raises(InputError, match="length zero"):
         pose_outputs(positions, quaternions, np.zeros(3), [1e-7, 0, 0, 0])
     pose_outputs(positions, quaternions, np.zeros(3), [1e-5, 0, 0, 0])
-
-
-def test_poses_need_at_least_one_sample():
-    p, q = np.zeros((0, 3)), np.zeros((0, 4))
-    with pytest.raises(InputError, match="positions"):
-        pose_outputs(p, q, np.zeros(3), [1.0, 0.0, 0.0, 0.0])
-    with pytest.raises(InputError, match="demonstration 0 has no poses"):
-        pose_demonstrations([np.zeros(0)], [p], [q])
-    with pytest.raises(InputError, match="1 arrays of positions and 2 of quaternions"):
-        pose_demonstrations([np.zeros(1)], [np.zeros((1, 3))], [q, q])

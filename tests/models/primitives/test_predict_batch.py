@@ -113,8 +113,6 @@ def test_actions_are_zero_and_steps_shared_by_default():
         ([-1], np.zeros((1, 3)), np.zeros((1, 4, 3)), "at least 0"),
         ([0.5], np.zeros((1, 3)), np.zeros((1, 4, 3)), "at least 0"),
         ([[0]], np.zeros((1, 3)), np.zeros((1, 4, 3)), "at least 0"),
-        ([0, 1], np.zeros((1, 3)), np.zeros((1, 4, 3)), "2 steps for 1 predictions"),
-        ([0], np.zeros((1, 2)), np.zeros((1, 4, 3)), r"shape \(1, 3\)"),
         ([0], np.zeros((1, 3)), np.zeros((1, 3, 3)), r"shape \(1, 4, 3\)"),
         ([0], np.zeros((1, 3)), None, r"shape \(1, 4, 3\)"),
         ([0], np.full((1, 3), np.nan), np.zeros((1, 4, 3)), "finite"),

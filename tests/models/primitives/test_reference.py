@@ -115,20 +115,6 @@ def test_from_demonstrations_refuses_invalid_mixtures():
         ReferenceTrajectory.from_demonstrations(hourglass(), 5, floor=-1)
 
 
-@pytest.mark.parametrize("components", [2.5, True, "8"])
-def test_reference_refuses_a_fractional_number_of_components(components):
-    with pytest.raises(InputError, match="components must be a whole number"):
-        ReferenceTrajectory.from_demonstrations(hourglass(), components)
-
-
-@pytest.mark.parametrize(
-    ("seed", "message"), [(-1, "from 0 to"), (2**32, "from 0 to"), ("a", "whole number"), (0.5, "whole")]
-)
-def test_reference_refuses_an_invalid_seed(seed, message):
-    with pytest.raises(InputError, match=f"seed must be .*{message}"):
-        ReferenceTrajectory.from_demonstrations(hourglass(), 5, seed)
-
-
 @pytest.mark.parametrize("times", [[0.0, 1.0, 10.0], [2.0, 3.0, 4.0]])
 def test_resampled_reference_is_interpolated_over_its_clock(times):
     means = np.array(times)[:, None] - times[0]
@@ -152,12 +138,9 @@ def test_constant_output_has_a_spread_independent_of_its_value(height):
     ("changes", "message"),
     [
         ({"components": 61}, "components must be between 1 and half the number of steps, 60: 61"),
-        ({"components": "6"}, "components must be a whole number, not '6'"),
-        ({"gap_scale": None}, "gap_scale must be a number, not None"),
-        ({"demonstrations": "demonstrations.npz"}, "a reference is fitted to Demonstrations, not 'demonstrations.npz'"),
         ({"demonstrations": hourglass(1), "prior_std": "small"}, "prior_std is not an array of numbers"),
     ],
 )
-def test_arguments_of_wrong_type_are_refused(changes, message):
+def test_arguments_out_of_range_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         ReferenceTrajectory.from_demonstrations(**({"demonstrations": hourglass(3), "components": 4} | changes))

@@ -16,7 +16,6 @@ from guiderail.models.robots.robot import (
     end_effector_names,
     find_end_effector,
     find_robot,
-    register_end_effector,
     register_robot,
     robot_names,
 )
@@ -61,7 +60,7 @@ def test_find_end_effector_suggests_the_nearest_name():
         find_end_effector("gripper")
 
 
-@pytest.mark.parametrize("robot", [5, None, type("Arm", (), {"name": "arm"})])
+@pytest.mark.parametrize("robot", [None, type("Arm", (), {"name": "arm"})])
 def test_register_robot_refuses_other_objects(robot):
     with pytest.raises(InputError, match="a robot is registered as a Robot object, not"):
         register_robot(robot)
@@ -91,18 +90,10 @@ def test_entry_point_of_an_installed_package_adds_a_robot(tmp_path, monkeypatch)
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"home": (0.0,) * 5}, "home must be 6 joint positions"),
-        ({"home": (np.nan,) * 6}, "home must be 6 joint positions"),
-        ({"home": ("a",) * 6}, "home must be 6 joint positions"),
-        ({"tool_turn": np.nan}, "tool_turn must be a finite angle, not nan"),
-        ({"tool_turn": "a"}, "tool_turn must be a finite angle, not 'a'"),
-        ({"apparent_rotor_inertia": "a"}, "apparent_rotor_inertia"),
-        ({"level_posture": (0.0,) * 7}, "level_posture must be 6"),
         ({"joints": ("a", "b")}, "six joints or more"),
         ({"joints": ("a",) * 6}, "each once"),
         ({"apparent_rotor_inertia": 0.0}, "apparent_rotor_inertia"),
         ({"apparent_rotor_inertia": 1.5}, "apparent_rotor_inertia"),
-        ({"drives": JointDrives((1.0,), (1.0,))}, "needs a drive for each of its"),
     ],
 )
 def test_robot_refuses_invalid_data(fields, reason):
@@ -113,23 +104,13 @@ def test_robot_refuses_invalid_data(fields, reason):
 @pytest.mark.parametrize(
     ("fields", "reason"),
     [
-        ({"bodies": ()}, "bodies"),
         ({"opening": {}}, "opening"),
         ({"opening": {"left_finger_joint": np.inf}}, "opening"),
-        ({"drives": None}, "drive"),
     ],
 )
 def test_end_effector_refuses_invalid_data(fields, reason):
     with pytest.raises(InputError, match=reason):
         dataclasses.replace(find_end_effector("parallel_gripper"), **fields)
-
-
-@pytest.mark.parametrize(
-    ("stiffness", "inertia"), [((1.0, 2.0), (1.0,)), ((0.0,), (1.0,)), ((1.0,), (np.nan,)), (("a",), (1.0,))]
-)
-def test_drives_refuse_invalid_data(stiffness, inertia):
-    with pytest.raises(InputError):
-        JointDrives(stiffness, inertia)
 
 
 def test_drives_are_critically_damped():
@@ -255,8 +236,3 @@ def test_robot_has_a_source_of_its_data(arm):
 def test_robot_models_reference_no_remote_files(arm):
     text = arm.robot.model.read_text()
     assert not re.search(r"package:|https?:(?!//drake\.mit\.edu)|mesh ", text)
-
-
-def test_register_end_effector_refuses_other_objects():
-    with pytest.raises(InputError, match="an end effector is registered as an EndEffector object, not 3"):
-        register_end_effector(3)

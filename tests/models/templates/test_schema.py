@@ -1,6 +1,6 @@
 """Template files: parsed values, and the error messages for invalid files."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import yaml
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform
 from guiderail.models.templates import load_template, parse_template
-from guiderail.models.templates.constraints import ActiveConstraint, Cylinder
+from guiderail.models.templates.active_constraints import ActiveConstraint, Cylinder
 from guiderail.models.templates.drawing import state_lines
 from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, TRANSITION_DISTANCES, register
 from guiderail.models.templates.transitions import TransitionDistance
@@ -118,21 +118,6 @@ def test_register_refuses_invalid_kinds_and_names(name, kind, sentence):
     with pytest.raises(InputError, match=sentence):
         register(TRANSITION_DISTANCES, name)(kind)
     assert name not in TRANSITION_DISTANCES
-
-
-def test_next_state_refuses_a_distance_that_is_no_number():
-    @dataclass(frozen=True)
-    class Text(TransitionDistance):
-        frame: str
-
-        def value(self, X_WE, frames):
-            return "near"
-
-    template = parse_template(edit_template(lambda data: None))
-    states = tuple(replace(state, transition_distance=Text("cup")) for state in template.states)
-    template = replace(template, states=states)
-    with pytest.raises(InputError, match="the transition distance Text must be a number, not 'near'"):
-        template.next_state(0, RigidTransform(), {"cup": RigidTransform()})
 
 
 TRANSLATION = {"kind": "translation", "inputs": [0, 1], "speed_m_per_s": 0.1}
@@ -278,9 +263,3 @@ def test_parse_refuses_a_parameter_that_depends_on_another():
             "{name: x, inputs: 1, parameters: {near: far, far: 1}, max_speed_m_per_s: 1, "
             "max_speed_rad_per_s: 1, states: {}}"
         )
-
-
-@pytest.mark.parametrize("source", [None, 5, ["pouring"]])
-def test_load_refuses_sources_that_are_no_path_or_name(source):
-    with pytest.raises(InputError, match="a template is read from a file or by its name, not from"):
-        load_template(source)

@@ -312,29 +312,3 @@ def test_progress_is_finite_for_cyclic_states():
     )
     template = SharedControlTemplate("round", 3, (), (a, b, c), 0, REACH, 1.0)
     assert [template.progress(number, RigidTransform(), {}) for number in range(3)] == [1.0, 2.0, 3.0]
-
-
-@pytest.mark.parametrize("state", [-1, 4, "tilt", None])
-def test_map_and_command_refuse_unknown_states(state):
-    template, X_WE = load_template("pouring"), RigidTransform([0.0, -0.3, 0.15])
-    frames = {"mug_tip": RigidTransform()}
-    for call in (
-        lambda: template.map(state, np.zeros(3), X_WE, frames, 0.02),
-        lambda: template.command(state, X_WE, X_WE, frames, 0.02),
-    ):
-        with pytest.raises(InputError, match="a state of the template pouring is a number from 0 to"):
-            call()
-
-
-@pytest.mark.parametrize("period", [-0.02, 0.0, np.nan])
-def test_map_and_command_refuse_invalid_arguments(period):
-    template, X_WE = load_template("pouring"), RigidTransform([0.0, -0.3, 0.15])
-    frames = {"mug_tip": RigidTransform()}
-    with pytest.raises(InputError, match="a period must be positive"):
-        template.command(0, X_WE, X_WE, frames, period)
-    with pytest.raises(InputError, match="a period must be positive"):
-        template.map(0, np.zeros(3), X_WE, frames, period)
-    with pytest.raises(InputError, match="has 3 inputs, not an array of shape"):
-        template.map(0, np.zeros(2), X_WE, frames, 0.02)
-    with pytest.raises(InputError, match="needs the frame mug_tip"):
-        template.map(0, np.zeros(3), X_WE, {}, 0.02)

@@ -1,6 +1,6 @@
 """Benchmark of learners."""
 
-from guiderail.tools.learning.config import PRESETS
+from guiderail.tools.learning.learner_config import PRESETS
 from research.benchmarks import learner
 
 

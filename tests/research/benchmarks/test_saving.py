@@ -6,7 +6,6 @@ from research.benchmarks.saving import saving_share, timed
 
 def test_saving_share_counts_saving_only(monkeypatch, bead_config):
     monkeypatch.setattr(saving, "configure", lambda *_, **__: bead_config)
-    monkeypatch.setattr(saving, "with_defaults", lambda task, given: given)
     result = saving_share("Bead", bead_config.episodes)
     assert 1 <= result["checkpoints"] <= bead_config.episodes
     assert 0 < result["step_log_share"] < 1

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from guiderail.tools.learning.config import LEARNERS
+from guiderail.tools.learning.learner_config import LEARNERS
 from guiderail_studies.declaration import load_study
 from research.results.methods import (
     README_COLUMNS,

@@ -31,12 +31,6 @@ def test_signal_is_refused_when_its_sizes_differ(system):
         SignalPorts(system, {"pose": 2}, {"pose": 6})
 
 
-@pytest.mark.parametrize(("signals", "words"), [({"pose": 0}, "'pose'"), ({"": 1}, "needs a name, not ''")])
-def test_signal_is_refused_when_size_is_zero_or_name_is_empty(signals, words, system):
-    with pytest.raises(InputError, match=words):
-        SignalPorts(system, signals)
-
-
 def test_unknown_signal_is_refused_with_the_known_names(system):
     with pytest.raises(InputError, match="'wrench', only pose, force"):
         SignalPorts(system, {"pose": 2, "force": 1}).port("wrench")

@@ -1,13 +1,12 @@
 """Package of a lab with a task, guidance, a kernel, a learner with settings, and an environment without guiderail."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 from pydantic import Field
 from pydantic.dataclasses import dataclass
-from pydrake.systems.framework import Context, Diagram
 
 import guiderail as gr
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
@@ -16,53 +15,38 @@ from guiderail.models.policy import FORMAT
 NUM_STEPS, PERIOD = 80, 0.02
 
 
-class SlotOptions(gr.Options):
-    """Options of the slot."""
-
-    width: float = Field(0.14, ge=0.05, le=0.3, description="width of the slot [m]")
-
-
 @gr.register_task("peglab/Slot")
 class Slot(gr.Task):
     """Task of moving through a slot to a goal that the reference trajectory does not reach."""
 
-    workcell_kind = "plane"
-    Options = SlotOptions
-    options: SlotOptions
+    station, clip, has_held_out_distribution = gr.PlaneStation, 1.0, True
     defaults = {"guidance": "kgrl", "action_repeat": 5}
-    num_steps = NUM_STEPS
-    clip = 1.0
-    has_held_out_distribution = True
+    width: float = Field(0.14, ge=0.05, le=0.3, description="width of the slot [m]")
 
     def workcell(self) -> PassageGeometry:
-        middle = 0.35
-        gap = (middle - self.options.width / 2, middle + self.options.width / 2)
+        gap = (0.35 - self.width / 2, 0.35 + self.width / 2)
         return PassageGeometry(start=(0.35, 0.1), goal=(0.42, 0.9), goal_radius=0.06, gap_x=gap)
 
-    def reference(self) -> gr.ReferenceTrajectory:
+    def prior(self) -> gr.Prior:
         phase = np.linspace(0.0, 1.0, NUM_STEPS)
         means = np.column_stack([np.full(NUM_STEPS, 0.35), 0.1 + 0.8 * phase])
         covariances = np.tile(0.04**2 * np.eye(2), (NUM_STEPS, 1, 1))
-        return gr.ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, covariances)
+        reference = gr.ReferenceTrajectory(PERIOD * np.arange(NUM_STEPS), means, covariances)
+        return gr.Prior(reference, gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf]))
 
-    def constraints(self) -> gr.LinearConstraints:
-        return gr.LinearConstraints.box([0.25, -np.inf], [0.45, np.inf])
-
-    def observation_terms(self) -> Sequence[gr.ObservationTerm]:
+    def observe(self) -> Sequence[gr.ObservationTerm]:
         return (gr.ObservationTerm("phase"), gr.ObservationTerm("pose", 0.5, 0.5))
 
-    def reward_terms(self, num_actions: int) -> list[gr.RewardTerm]:
+    def rewards(self) -> Mapping[str, Callable[..., float]]:
         goal = np.array(self.workcell().goal)
-        return [gr.RewardTerm("nearness", {"pose": 2}, lambda pose: -float(np.linalg.norm(pose - goal)))]
+        return {"nearness": lambda pose: -float(np.linalg.norm(pose - goal))}
 
-    def termination_terms(self) -> list[gr.TerminationTerm]:
-        return [gr.TerminationTerm("success", {"pose": 2}, self.workcell().at_goal)]
+    def done(self) -> Mapping[str, Callable[..., bool]]:
+        return {"success": self.workcell().at_goal}
 
-    def reset(
-        self, station: gr.Station, guidance: Diagram, context: Context, rng: np.random.Generator, options: Any
-    ) -> dict[str, Any]:
-        start = np.array([0.35, 0.1]) + (0.01 if options.held_out else 0.002) * rng.standard_normal(2)
-        station.set_pose(context, start)
+    def reset(self, world: gr.World, rng: np.random.Generator, given: Any) -> dict[str, Any]:
+        start = np.array([0.35, 0.1]) + (0.01 if given.held_out else 0.002) * rng.standard_normal(2)
+        world.set_pose(start)
         return {"start": start}
 
 

@@ -5,12 +5,12 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.cli import demo
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.visualization import style
+from guiderail.tools.visualization import figures
 
 
 def test_demo_prints_its_results_and_can_be_removed(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(demo, "HELD_OUT", 1)
-    monkeypatch.setattr(style, "LAYOUT", "constrained")  # default layout, which the tests' fixture omits
+    monkeypatch.setattr(figures, "LAYOUT", "constrained")  # default layout, which the tests' fixture omits
     out = tmp_path / "demo"
     demo.run_demo(out, episodes=2, seed=0)
     printed = capsys.readouterr().out

@@ -18,13 +18,13 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in a shell's ba
 import bead
 bead.register()
 from guiderail.tools.cli.main import main
-from guiderail.tools.learning import trainer
+from guiderail.tools.learning.trainer import TrainingLoop
 
-def save(*arguments, write=trainer.write_checkpoint):
-    write(*arguments)
+def save(loop, write=TrainingLoop.write_checkpoint):
+    write(loop)
     print("saved", flush=True)
 
-trainer.write_checkpoint = save
+TrainingLoop.write_checkpoint = save
 main(sys.argv[1:])
 """
 # Program that runs a command in which the function of the first two arguments sends SIGINT to its own process.

@@ -19,8 +19,7 @@ from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.baselines import find_scripted_policy, scripted_policies
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import EpisodeSpec
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail.tools.visualization import replay
 
 
@@ -70,6 +69,6 @@ def test_scripted_policy_is_found_by_name_or_as_the_default():
 
 @pytest.mark.parametrize("task", ["BncConnector", "GridClamp", "NarrowPassage", "Pouring"])
 def test_scripted_policies_have_the_same_names_per_difficulty(task):
-    names = [set(scripted_policies(task, difficulty)) for difficulty in TASKS.get(task).difficulties]
+    names = [set(scripted_policies(task, difficulty)) for difficulty in ("standard", *TASKS.get(task).presets)]
     assert names[0]
     assert all(names_of_difficulty == names[0] for names_of_difficulty in names)

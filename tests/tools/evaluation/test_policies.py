@@ -18,7 +18,6 @@ from guiderail.models.policy import Policy
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.evaluate import evaluate
 from guiderail.tools.evaluation.policies import (
-    PredictPolicy,
     as_policy,
     check_compatible,
     is_policy_file,
@@ -198,42 +197,10 @@ def test_model_with_other_action_bounds_is_refused(env, tmp_path):
         check_compatible(load_policy(tmp_path / "rescaled.zip", trust_policy=True), env)
 
 
-def test_spaces_that_differ_are_named_with_options_that_fit():
-    """With difficulty=hard, the observation of the connector includes the center of pressure."""
-    policy = SAC("MlpPolicy", make_environment("BncConnector", {"observation": "center_of_pressure"}), device="cpu")
-    env = make_environment("BncConnector", {})
-    with pytest.raises(InputError) as error:
-        check_compatible(PredictPolicy(policy), env)
-    (policy_size,), (env_size,) = policy.observation_space.shape, env.observation_space.shape
-    assert f"takes observations ({policy_size},) and returns actions (2,)" in str(error.value)
-    assert f"this environment has observations ({env_size},) and actions (2,)" in str(error.value)
-    assert "it fits with --env difficulty=hard or --env observation=center_of_pressure" in str(error.value)
-
-
-def test_mismatch_names_the_only_size_that_a_network_accepts(env, tmp_path):
-    torch.jit.script(torch.nn.Linear(5, 2)).save(tmp_path / "policy.pt")
-    message = r"takes observations \({}\) and returns actions \({}\), .* observations \(3,\) and actions \(2,\)"
-    with pytest.raises(InputError, match=message.format("5,", "2,") + ": give another policy"):
-        check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
-    with pytest.raises(InputError, match=message.format("7,", "4,")):
-        check_compatible(lambda observation: np.ones((4, 7)) @ observation, env)
-    with pytest.raises(InputError, match=r"cannot take these observations, .* observations \(3,\)") as error:
-        check_compatible(lambda observation: observation[40:42] + observation[40], env)
-    assert "--env" not in str(error.value)
-
-
 @pytest.mark.parametrize("shape", [(), (3,), (2, 1)])
 def test_mismatch_of_the_action_names_the_shape_to_return(shape, env):
-    with pytest.raises(InputError, match=r"takes observations \(3,\) .*: it must return an array of shape \(2,\)$"):
+    with pytest.raises(InputError, match=r"takes observations \(3,\) .*: it must return an action \(2,\)$"):
         check_compatible(lambda observation: np.zeros(shape), env)
-
-
-def test_mismatch_names_no_options_when_none_fit():
-    env = make_environment("NarrowPassage", {})
-    with pytest.raises(InputError, match=r"returns actions \(2, 2\), .*: it must return an array of shape \(2,\)$"):
-        check_compatible(lambda observation: np.zeros((2, 2)), env)
-    with pytest.raises(InputError, match=r"takes observations \(77,\) .* no options of NarrowPassage fit it"):
-        check_compatible(lambda observation: np.ones((2, 77)) @ observation, env)
 
 
 def fail(observation):
@@ -260,17 +227,17 @@ class FailingModel:
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
-        (fail, r"^the policy fail raised ValueError: wrong value, for observations of shape \(3,\)$"),
-        (fail_in_episode, r"^the policy fail_in_episode raised RuntimeError: wrong state(?!,)"),
-        (exit_program, r"^the policy exit_program raised SystemExit, for"),
+        (fail, r"^the policy fail raised ValueError: wrong value"),
+        (fail_in_episode, r"^the policy fail_in_episode raised RuntimeError: wrong state"),
+        (exit_program, r"^the policy exit_program raised SystemExit"),
         (lambda: np.zeros(2), r"^the policy raised TypeError: .*takes 0 positional arguments"),
-        (FailingModel(), r"^the policy FailingModel raised KeyError: 'x', for"),
+        (FailingModel(), r"^the policy FailingModel raised KeyError: 'x'"),
     ],
 )
 def test_exception_of_a_policy_is_named(policy, message, env):
     with pytest.raises(InputError, match=message):
         check_compatible(policy, env)
-    with pytest.raises(InputError, match=message.split(", for")[0]):
+    with pytest.raises(InputError, match=message):
         evaluate(policy, "Bead", 2, baselines=(), processes=2)
 
 
@@ -291,7 +258,7 @@ class FailingNetwork(torch.nn.Module):
 )
 def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
     torch.jit.script(module).save(tmp_path / "policy.pt")
-    with pytest.raises(InputError, match=rf"^the policy policy\.pt raised {message}, for observations"):
+    with pytest.raises(InputError, match=rf"^the policy policy\.pt raised {message}"):
         check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
 
 
@@ -406,11 +373,6 @@ def test_registered_environment_is_evaluated_by_its_id():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (
-            ("zero", gymnasium.vector.SyncVectorEnv([PointToOrigin] * 2)),
-            "single environment, and .* is a vector environment",
-        ),
-        (("zero", PointToOrigin), r"PointToOrigin is a class: give an environment, such as PointToOrigin\(\)"),
         ((PointToOrigin(), lambda point: point), "needs a policy and then the name of a task, .*, not <function"),
         (("NarrowPassage", lambda point: point), "needs a policy and then the name of a task"),
         (("zero", "CartPole-v99"), "no environment 'CartPole-v99' is registered with Gymnasium: check the id"),
@@ -426,32 +388,6 @@ def test_evaluation_in_an_invalid_environment_is_refused(arguments, message):
 def test_action_of_a_function_with_another_shape_is_refused(returned):
     with pytest.raises(InputError, match=r"the policy returned .*, and the actions .* have the shape \(2,\)"):
         evaluate(lambda point: returned, PointToOrigin(), 1, baselines=(), processes=1)
-
-
-class ZeroModel:
-    """Model of another package, which always returns zero."""
-
-    def predict(self, observation):
-        return np.zeros(2)
-
-
-@pytest.mark.parametrize(
-    ("baselines", "message"),
-    [
-        ("constant", "baselines are a list of names"),
-        (5, "baselines are a list of names"),
-        ({"lab": 5}, "baseline lab must be a function from an environment to a policy, not 5"),
-        ({"lab": lambda point: np.zeros(2)}, "must return a policy, not array"),
-    ],
-)
-def test_baselines_of_another_type_are_refused(baselines, message):
-    with pytest.raises(InputError, match=message):
-        evaluate(ZeroModel(), PointToOrigin(), 1, baselines=baselines, processes=1)
-
-
-def test_class_is_no_policy():
-    with pytest.raises(InputError, match=r"ZeroModel is a class: give a policy, such as ZeroModel\(\)"):
-        evaluate(ZeroModel, PointToOrigin(), 1)
 
 
 def test_policy_of_another_environment_is_refused():

@@ -3,7 +3,7 @@ import math
 
 from rich.console import Console
 
-from guiderail.tools.evaluation.rollout import EpisodeProgress
+from guiderail.tools.progress import EpisodeProgress
 
 
 def rows(count):

@@ -62,10 +62,6 @@ class Model:
     [
         ({"seed": -1}, "a seed is a whole number of at least 0, not -1"),
         ({"seed": 1.5}, "a seed must be a whole number, not 1.5"),
-        (
-            {"env": "CartPole-v1"},
-            "an episode runs in an environment, as gymnasium.make returns it, not in 'CartPole-v1'",
-        ),
         ({"act": 3}, "3 is no policy"),
         ({"act": lambda observation: 7}, "returned 7, and the actions of this environment are 0 to 1"),
         ({"act": lambda observation: "left"}, "returned 'left', and the actions"),

@@ -8,7 +8,6 @@ import pytest
 from guiderail import Demonstrations, Frame, Segment, align_demonstrations, cut_demonstrations, find_events
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives.demonstrations import MAX_ALIGNED_SAMPLES, _warping_path
-from guiderail.tools.guided.guide import GuideSettings
 
 
 def recordings():
@@ -24,23 +23,6 @@ def test_find_events_searches_the_conditions_in_order():
     assert events == [[1, 4], [0, 3]]
     with pytest.raises(InputError, match="event 1 does not occur in recording 0"):
         find_events(signals, [lambda s: s[0] == 2, lambda s: s[0] == 1])
-
-
-@pytest.mark.parametrize(
-    ("signals", "conditions", "message"),
-    [
-        (np.zeros((5, 2)), [lambda s: s[0] > 0], r"signals are a list of arrays \(N, S\)"),
-        ([np.zeros(5)], [lambda s: s > 0], "signals are a list"),
-        ([[[0.0], [0.0, 1.0]]], [lambda s: s[0] > 0], "signals are a list"),
-        (recordings(), [lambda s: s[0] > 0], "signals are a list"),
-        ([np.zeros((5, 2))], lambda s: s[0] > 0, "conditions are a list of functions"),
-        ([np.zeros((5, 2))], [0.5], "conditions are a list of functions"),
-        ([np.zeros((5, 2))], [lambda s: s > 0], r"a condition must return True or False, not array"),
-    ],
-)
-def test_find_events_raises_when_an_argument_is_invalid(signals, conditions, message):
-    with pytest.raises(InputError, match=message):
-        find_events(signals, conditions)
 
 
 def test_find_events_accepts_an_array_of_recordings():
@@ -63,9 +45,6 @@ def test_cut_parts_share_a_sample_and_begin_at_time_zero():
         [[10], [10], [39]],
         [[10, 5], [5, 10], [5, 10]],
         [[1], [1, 2], [1]],
-        [5] * 3,
-        5,
-        [[5.5]] * 3,
     ],
 )
 def test_cut_demonstrations_raises_when_a_cut_is_invalid(cuts):
@@ -81,16 +60,6 @@ def test_discrete_value_is_the_most_frequent_at_each_phase():
     assert [int(v) for v in values] == [-1] * 10 + [1] * 10
 
 
-@pytest.mark.parametrize(
-    "discrete",
-    [5, [1, 1, 1], [None] * 3, [[0.0, [1.0]]] * 3, [[[1], [1, 2]]] * 3, GRIPPER[:2],
-     [np.zeros((40, width)) for width in (1, 1, 2)]],
-)  # fmt: skip
-def test_discrete_values_raise_when_not_one_per_sample(discrete):
-    with pytest.raises(InputError, match="a value for each sample"):
-        Segment(recordings(), discrete=discrete).discrete_values(20)
-
-
 def test_segment_raises_when_it_has_discrete_and_extra():
     with pytest.raises(InputError, match="not both"):
         Segment(recordings(), discrete=GRIPPER, extra=1.0)
@@ -99,32 +68,13 @@ def test_segment_raises_when_it_has_discrete_and_extra():
 @pytest.mark.parametrize(
     ("keywords", "message"),
     [
-        ({"num_steps": 11}, "at least 12"),
-        ({"num_steps": np.nan}, "at least 12, not nan"),
-        ({"dwell": -1}, "at least 0"),
-        ({"frame": np.zeros(3)}, "frame of a segment is a function"),
-        ({"until": True}, "until of a segment is a function"),
-        ({"dwell": np.inf}, "at least 0, not inf"),
+        ({"num_steps": 11}, "from 12 to"),
+        ({"dwell": -1}, "from 0 to"),
     ],
 )
 def test_segment_raises_when_an_argument_is_invalid(keywords, message):
     with pytest.raises(InputError, match=message):
         Segment(recordings(), **keywords)
-
-
-@pytest.mark.parametrize(
-    ("demonstrations", "value"), [(None, "None"), (5, "5"), ([1, 2], r"\[1, 2\]"), ([recordings()], "")]
-)
-def test_segment_raises_when_demonstrations_have_a_wrong_type(demonstrations, value):
-    with pytest.raises(InputError, match=f"demonstrations of a segment are Demonstrations or their file, not {value}"):
-        Segment(demonstrations)
-
-
-@pytest.mark.parametrize("history", [0, 1.5, np.inf, "4"])
-def test_guide_settings_raise_when_history_is_invalid(history):
-    with pytest.raises(InputError, match="history is a number of outputs, at least 1, not"):
-        GuideSettings(history=history)
-    assert type(GuideSettings(history=2.0).history) is int
 
 
 def test_number_of_steps_follows_from_the_period():
@@ -135,7 +85,7 @@ def test_number_of_steps_follows_from_the_period():
     with pytest.raises(InputError, match=r"shorter than 4 periods of 1\.2 s"):
         segment.steps_of(1.2)
     with pytest.raises(InputError, match="give the period of the environment"):
-        segment.steps_of("0.1")
+        segment.steps_of(None)
     assert Segment(recordings(), num_steps=20).steps_of(None) == 20
 
 

@@ -8,9 +8,9 @@ import pandas as pd
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.actors import ParallelLearner
+from guiderail.tools.learning.processes import ActorEpisodes
 from guiderail.tools.learning.run_folder import LOCK, RunFolder
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.same_runs import differences
 
 
@@ -45,21 +45,21 @@ def test_run_with_actors_resumes_bit_for_bit(num_envs, parallel_config, tmp_path
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)
     with pytest.raises(Stopped):
-        run_training(stopped, config, report=stop_in_episode_4)
+        run_training(stopped, config, observers=Observers(stop_in_episode_4))
     run_training(stopped, config, resume=True)
     assert differences(whole.path, stopped.path) == []
 
 
 def test_lock_is_released_after_the_actors_end(parallel_config, tmp_path, monkeypatch):
-    folder, close, locked = RunFolder(tmp_path / "run"), ParallelLearner.close, []
+    folder, close, locked = RunFolder(tmp_path / "run"), ActorEpisodes.end, []
 
     def close_and_record(self):
         close(self)
         locked.append((folder.path / LOCK).exists())
 
-    monkeypatch.setattr(ParallelLearner, "close", close_and_record)
+    monkeypatch.setattr(ActorEpisodes, "end", close_and_record)
     with pytest.raises(Stopped):
-        run_training(folder, parallel_config(2), report=stop_in_episode_4)
+        run_training(folder, parallel_config(2), observers=Observers(stop_in_episode_4))
     assert locked == [True]
     assert not (folder.path / LOCK).exists()
 
@@ -83,7 +83,7 @@ def test_demonstrator_acts_in_actors(parallel_config, tmp_path):
 
 
 def test_run_ends_with_one_sentence_when_an_actor_is_killed(parallel_config, tmp_path, monkeypatch):
-    monkeypatch.setattr(ParallelLearner, "_simulate", lambda self, assignment: os.kill(os.getpid(), signal.SIGKILL))
+    monkeypatch.setattr(ActorEpisodes, "_simulate", lambda self, assignment: os.kill(os.getpid(), signal.SIGKILL))
     with pytest.raises(InputError, match="an actor was killed: resume"):
         run_training(RunFolder(tmp_path / "run"), parallel_config(2))
 
@@ -92,7 +92,7 @@ def test_error_of_an_actor_is_raised_in_the_main_process(parallel_config, tmp_pa
     def refuse(self, assignment):
         raise InputError("the episode is refused")
 
-    monkeypatch.setattr(ParallelLearner, "_simulate", refuse)
+    monkeypatch.setattr(ActorEpisodes, "_simulate", refuse)
     with pytest.raises(InputError, match="the episode is refused"):
         run_training(RunFolder(tmp_path / "run"), parallel_config(2))
     assert not (tmp_path / "run").exists()
@@ -108,18 +108,18 @@ def test_actors_are_refused_with_conflicting_settings(parallel_config, tmp_path)
     with pytest.raises(InputError, match="num_envs does not work with"):
         run_training(folder, parallel_config(2, pipelined=True))
     with pytest.raises(InputError, match="callbacks need model and episodes"):
-        run_training(folder, parallel_config(2), sb3_callbacks=[])
+        run_training(folder, parallel_config(2), observers=Observers(sb3_callbacks=[]))
     assert not folder.path.exists()
 
 
 def test_actors_continue_the_episode_count_of_init_from(parallel_config, bead_run, monkeypatch, tmp_path):
-    simulate = ParallelLearner._simulate
+    simulate = ActorEpisodes._simulate
 
     def raise_episode_number(self, assignment):
         simulate(self, assignment)
         raise InputError(f"the actor is in episode {self._learner.episodes}")
 
-    monkeypatch.setattr(ParallelLearner, "_simulate", raise_episode_number)
+    monkeypatch.setattr(ActorEpisodes, "_simulate", raise_episode_number)
     episodes = len(RunFolder(bead_run).episodes())
     with pytest.raises(InputError, match=f"in episode {episodes + 1}$"):
         run_training(RunFolder(tmp_path / "second"), parallel_config(1, init_from=str(bead_run)))

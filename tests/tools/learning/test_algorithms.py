@@ -11,10 +11,9 @@ from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, learner_arguments
-from guiderail.tools.learning.networks import DroppedNormalizedReLU
-from guiderail.tools.learning.sb3 import DemonstrationReplayBuffer
+from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
+from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
 
 OFF_POLICY = {"net_arch": "8", "batch_size": 4, "learning_starts": 6, "train_freq": 4, "gradient_steps": 2}
 ON_POLICY = {"net_arch": "8,8", "n_steps": 16, "batch_size": 8}

@@ -1,8 +1,8 @@
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.train import train
 
 

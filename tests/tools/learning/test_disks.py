@@ -9,7 +9,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.disks import bound_by_permissions, full_disk
 from oracles.same_runs import differences
 
@@ -37,7 +37,7 @@ def test_run_resumes_when_a_full_disk_has_room_again(episode, bead_run, bead_con
             if row["episode"] == episode:
                 disk.enter_context(full_disk())
 
-        run_training(folder, bead_config, report=fill)
+        run_training(folder, bead_config, observers=Observers(fill))
     assert not list(folder.path.rglob("*.part"))
     run_training(folder, bead_config, resume=True)
     assert differences(bead_run, folder.path) == []

@@ -10,11 +10,10 @@ import guiderail
 from guiderail.models.common.errors import InputError
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.configure import configure
 from guiderail.tools.learning.environment_set import EnvironmentSet, find_members, load_variants
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.learning.train import train
+from guiderail.tools.learning.trainer import Observers, run_training
 from oracles.same_runs import differences
 
 SETTINGS = {"net_arch": "8", "gradient_steps": 1, "batch_size": 8, "learning_starts": 10}
@@ -45,7 +44,7 @@ def test_run_over_a_set_resumes_bit_for_bit(settings, tmp_path, forkserver):
     whole, stopped = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "stopped")
     run_training(whole, config)
     with pytest.raises(Stopped):
-        run_training(stopped, config, report=stop_in_episode_2)
+        run_training(stopped, config, observers=Observers(stop_in_episode_2))
     run_training(stopped, stopped.config(), resume=True)
     assert differences(whole.path, stopped.path) == []
 
@@ -123,10 +122,8 @@ def test_environments_given_as_objects_are_a_set(tmp_path):
 
 def test_sets_of_unequal_environments_are_refused(tmp_path):
     def start(variants, **options):
-        start_or_resume(
-            "NarrowPassage", tmp_path / "run", variants=variants, environment=ENVIRONMENT | options, episodes=2,
-            settings=SETTINGS, pictures=False,
-        )  # fmt: skip
+        given = {"variants": variants, "episodes": 2, "settings": SETTINGS, "pictures": False}
+        train("NarrowPassage", out=tmp_path / "run", **given, **(ENVIRONMENT | options))
 
     for variants, message in (
         ({"one": {}, "other": {"action_dims": "0"}}, r"other has the actions .*\(1,\).* and one .*\(2,\)"),
@@ -143,13 +140,13 @@ def test_sets_of_unequal_environments_are_refused(tmp_path):
 
 
 def test_resume_refuses_another_set(tmp_path):
-    options = {"environment": ENVIRONMENT, "settings": SETTINGS, "pictures": False}
+    options = {**ENVIRONMENT, "settings": SETTINGS, "pictures": False}
     out = tmp_path / "run"
-    start_or_resume("NarrowPassage", out, variants=VARIANTS, episodes=1, **options)
-    start_or_resume("NarrowPassage", out, variants=VARIANTS, episodes=2, resume=True, **options)
+    train("NarrowPassage", out=out, variants=VARIANTS, episodes=1, **options)
+    train("NarrowPassage", out=out, variants=VARIANTS, episodes=2, resume=True, **options)
     with pytest.raises(InputError, match="has another set of environments"):
-        start_or_resume("NarrowPassage", out, variants={**VARIANTS, "more": {}}, episodes=3, resume=True, **options)
-    run = start_or_resume(None, out, environment={}, episodes=3, resume=True, pictures=False)
+        train("NarrowPassage", out=out, variants={**VARIANTS, "more": {}}, episodes=3, resume=True, **options)
+    run = train(out=out, episodes=3, resume=True, pictures=False)
     assert sorted(run.episodes["environment"]) == sorted(VARIANTS)
 
 

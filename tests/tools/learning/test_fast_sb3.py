@@ -10,8 +10,8 @@ from stable_baselines3 import SAC
 from torch.nn.utils import parameters_to_vector
 
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.fast_sb3 import FastTrainingStep
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
 
 STEPS, BATCH = 6, 64

@@ -10,8 +10,8 @@ from guiderail.diagrams.envs.observation import ImageAndStateSpace
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS, described_observation
+from guiderail.tools.learning.learner_config import resolve_preset
 
 SHAPE = (16, 17, 3)
 IMAGE = spaces.Box(0, 255, SHAPE, np.uint8)

@@ -10,9 +10,9 @@ from spaces_only_env import SpacesOnlyEnv
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
-from guiderail.tools.learning.pipelined import PipelinedLearner, _write
+from guiderail.tools.learning.learner_config import resolve_preset
+from guiderail.tools.learning.processes import PipelinedLearner, _write
 
 
 def make_learner(algorithm="sac", **options):

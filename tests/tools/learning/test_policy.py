@@ -8,8 +8,8 @@ from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy, _digest
-from guiderail.tools.learning.config import resolve_preset
 from guiderail.tools.learning.learner import LEARNERS
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.networks import export_policy, pack_observation
 
 STATE = spaces.Box(-np.inf, np.inf, (5,))

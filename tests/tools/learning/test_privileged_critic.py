@@ -15,10 +15,10 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.episode import Transition
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail.tools.learning.networks import SpacesOnlyEnv
 from guiderail.tools.learning.off_policy import OffPolicyLearner, SacLearner, TqcLearner
-from guiderail.tools.learning.pipelined import PipelinedLearner
+from guiderail.tools.learning.processes import PipelinedLearner
 
 OBSERVED, HIDDEN = 5, 3
 SETTINGS = {"net_arch": "16", "batch_size": 8, "learning_starts": 4, "symmetry": False, "privileged_critic": True}

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.config import PRESETS
+from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunFolder
 
 

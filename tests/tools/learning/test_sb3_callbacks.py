@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.trainer import Observers, run_training
 
 
 class Recorder(BaseCallback):
@@ -38,7 +38,7 @@ class Recorder(BaseCallback):
 def test_callbacks_receive_every_transition_and_the_model(bead_config, tmp_path):
     recorder, checkpoints = Recorder(), CheckpointCallback(5, str(tmp_path / "models"))
     config = replace(bead_config, episodes=3, learner=replace(bead_config.learner, algorithm="sac"))
-    rows = run_training(RunFolder(tmp_path / "run"), config, sb3_callbacks=[recorder, checkpoints])
+    rows = run_training(RunFolder(tmp_path / "run"), config, observers=Observers(sb3_callbacks=[recorder, checkpoints]))
     assert recorder.calls == ["training start", *["start", "end"] * 3, "training end"]
     assert [count for count, _, _ in recorder.transitions] == list(range(1, len(recorder.transitions) + 1))
     assert sum(reward for _, reward, _ in recorder.transitions) == pytest.approx(sum(row["return"] for row in rows))
@@ -51,15 +51,15 @@ def test_callbacks_receive_every_transition_and_the_model(bead_config, tmp_path)
 def test_count_of_transitions_continues_when_resumed(bead_config, tmp_path):
     config, folder = replace(bead_config, episodes=1), RunFolder(tmp_path / "run")
     first, second = Recorder(), Recorder()
-    run_training(folder, config, sb3_callbacks=first)
-    run_training(folder, replace(config, episodes=2), resume=True, sb3_callbacks=second)
+    run_training(folder, config, observers=Observers(sb3_callbacks=first))
+    run_training(folder, replace(config, episodes=2), resume=True, observers=Observers(sb3_callbacks=second))
     counts = [count for count, _, _ in [*first.transitions, *second.transitions]]
     assert counts == list(range(1, len(counts) + 1))
 
 
 def test_callback_that_returns_false_ends_the_training(bead_config, tmp_path):
     recorder = Recorder(last=1)
-    rows = run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=recorder)
+    rows = run_training(RunFolder(tmp_path / "run"), bead_config, observers=Observers(sb3_callbacks=recorder))
     assert len(rows) == 1
     assert (tmp_path / "run" / "policy.safetensors").is_file()
     resumed = run_training(RunFolder(tmp_path / "run"), bead_config, resume=True)
@@ -69,5 +69,5 @@ def test_callback_that_returns_false_ends_the_training(bead_config, tmp_path):
 def test_callbacks_of_another_kind_are_refused(bead_config, tmp_path):
     for callbacks in (lambda: True, [TD3]):
         with pytest.raises(InputError, match="is no callback"):
-            run_training(RunFolder(tmp_path / "run"), bead_config, sb3_callbacks=callbacks)
+            run_training(RunFolder(tmp_path / "run"), bead_config, observers=Observers(sb3_callbacks=callbacks))
     assert not (tmp_path / "run").exists()

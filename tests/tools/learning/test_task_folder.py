@@ -18,9 +18,8 @@ from guiderail.tools.environments import task_content
 from guiderail.tools.evaluation.evaluation import episodes_file
 from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume
+from guiderail.tools.learning.run_folder import RunFolder, configure
+from guiderail.tools.learning.train import train
 from guiderail_lerobot.env_server import open_environment
 from guiderail_studies.certify import certify_skill
 from guiderail_studies.declaration import Study
@@ -81,7 +80,7 @@ def test_run_is_not_resumed_when_its_task_folder_changed(name, folder, run):
     config, before = run.config(), (folder / name).read_text()
     (folder / name).write_text(CHANGES[name])
     for resume in (
-        lambda: start_or_resume(None, run.path, environment={}, resume=True),
+        lambda: train(out=run.path, resume=True),
         lambda: run.refuse_another(configure("parts/pin", {}, episodes=2)),
     ):
         with pytest.raises(InputError, match="the files of parts/pin are not those"):

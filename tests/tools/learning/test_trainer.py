@@ -16,14 +16,13 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluation import episodes_file
-from guiderail.tools.learning import actors, trainer
+from guiderail.tools.learning import episodes, processes, trainer
 from guiderail.tools.learning.checkpoint import load_checkpoint, save_checkpoint
-from guiderail.tools.learning.configure import configure, resumed_config, with_defaults
 from guiderail.tools.learning.learner import LEARNERS
 from guiderail.tools.learning.off_policy import SacLearner
-from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.train import start_or_resume, train
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.run_folder import RunFolder, configure, resumed_config
+from guiderail.tools.learning.train import Training, train
+from guiderail.tools.learning.trainer import Observers, run_training
 
 # Program that trains the run of `bead_config` and prints the number of each finished episode.
 CHILD = """
@@ -33,11 +32,11 @@ sys.path.insert(0, {tests!r})
 import bead
 bead.register()
 from guiderail.tools.learning.run_folder import RunFolder
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.trainer import run_training
+from guiderail.tools.learning.run_folder import configure
+from guiderail.tools.learning.trainer import Observers, run_training
 settings = dict(net_arch="16", batch_size=16, learning_starts=10, gradient_steps=4)
 run_training(RunFolder({out!r}), configure("Bead", {{}}, settings=settings, episodes=8, seed=5),
-      report=lambda row: print(row["episode"], flush=True))
+      observers=Observers(lambda row: print(row["episode"], flush=True)))
 """
 
 
@@ -160,12 +159,14 @@ def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_con
     short, stopped = RunFolder(tmp_path / "short"), RunFolder(tmp_path / "stopped")
     run_training(short, replace(config, episodes=episodes))
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))  # the checkpoint has the four episodes before
+        run_training(
+            stopped, config, observers=Observers(interrupt_in(4))
+        )  # the checkpoint has the four episodes before
     with pytest.raises(InputError, match="has done 4 episodes: give at least as many"):
-        resumed_config(stopped, None, {}, {"episodes": 3}, None)
+        resumed_config(stopped, None, {}, {"episodes": 3})
     with pytest.raises(InputError, match="--episodes ends it early"):
         Policy.load(stopped.path)
-    run_training(stopped, resumed_config(stopped, None, {}, {"episodes": episodes}, None), resume=True)
+    run_training(stopped, resumed_config(stopped, None, {}, {"episodes": episodes}), resume=True)
     assert_same_run(short, stopped)
     assert stopped.config() == short.config()
 
@@ -173,12 +174,12 @@ def test_interrupted_run_can_end_with_fewer_episodes(changes, episodes, bead_con
 @pytest.mark.parametrize("num_envs", [0, 3])
 def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config, tmp_path, monkeypatch):
     successes = dict(enumerate([1, 1, 0, 1, 1, 1, 1, 1]))
-    rollout = trainer.rollout
+    rollout = episodes.rollout
 
     def rollout_with_success(*arguments, index, **options):
         return rollout(*arguments, index=index, **options) | {"success": successes[index]}
 
-    for module in (trainer, actors):
+    for module in (episodes, processes):
         monkeypatch.setattr(module, "rollout", rollout_with_success)
     learner = replace(bead_config.learner, stop_after_successes=3, num_envs=num_envs)
     config, whole, stopped = replace(bead_config, learner=learner), RunFolder(tmp_path / "a"), RunFolder(tmp_path / "b")
@@ -187,7 +188,7 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
     assert len(list(whole.steps.glob("*.parquet"))) == 6
     assert Policy.load(whole.path)
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))
+        run_training(stopped, config, observers=Observers(interrupt_in(4)))
     run_training(stopped, config, resume=True)
     assert_same_run(whole, stopped)
     monkeypatch.delattr(RunFolder, "remove_policy")  # the policy of a finished run is not removed
@@ -197,8 +198,8 @@ def test_run_ends_after_successes_in_a_row_also_if_resumed(num_envs, bead_config
 
 
 def test_demonstrated_successes_do_not_end_a_run(bead_config, tmp_path, monkeypatch):
-    rollout = trainer.rollout
-    monkeypatch.setattr(trainer, "rollout", lambda *values, **options: rollout(*values, **options) | {"success": 1})
+    rollout = episodes.rollout
+    monkeypatch.setattr(episodes, "rollout", lambda *values, **options: rollout(*values, **options) | {"success": 1})
     learner = replace(bead_config.learner, stop_after_successes=2, demonstration_episodes=2)
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, learner=learner), demonstrator=zero_policy)
@@ -209,7 +210,7 @@ def test_outdated_policy_is_removed_when_a_run_continues(bead_config, tmp_path):
     folder = RunFolder(tmp_path / "run")
     run_training(folder, replace(bead_config, episodes=2))
     with pytest.raises(KeyboardInterrupt):
-        run_training(folder, replace(bead_config, episodes=3), resume=True, report=interrupt_in(2))
+        run_training(folder, replace(bead_config, episodes=3), resume=True, observers=Observers(interrupt_in(2)))
     with pytest.raises(InputError, match="finish the run with --resume"):
         Policy.load(folder.path)
     run_training(folder, replace(bead_config, episodes=3), resume=True)
@@ -225,7 +226,7 @@ def test_pipelined_run_resumes_bit_for_bit(bead_config, tmp_path, forkserver):
     undisturbed, stopped = RunFolder(tmp_path / "undisturbed"), RunFolder(tmp_path / "stopped")
     rows = run_training(undisturbed, config)
     with pytest.raises(KeyboardInterrupt):
-        run_training(stopped, config, report=interrupt_in(4))
+        run_training(stopped, config, observers=Observers(interrupt_in(4)))
     run_training(stopped, config, resume=True)
     assert_same_run(undisturbed, stopped)
     # A run that is not pipelined acts with weights that are one episode newer.
@@ -254,7 +255,7 @@ def test_step_log_stays_off_when_a_run_resumes(bead_config, tmp_path):
     run_training(folder, replace(bead_config, episodes=2, step_log=False))
     assert not folder.steps.exists()
     with pytest.raises(InputError, match="step_log False, not True"):
-        start_or_resume(None, folder.path, environment={}, step_log=True, resume=True)
+        Training(folder.path, choices={"step_log": True}, resume=True).start()
 
 
 def test_run_is_refused_in_a_folder_with_other_files(bead_config, tmp_path):
@@ -281,7 +282,7 @@ def test_damaged_run_is_unchanged_when_resume_is_refused(bead_config, tmp_path, 
     damage(folder)
     before = {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
     with pytest.raises(InputError):
-        start_or_resume(None, folder.path, environment={}, episodes=4, resume=True)
+        train(out=folder.path, episodes=4, resume=True)
     assert before == {path: path.read_bytes() for path in folder.path.rglob("*") if path.is_file()}
 
 
@@ -351,9 +352,9 @@ def test_run_starts_again_when_killed_before_a_checkpoint(bead_config, bead_run,
 def test_resume_refuses_other_settings(bead_config, tmp_path):
     run_training(RunFolder(tmp_path / "run"), replace(bead_config, episodes=2))
     with pytest.raises(InputError, match="seed 5, not 7"):
-        start_or_resume(None, tmp_path / "run", environment={}, seed=7, resume=True)
+        train(out=tmp_path / "run", seed=7, resume=True)
     with pytest.raises(InputError, match="other learner settings"):
-        start_or_resume(None, tmp_path / "run", environment={}, settings={"batch_size": 8}, resume=True)
+        train(out=tmp_path / "run", settings={"batch_size": 8}, resume=True)
 
 
 @pytest.mark.parametrize(("old", "new"), [("seed: 5", "seed: 6"), ("batch_size: 16", "batch_size: 8")])
@@ -368,7 +369,7 @@ def test_resume_refuses_an_edited_configuration(old, new, bead_run):
 def test_resume_refuses_too_many_episodes(bead_config, tmp_path):
     RunFolder(tmp_path).write_config(bead_config)
     with pytest.raises(InputError, match="at most 1000000000 episodes"):
-        resumed_config(RunFolder(tmp_path), None, {}, {"episodes": 10**9 + 1}, None)
+        resumed_config(RunFolder(tmp_path), None, {}, {"episodes": 10**9 + 1})
 
 
 def test_resume_refuses_rows_with_other_columns(bead_config, bead_run):
@@ -388,14 +389,12 @@ def test_resume_refuses_rows_with_other_columns(bead_config, bead_run):
     [("GridClamp", "sac_gridclamp", "sac"), ("Pouring", "pouring", "sac"), ("BncConnector", "tqc_contact", "tqc")],
 )
 def test_default_learner_is_declared_by_the_task(task, preset, algorithm):
-    config = configure(task, {}, **with_defaults(task, {"seed": 3}))
+    config = configure(task, {}, **{"seed": 3})
     assert (config.preset, config.learner.algorithm, config.seed) == (preset, algorithm, 3)
 
 
 def test_chosen_algorithm_replaces_the_default_learner():
-    arguments = with_defaults("GridClamp", {"algorithm": "tqc"})
-    assert arguments == {"algorithm": "tqc"}
-    assert configure("GridClamp", {"guidance": "none"}, **arguments).preset == "tqc_contact"
+    assert configure("GridClamp", {"guidance": "none"}, algorithm="tqc").preset == "tqc_contact"
 
 
 @pytest.mark.parametrize("pipelined", [False, True])
@@ -421,20 +420,20 @@ def test_run_is_refused_when_memory_does_not_suffice(bead_config, tmp_path, monk
 
 def test_resume_accepts_the_same_options_and_logs_versions(tmp_path, caplog):
     options = {
-        "environment": {"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40},
+        **{"guidance": "kgrl", "action_dims": "0,1", "action_repeat": 40},
         "settings": {"net_arch": "8", "gradient_steps": 1},
         "pictures": False,
     }
     out = tmp_path / "run"
-    start_or_resume("NarrowPassage", out, episodes=1, **options)
+    train("NarrowPassage", out=out, episodes=1, **options)
     folder = RunFolder(out)
     folder.write_config(replace(folder.config(), versions={**folder.config().versions, "drake": "1.0.0"}))
     for _ in range(2):
-        start_or_resume("NarrowPassage", out, episodes=2, resume=True, **options)
+        train("NarrowPassage", out=out, episodes=2, resume=True, **options)
     assert caplog.text.count("continues with other versions: drake 1.0.0, then ") == 1
     assert folder.config().versions["drake"].startswith("1.0.0, then ")
     with pytest.raises(InputError, match="has done 2 episodes"):
-        start_or_resume("NarrowPassage", out, episodes=1, resume=True, **options)
+        train("NarrowPassage", out=out, episodes=1, resume=True, **options)
 
 
 def write_subclass(folder, package, base, decorator, name):
@@ -453,12 +452,12 @@ def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
     names = "narrow_passage.task.NarrowPassage", "registry.register_task"
     file = write_subclass(tmp_path, "guiderail.diagrams.tasks", *names, "changes/Passage")
     out, environment = tmp_path / "run", {"guidance": "kgrl", "action_repeat": 40}
-    start_or_resume("changes/Passage", out, environment=environment, episodes=1, imports=[str(file)], pictures=False)
+    Training(out, ["changes/Passage"], environment, {"episodes": 1}, imports=[str(file)], pictures=False).start()
     config = RunFolder(out).config()
     before = episodes_file(out, "uniform_random", config, config.environment, episodes=2)
     file.write_text(file.read_text() + "# changed\n")
     with pytest.raises(InputError, match=f"the files of changes/Passage or {file.name} are not those that the run"):
-        start_or_resume(None, out, environment={}, episodes=2, resume=True)
+        train(out=out, episodes=2, resume=True)
     assert episodes_file(out, "uniform_random", config, config.environment, episodes=2) != before
     gymnasium.registry.pop(environment_id("changes/Passage"), None)
 
@@ -468,10 +467,9 @@ def test_imported_learner_can_be_pipelined(tmp_path, forkserver, monkeypatch):
     names = "off_policy.SacLearner", "learner.register_learner"
     file = write_subclass(tmp_path, "guiderail.tools.learning", *names, "lab_sac")
     settings = {"net_arch": "8", "pipelined": True, "learning_starts": 10, "batch_size": 8, "gradient_steps": 1}
-    run = start_or_resume(
-        "NarrowPassage", tmp_path / "run", environment={"guidance": "kgrl", "action_repeat": 20},
-        algorithm="lab_sac", settings=settings, episodes=2, imports=[str(file)], pictures=False,
-    )  # fmt: skip
+    environment, choices = {"guidance": "kgrl", "action_repeat": 20}, {"algorithm": "lab_sac", "episodes": 2}
+    training = Training(tmp_path / "run", ["NarrowPassage"], environment, choices | {"settings": settings})
+    run = replace(training, imports=[str(file)], pictures=False).start()
     assert run.summary["episodes"] == 2
 
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from guiderail.tools.visualization.style import draw_runs, legend_above, new_figure
+from guiderail.tools.visualization.figures import draw_runs, legend_above, new_figure
 
 
 def test_legend_is_above_the_data():

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PrimitiveLaw
-from guiderail.models.primitives import LcNsKmp, LinearConstraints
+from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.window import StepFactor
 
 Arrays = dict[str, np.ndarray]
 """Arrays of doubles by name."""
+_ROUNDING, _DEPENDENT = 1e-12, 1e-9  # negligible singular values of equations, relative to the largest
 _EQUAL = 1e-9  # largest distance of two bounds that count as equal, relative to a correction of norm one
 
 
@@ -32,26 +34,26 @@ def primitive_arrays(law: PrimitiveLaw) -> Arrays:
         law: Law of KGRL or sKGRL, without residual, filter and progress.
 
     Raises:
-        InputError: If a lower bound is equal to its upper bound: the solver needs thousands of iterations for the
-            many dependent equations of a window.
+        InputError: If the primitive has a history and a lower bound is equal to its upper bound: in Python, a history
+            outside of the equation then has no solution, and the last command is repeated.
     """
     primitive = law.primitive
     gain = law.gain[:, None] * np.eye(law.num_outputs)[:, law.outputs]  # (O, A), per unit of each entry of the action
-    factors = [_factor(primitive, step) for step in range(primitive.num_steps)]
-    if any((factor.upper - factor.lower < _EQUAL).any() for factor in factors):
-        raise InputError("constraints with equal lower and upper bounds cannot be exported: widen them a little")
-    rows = [factor.constraint_rows for factor in factors]
-    width = max(row.shape[1] for row in rows)
+    steps = [_Step.of(primitive._factor(step)) for step in range(primitive.num_steps)]
+    if primitive.history and any(step.is_equal.any() for step in steps):
+        raise InputError("equal lower and upper bounds cannot be exported with a history: widen them or use kgrl")
+    steps = [step.without_equations() for step in steps]
+    width = max(step.rows.shape[1] for step in steps)
     arrays = {
-        "primitive/output_map": [factor.output_map for factor in factors],
-        "primitive/output_offset": [factor.output_offset for factor in factors],
-        "primitive/constraint_map": [factor.constraint_map for factor in factors],
-        "primitive/lower": [factor.lower for factor in factors],
-        "primitive/upper": [factor.upper for factor in factors],
-        "primitive/scale": [_scale(factor) for factor in factors],
-        "primitive/constraint_rows": [_widened(row, width) for row in rows],
-        "primitive/correction_map": [_widened(factor.correction_map, width) for factor in factors],
-        "primitive/rank": [float(row.shape[1]) for row in rows],
+        "primitive/output_map": [step.output_map for step in steps],
+        "primitive/output_offset": [step.output_offset for step in steps],
+        "primitive/constraint_map": [step.constraint_map for step in steps],
+        "primitive/lower": [step.lower for step in steps],
+        "primitive/upper": [step.upper for step in steps],
+        "primitive/scale": [step.scale for step in steps],
+        "primitive/constraint_rows": [_widened(step.rows, width) for step in steps],
+        "primitive/correction_map": [_widened(step.correction_map, width) for step in steps],
+        "primitive/rank": [float(step.rows.shape[1]) for step in steps],
         "primitive/gain": gain,
         "primitive/initial_command": primitive.constraints.nearest(primitive.reference.means[0]),
         "primitive/first_mean": primitive.reference.means[0],
@@ -61,15 +63,72 @@ def primitive_arrays(law: PrimitiveLaw) -> Arrays:
     return stacked | constraint_arrays(primitive.constraints)
 
 
-def _factor(primitive: LcNsKmp, step: int) -> StepFactor:
-    history = np.tile(primitive.reference.means[0], (primitive.history, 1)) if primitive.history else None
-    return primitive.predict(step, None, history).factor
+@dataclass(frozen=True)
+class _Step:
+    """Factored problem of one step, as in `StepFactor`, with the scale (m,) of each constrained direction."""
 
+    output_map: np.ndarray
+    output_offset: np.ndarray
+    constraint_map: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    rows: np.ndarray
+    correction_map: np.ndarray
+    scale: np.ndarray
+    num_executed: int  # number of directions of the executed point, which are the first
 
-def _scale(factor: StepFactor) -> np.ndarray:
-    """Return the scale (m,) of each constrained direction."""
-    alpha = factor.multipliers(np.full(len(factor.lower), -1.0))
-    return alpha[alpha > 0.0]
+    @classmethod
+    def of(cls, factor: StepFactor) -> _Step:
+        """Return the arrays of a factored problem."""
+        alpha = factor.multipliers(np.full(len(factor.lower), -1.0))
+        return cls(
+            factor.output_map, factor.output_offset, factor.constraint_map, factor.lower, factor.upper,
+            factor.constraint_rows, factor.correction_map, alpha[alpha > 0.0],
+            len(factor._directions),
+        )  # fmt: skip
+
+    @property
+    def is_equal(self) -> np.ndarray:
+        """Mask (m,) of the directions with equal bounds."""
+        return self.upper - self.lower < _EQUAL
+
+    def without_equations(self) -> _Step:
+        """Return the problem without its equations, which are the directions with equal bounds.
+
+        The solutions of equations R v = e − F x are v = R⁺ (e − F x) + N w. The particular solution is affine in x
+        and becomes part of the maps; as it is orthogonal to N w, the correction w of least norm gives v of least norm.
+        The equations of a window are hundreds of nearly dependent rows, which an active-set method can't order well.
+        The equations of the executed point are solved first, so that it satisfies them exactly.
+        """
+        executed = np.arange(len(self.scale)) < self.num_executed
+        step = self
+        for at, negligible in ((self.is_equal & executed, _ROUNDING), (self.is_equal & ~executed, _DEPENDENT)):
+            if at.any():
+                step = step._solved(at, negligible)
+        return step
+
+    def _solved(self, at: np.ndarray, negligible: float) -> _Step:
+        """Return the problem with the equations of a mask (m,) solved; their rows become zero and unbounded.
+
+        Singular values below `negligible` times the largest belong to equations that follow from the others.
+        """
+        U, s, Vt = np.linalg.svd(self.rows[at])
+        rank = int((s > negligible * s.max(initial=0.0)).sum())
+        pinv = Vt[:rank].T / s[:rank] @ U[:, :rank].T  # (r, equations)
+        basis = Vt[rank:].T
+        free = ~at
+        e, F = 0.5 * (self.lower[at] + self.upper[at]), self.constraint_map[at]
+        offset = free * (self.rows @ (pinv @ e))
+        return replace(
+            self,
+            output_map=self.output_map - self.correction_map @ pinv @ F,
+            output_offset=self.output_offset + self.correction_map @ (pinv @ e),
+            constraint_map=free[:, None] * (self.constraint_map - self.rows @ pinv @ F),
+            lower=np.where(free, self.lower - offset, -np.inf),
+            upper=np.where(free, self.upper - offset, np.inf),
+            rows=free[:, None] * (self.rows @ basis),
+            correction_map=self.correction_map @ basis,
+        )
 
 
 def _widened(matrix: np.ndarray, width: int) -> np.ndarray:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from importlib.resources import files
 from importlib.resources.abc import Traversable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from safetensors.numpy import save
 
-from guiderail.diagrams.envs.task_checks import call_checked
 from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.stations.impedance_control import (
@@ -24,8 +22,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.laws.skill import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
-from guiderail.tools.export import GUIDED, TrainedSkill, load_skill, to_json, write_files
-from guiderail.tools.files import check_new
+from guiderail.tools.export import GUIDED, Exporter, TrainedSkill, to_json
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
 from guiderail_cpp.recording import record_skill
 from guiderail_cpp.templates import template_arrays
@@ -38,22 +35,8 @@ VELOCITY_TEMPLATE = "end_effector_velocity"  # input mapping of the guidance `no
 NO_LIMIT = 1e300  # number for infinity, which the state of a robot cannot exceed
 
 
-def export_cpp(run: Path | str, out: Path) -> list[Path]:
-    """Write a skill as a C++ project: library, data, recorded steps, and a program that replays them.
-
-    Args:
-        run: Folder of a run, or `pretrained:NAME`.
-        out: Folder to write, which must not exist.
-
-    Returns:
-        Paths of the files.
-
-    Raises:
-        InputError: If there is no such run, its policy observes images, its guidance has no C++ implementation, or the
-            folder exists.
-    """
-    check_new(out, "folder")
-    skill = load_skill(run, (*GUIDED, *TEMPLATES), EXPORTED)
+def _project_files(skill: TrainedSkill) -> dict[str, bytes]:
+    """Return the files of a C++ project: library, data, recorded steps, and a program that replays them."""
     arrays, texts, signals = skill_arrays(skill)
     recording = record_skill(skill, signals)
     description = skill.description | {"data": DATA_FILE, "signals": signals}
@@ -65,7 +48,11 @@ def export_cpp(run: Path | str, out: Path) -> list[Path]:
         SKILL_FILE: to_json(description),
     }
     package = files("guiderail_cpp")
-    return write_files(out, written | _copied(package / "files", "") | _copied(package / "include", "include/"))
+    return written | _copied(package / "files", "") | _copied(package / "include", "include/")
+
+
+export_cpp = Exporter((*GUIDED, *TEMPLATES), EXPORTED, _project_files)
+"""Write the skill of a run as a C++ project; a call has the arguments of `guiderail.tools.export.Exporter`."""
 
 
 def _copied(folder: Traversable, prefix: str) -> dict[str, bytes]:
@@ -112,7 +99,7 @@ def _guidance_arrays(guidance: str, prior: PriorKnowledge) -> Arrays:
 
 def _force_arrays(skill: TrainedSkill) -> Arrays:
     """Return the arrays of the task's force bound, if any: the governor's, and the limits of a template's states."""
-    impedance = call_checked(skill.task, "impedance")
+    impedance = skill.task.impedance()
     if impedance is None or impedance.bound is None:
         return {}
     stiffness = np.array(impedance.stiffness)

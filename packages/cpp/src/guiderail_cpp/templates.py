@@ -10,16 +10,16 @@ import numpy as np
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.models.templates import SharedControlTemplate, mappings, shape_constraints, transitions
-from guiderail.models.templates import constraints as active
+from guiderail.models.templates import SharedControlTemplate, mappings, transitions
+from guiderail.models.templates import active_constraints as active
 from guiderail.models.templates.geometry import WORLD, StatePart, matrix_deg
 
 # Kinds in the order of the enumerations in template.hpp.
 MAPPINGS: tuple[type, ...] = (mappings.Translation, mappings.Rotation, mappings.TiltTowards)
 CONSTRAINTS: tuple[type, ...] = (
     active.HalfSpace, active.Box, active.Cylinder, active.Sector, active.KeepAbove, active.Funnel,
-    active.FixedOrientation, active.TiltLimits, active.TiltByDistance, active.Arc, shape_constraints.OutsideSphere,
-    shape_constraints.OutsideCylinder, shape_constraints.OutsideBox, shape_constraints.InsideSphere,
+    active.FixedOrientation, active.TiltLimits, active.TiltByDistance, active.Arc, active.OutsideSphere,
+    active.OutsideCylinder, active.OutsideBox, active.InsideSphere,
 )  # fmt: skip
 DISTANCES: tuple[type, ...] = (
     transitions.Distance, transitions.Height, transitions.AxisDistance, transitions.TiltToGo, transitions.RotationToGo,
@@ -125,11 +125,11 @@ def _constraint_numbers(c: Any) -> tuple[Sequence[float], Sequence[float], Seque
     if isinstance(c, active.Arc):
         limits = [math.radians(c.min_deg), math.radians(c.max_deg)]
         return [c.radius_m, c.height_m, *limits, *_rotation(c.rpy_deg)], (), ()
-    if isinstance(c, shape_constraints.OutsideSphere):
+    if isinstance(c, active.OutsideSphere):
         return [*c.center_m, c.radius_m, 0.0], (), ()
-    if isinstance(c, shape_constraints.OutsideCylinder):
+    if isinstance(c, active.OutsideCylinder):
         return [0.0, 0.0, c.min_m, 0.0, 0.0, 1.0, c.max_m - c.min_m, c.radius_m, c.margin_m], (), ()
-    if isinstance(c, shape_constraints.OutsideBox):
+    if isinstance(c, active.OutsideBox):
         return [*c.lower_m, *c.upper_m, c.margin_m], (), ()
     return [*c.center_m, c.radius_m], (), ()
 

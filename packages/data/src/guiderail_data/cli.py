@@ -14,7 +14,7 @@ POSE = "x,y,z,rx,ry,rz"
 @command("dataset import bag --out demonstrations.npz --target 0.5,0,0.2,0,0,0", "import", dataset)
 def import_(
     source: Annotated[
-        Path, argument("LeRobot v3 dataset, ROS 2 bag, .mcap or .csv file, or a folder of them.", "SOURCE")
+        Path, argument("LeRobot v3 dataset, ROS bag, .mcap or .csv file, or a folder of them.", "SOURCE")
     ],
     out: Annotated[Path, option("File of demonstrations to write, .npz or .csv.")],
     signal: Annotated[
@@ -56,6 +56,33 @@ def export(
     from guiderail_data.convert import export_demonstrations
 
     print_result(export_demonstrations(file, out, to, rate), as_json)
+
+
+@command("dataset record runs/connector --to lerobot --episodes 50 --out connector_episodes", "record", dataset)
+def record(
+    policy: Annotated[
+        str, argument("Folder of a run, pretrained:NAME ({pretrained}), or with --task a policy's name.", "POLICY")
+    ],
+    out: Annotated[str, option("LeRobot: folder to write. Minari: identifier, such as guiderail/clamp/scripted-v0.")],
+    to: Annotated[str, option("Format: lerobot or minari.")],
+    task: cli.PolicyTask = None,
+    env: cli.Env = None,
+    episodes: Annotated[int, option("Number of episodes.")] = 50,
+    seed: Annotated[int, option("Seed of the first episode; episode i has this seed + i.")] = 0,
+    as_json: cli.Json = False,
+) -> None:
+    """Run a policy and write its episodes as a data set of LeRobot or Minari.
+
+    The demonstrations of a task are the episodes of its scripted policy. LeRobot has the commanded pose as action, and
+    the measured pose and wrench as observation.state and observation.wrench; Minari has observations, actions and
+    rewards, in the folder that the variable MINARI_DATASETS_PATH names.
+    """
+    from guiderail_data.episodes import record_episodes
+
+    name = None if task is None else cli.find_task(task, None)[0]
+    environment = cli.parse_environment(env)
+    result = record_episodes(policy, out, to, task=name, environment=environment, episodes=episodes, seed=seed)
+    print_result(result, as_json)
 
 
 @command("dataset validate demonstrations.csv --draw demonstrations.png", None, dataset)

@@ -1,4 +1,4 @@
-"""Import of demonstrations from LeRobot datasets, ROS 2 bags and CSV files; export to LeRobot and MCAP."""
+"""Import of demonstrations from LeRobot datasets, ROS bags and CSV files; export to LeRobot and MCAP."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from guiderail.models.common.files import visible_files
 from guiderail.models.common.registry import did_you_mean
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.io import MAX_NUMBERS
-from guiderail.tools.files import ENDINGS, check_new, load_demonstrations, path_exists
+from guiderail.tools.files import ENDINGS, check_new, path_exists
 from guiderail_data.formats.csv_layouts import read_csv_files
 from guiderail_data.formats.lerobot import INFO, read_lerobot, write_lerobot
 from guiderail_data.formats.recorded import describe_time_shift
 from guiderail_data.formats.ros_bag import find_bags, read_bags, write_mcap
+from guiderail_data.reading import load_demonstrations
 from guiderail_data.validate import other_units
 
 WRITERS: dict[str, Callable[[Path, Demonstrations], list[str]]] = {"lerobot": write_lerobot, "mcap": write_mcap}
@@ -60,13 +61,20 @@ def import_recording(
         if target is not None:
             raise InputError("a LeRobot dataset does not state which numbers are a pose: leave --target out")
     elif find_bags(source):
-        recorded, kind = read_bags(source, signal, target), "ROS 2 bags"
+        recorded, kind = read_bags(source, signal, target), "ROS bags"
     elif source.suffix == ".csv" or (source.is_dir() and visible_files(source, (".csv",))):
         if signal is not None:
             raise InputError("a CSV file holds one motion and no signals to choose from: leave --signal out")
         recorded, kind = read_csv_files(source, target=target, **csv_options), "CSV files"
     else:
-        raise InputError(f"{source} is not a LeRobot dataset, a bag, an .mcap or .csv file, or a folder of them")
+        remedy = (
+            "name the bag's folder, with its metadata.yaml"
+            if source.suffix == ".db3"
+            else "write the poses of each motion to a CSV file with the columns t, x_m, y_m, z_m, qx, qy, qz and qw"
+        )
+        raise InputError(
+            f"{source} is not a LeRobot dataset, a bag, an .mcap or .csv file, or a folder of them: {remedy}"
+        )
     given = [name for name, value in csv_options.items() if value is not None]
     if given and kind != "CSV files":
         raise InputError(f"leave --{given[0].replace('_', '-')} out: it is stated in {kind}")

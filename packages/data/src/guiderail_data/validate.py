@@ -20,10 +20,10 @@ from guiderail.tools.files import (
     ENDINGS,
     check_new,
     check_picture,
-    load_demonstrations,
     path_exists,
     write_atomically,
 )
+from guiderail_data.reading import load_demonstrations
 
 JUMP_RATIO = 150.0  # ratio of an output's largest to its median speed above which a jump is reported
 GAP_RATIO = 10.0  # ratio of the longest to the median sampling period above which missing samples are reported
@@ -105,7 +105,7 @@ def as_values(bounds: DemonstratedBounds) -> dict[str, Any]:
 
 
 def _draw(bounds: DemonstratedBounds, demonstrations: Any, picture: Path) -> None:
-    from guiderail.tools.visualization.style import new_figure, save_figure
+    from guiderail.tools.visualization.figures import new_figure, save_figure
 
     common = demonstrations.resampled()
     at = np.linspace(0.0, 1.0, len(common.times[0]))
@@ -265,7 +265,7 @@ def draw_demonstrations(common: Demonstrations, picture: Path) -> None:
     Raises:
         InputError: If the picture cannot be written.
     """
-    from guiderail.tools.visualization.style import new_figure, save_figure
+    from guiderail.tools.visualization.figures import new_figure, save_figure
 
     outputs, reference = np.stack(common.outputs), _fit_reference(common, None)
     figure, axes = new_figure(len(common.names), 1, (8.0, 2.2 * len(common.names)))

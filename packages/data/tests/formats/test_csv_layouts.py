@@ -122,6 +122,14 @@ def test_line_is_refused_when_its_number_of_fields_differs(row, file):
         read_csv_files(file, unit="m")
 
 
+def test_error_names_every_missing_unit_at_once(file):
+    file.write_text("t,x,y,z,roll,pitch,yaw\n0,1,2,3,0,0,0\n0.1,1,2,3,0,0,0\n")
+    with pytest.raises(
+        InputError, match="nor whether roll is in degrees: give --unit m or mm, and --angles deg or rad"
+    ):
+        read_csv_files(file)
+
+
 @pytest.mark.parametrize("delimiter", [",", ", ", ";", "\t", " "])
 def test_delimiter_is_detected(delimiter, file):
     lines = [("t", "x_m", "y_m", "z_m", "note"), *((0.1 * n, 1, 2, 3, 4 if delimiter == " " else "") for n in range(3))]

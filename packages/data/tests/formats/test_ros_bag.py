@@ -1,4 +1,4 @@
-"""ROS 2 bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
+"""ROS bags: joints, poses, arrays and time stamps of messages, refused bags, and export."""
 
 from functools import cache
 from itertools import product
@@ -37,6 +37,26 @@ def write(path, kind, make, values, topic="/topic"):
         for n, value in enumerate(values):
             writer.write(connection, 10_000_000 * n, store.serialize_cdr(make(types, value), kind))
     return path
+
+
+def test_bag_of_ros_1_is_read(tmp_path):
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    types, kind = store.types, "geometry_msgs/msg/PoseStamped"
+    with Writer(tmp_path / "shown.bag") as writer:
+        connection = writer.add_connection("/tool", kind, typestore=store)
+        for n in range(3):
+            time = types["builtin_interfaces/msg/Time"](sec=1, nanosec=20_000_000 * n)
+            header = types["std_msgs/msg/Header"](seq=n, stamp=time, frame_id="base")
+            point = types["geometry_msgs/msg/Point"](x=0.1 * n, y=0.0, z=0.4)
+            turn = types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
+            message = types[kind](header=header, pose=types["geometry_msgs/msg/Pose"](position=point, orientation=turn))
+            writer.write(connection, 10**9 + 20_000_000 * n, store.serialize_ros1(message, kind))
+    recorded = read_bags(tmp_path / "shown.bag", None, None)
+    np.testing.assert_allclose(recorded.outputs[0][:, :3], [[0.0, 0, 0.4], [0.1, 0, 0.4], [0.2, 0, 0.4]])
+    np.testing.assert_allclose(recorded.times[0], [0.0, 0.02, 0.04])
 
 
 def joints(types, values):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,60 +16,56 @@ from guiderail.tools.cli.app import argument, option, print_message, print_progr
 if TYPE_CHECKING:
     from guiderail_hardware.robot.connection import RobotConnection
 
-RobotUrl = Annotated[str | None, option("LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")]
 Driver = Annotated[str | None, option("Driver fci (Franka) or rtde (UR).  [default: the robot's LCM driver]")]
-Robot = Annotated[
-    str | None, option("Robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
-]
-Sim = Annotated[bool, option("Use a simulated driver in a subprocess instead of a robot.", "--sim")]
-Synchronous = Annotated[
-    bool,
-    option("With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"),
-]
-Rate = Annotated[
-    float | None,
-    option(
-        "With --sim, without --synchronous: speed of the simulated robot's clock relative to real time, from 0.001 to "
-        "1.  [default: 0.2]"
-    ),
-]
-Scenario = Annotated[Path | None, option("Scenario file with the robot, its bus and its surroundings.")]
-Yes = Annotated[bool, option("Answer all pre-flight questions with yes.", "--yes")]
 
 
-def connect(
-    environment: Mapping[str, Any], scenario: Path | None, *, sim: bool, synchronous: bool, rate: float | None
-) -> RobotConnection:
-    """Return the connection to a robot.
+@dataclass(frozen=True)
+class RobotOptions:
+    """Options about the robot of deploy and train-on-robot."""
 
-    Args:
-        environment: Options of the environment; `robot_url`, `robot` and `driver` are used.
-        scenario: Scenario file, or None.
-        sim: Use a simulated driver.
-        synchronous: The driver and the controller wait for each other.
-        rate: Speed of the simulated robot's clock relative to real time; None for the default.
+    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware"
+    robot_url: Annotated[
+        str | None, option("LCM URL of the driver's bus, or the robot's host.  [default: LCM's default]")
+    ] = None
+    robot: Annotated[
+        str | None, option("Robot arm.  [default: the scenario's, the driver's, or iiwa14]", choices="robots")
+    ] = None
+    driver: Driver = None
+    sim: Annotated[bool, option("Use a simulated driver in a subprocess instead of a robot.", "--sim")] = False
+    synchronous: Annotated[
+        bool,
+        option(
+            "With --sim: driver and controller wait for each other; wall-clock time does not count.", "--synchronous"
+        ),
+    ] = False
+    rate: Annotated[
+        float | None,
+        option(
+            "With --sim, without --synchronous: speed of the simulated robot's clock relative to real time, from 0.001 "
+            "to 1.  [default: 0.2]"
+        ),
+    ] = None
+    scenario: Annotated[Path | None, option("Scenario file with the robot, its bus and its surroundings.")] = None
+    yes: Annotated[bool, option("Answer all pre-flight questions with yes.", "--yes")] = False
 
-    Raises:
-        InputError: As `RobotConnection.from_scenario`.
-    """
-    from guiderail_hardware.robot.connection import RobotConnection
+    def environment(self) -> dict[str, Any]:
+        """Return the options of the environment that are given."""
+        return cli.parse_environment(None, robot_url=self.robot_url, robot=self.robot, driver=self.driver)
 
-    given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
-    given |= {"sim": sim, "synchronous": synchronous} | ({} if rate is None else {"rate": rate})
-    return RobotConnection.from_scenario(scenario, **given)
+    def connect(self, environment: Mapping[str, Any]) -> RobotConnection:
+        """Return the connection to the robot of `environment`; see `RobotConnection.from_scenario` for errors."""
+        from guiderail_hardware.robot.connection import RobotConnection
+
+        given = {name: environment[name] for name in ("robot_url", "robot", "driver") if name in environment}
+        given |= {"sim": self.sim, "synchronous": self.synchronous}
+        given |= {} if self.rate is None else {"rate": self.rate}
+        return RobotConnection.from_scenario(self.scenario, **given)
 
 
 @cli.command("deploy runs/connector --sim --yes")
 def deploy(
     run: Annotated[Path, argument("Folder of a run, or pretrained:NAME ({pretrained}).", "RUN")],
-    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
-    robot_url: RobotUrl = None,
-    robot: Robot = None,
-    driver: Driver = None,
-    sim: Sim = False,
-    synchronous: Synchronous = False,
-    rate: Rate = None,
-    scenario: Scenario = None,
+    robot: RobotOptions,
     force_limit: Annotated[
         float | None, option("Force limit of a first motion [N].  [default and maximum: that of the training]")
     ] = None,
@@ -79,7 +76,6 @@ def deploy(
     policy: Annotated[
         str | None, option("With --episodes: policy to evaluate instead of the run's: scripted, {baselines}.")
     ] = None,
-    yes: Yes = False,
     out: Annotated[
         Path | None, option("Folder of the recording.  [default: RUN/hardware; NAME/hardware for pretrained:NAME]")
     ] = None,
@@ -95,12 +91,11 @@ def deploy(
     its episodes; a stopped episode counts as a failure.
     """
     cli.import_files(imports)
-    environment = cli.parse_environment(None, robot_url=robot_url, robot=robot, driver=driver)
-    connection = connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate)
+    connection, station, yes = robot.connect(robot.environment()), robot.station, robot.yes
     if episodes is not None:
         if force_limit is not None:
             raise InputError("an evaluation has the force limit of the training: leave --force-limit out")
-        from guiderail_hardware.robot.evaluate import evaluate_on_robot
+        from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
 
         result = evaluate_on_robot(
             run, connection, episodes, station=station, policy=policy, assume_yes=yes, out=out, log=print_message
@@ -119,68 +114,41 @@ def deploy(
 
 @cli.command("train-on-robot BncConnector --sim --yes --episodes 20 --out runs/robot", "train-on-robot")
 def train_on_robot(
+    run: cli.RunOptions,
+    robot: RobotOptions,
     task: Annotated[str | None, argument("Task to learn: {tasks}.", "TASK", "tasks")] = None,
-    out: Annotated[Path | None, option("Folder of the run; it must not exist, except with --resume.")] = None,
-    station: Annotated[str, option("Hardware station.", choices="stations")] = "hardware",
     guidance: cli.Guidance = None,
-    algorithm: cli.Algorithm = None,
-    episodes: Annotated[int | None, option("Total number of episodes.  [default: 60]")] = None,
-    seed: Annotated[int | None, option("Seed of all random numbers.  [default: 0]")] = None,
-    preset: cli.Preset = None,
-    setting: cli.Settings = None,
     env: cli.Env = None,
-    robot_url: RobotUrl = None,
-    robot: Robot = None,
-    driver: Driver = None,
-    sim: Sim = False,
-    synchronous: Synchronous = False,
-    rate: Rate = None,
-    scenario: Scenario = None,
-    yes: Yes = False,
-    step_log: cli.WriteStepLog = None,
-    resume: Annotated[
-        bool, option("Resume the run in --out; a run with a simulated driver needs --sim again.", "--resume")
-    ] = False,
-    imports: cli.Imports = None,
-    trust_imports: cli.TrustImports = False,
-    as_json: cli.Json = False,
 ) -> None:
     """Train a policy on a robot and write a run folder.
 
-    Every episode ends with a checkpoint, and an interrupted run is resumed with --resume.
+    Every episode ends with a checkpoint, and an interrupted run is resumed with --resume; a run with a simulated
+    driver needs --sim again.
     """
     from guiderail.tools.imports import import_modules
 
-    name, folders = (None, ()) if task is None else cli.find_task(task, imports)
-    modules = import_modules((*folders, *(imports or ())))
-    if out is None:
-        raise InputError("the run needs a folder: name one with --out RUN")
-    environment = cli.parse_environment(
-        env, guidance=guidance, station=station, robot=robot, robot_url=robot_url, driver=driver
-    )
-    if resume:
+    name, folders = (None, ()) if task is None else cli.find_task(task, run.imports)
+    modules = import_modules((*folders, *(run.imports or ())))
+    out = run.folder
+    environment = cli.parse_environment(env, guidance=guidance, station=robot.station, **robot.environment())
+    if run.resume:
         environment = _with_stored_robot(out, environment)
-    settings: dict[str, Any] = cli.parse_pairs(setting, "--set", "batch_size=128")
-    if settings.get("num_envs", "0") != "0":
+    choices = run.choices()
+    if choices["settings"].get("num_envs", "0") != "0":
         raise InputError("there is one robot: leave num_envs out")
-    given = {
-        "algorithm": algorithm, "preset": preset, "episodes": episodes, "seed": seed, "step_log": step_log,
-        "imports": modules,
-    }  # fmt: skip
-    from guiderail_hardware.robot.train import train_on_robot as train
+    from guiderail_hardware.robot.robot_training import train_on_robot as train
 
     result = train(
         name,
         out,
-        connect(environment, scenario, sim=sim, synchronous=synchronous, rate=rate),
+        robot.connect(environment),
         environment=environment,
-        given={key: value for key, value in given.items() if value is not None},
-        settings=settings,
-        resume=resume,
-        assume_yes=yes,
+        given={**choices, "imports": modules},
+        resume=run.resume,
+        assume_yes=robot.yes,
         log=print_message,
     )
-    print_result(result, as_json)
+    print_result(result, run.as_json)
 
 
 def _with_stored_robot(out: Path, environment: dict[str, Any]) -> dict[str, Any]:

@@ -36,7 +36,7 @@ from guiderail.models.robots.robot import EndEffector, Robot, find_robot
 from guiderail.systems.command_watchdog import CommandWatchdog
 from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import output_getter
-from guiderail.systems.wrench_tare import WrenchTare
+from guiderail.systems.wrench_signals import WrenchTare
 from guiderail_hardware.drivers.driver import (
     Driver,
     PoseDriver,

@@ -206,6 +206,83 @@ def test_own_target_is_not_foreign_whatever_the_sign_of_its_handle(handle):
     assert driver.num_foreign_commands == 1
 
 
+POSITIONS = np.array([0.0, 0.2, 0.0, -2.1, 0.0, 2.3, 0.0])
+
+
+class ListBus:
+    """Bus of a driver in this process, with lists of messages in place of the middleware."""
+
+    def __init__(self):
+        from guiderail_hardware.drivers import ros2_messages
+
+        self.messages, self.joints, self.wrench, self.targets, self.sent = ros2_messages, [], [], [], []
+        self.target = SimpleNamespace(write=self.sent.append, instance_handle=1)
+
+    def take(self, reader):
+        taken, reader[:] = list(reader), []
+        return taken
+
+    def measure(self, stamp, positions=POSITIONS, sender=5):
+        m, info = self.messages, SimpleNamespace(publication_handle=sender)
+        header = m.Header(m.Time(stamp), "base")
+        self.wrench.append(m.WrenchStamped(header))
+        names = [f"panda_joint{number}" for number in range(1, 8)]
+        message = m.JointState(header, names, list(positions), [0.0] * 7, [])
+        self.joints.append(SimpleNamespace(**vars(message), sample_info=info))
+
+
+def position(target):
+    p = target.pose.position
+    return np.array([p.x, p.y, p.z])
+
+
+@pytest.fixture
+def commanded(monkeypatch):
+    """Return a driver that has sent a target, its bus, a clock, and the tool's position."""
+    now = [100.0]
+    monkeypatch.setattr(ros2, "clock", SimpleNamespace(monotonic=lambda: now[0], time=lambda: now[0]))
+    bus = ListBus()
+    driver = Ros2Driver("0", bus=bus)
+    driver.configure(IMPEDANCE)
+    bus.measure(1)
+    driver.read()
+    driver.write_pose(RigidTransform([0.4, 0.0, 0.4]), 0.0)
+    return driver, bus, now, position(bus.sent[0])
+
+
+@needs_middleware
+def test_driver_sends_no_target_beside_a_wrong_pose(commanded):
+    driver, bus, now, start = commanded
+    number, now[0] = len(bus.sent), now[0] + 0.005
+    bus.measure(2, POSITIONS + 1.0)
+    driver.read()
+    driver.write_pose(RigidTransform([0.4, 0.0, 0.4]), 0.0)
+    assert len(bus.sent) == number
+    driver.stop()
+    np.testing.assert_array_equal(position(bus.sent[-1]), start)
+
+
+@needs_middleware
+def test_stop_keeps_the_target_when_joint_states_are_old(commanded):
+    driver, bus, now, _ = commanded
+    number, now[0] = len(bus.sent), now[0] + 0.05
+    driver.stop()
+    assert len(bus.sent) == number
+
+
+@needs_middleware
+@pytest.mark.parametrize(
+    ("second", "conflicts"),
+    [({"stamp": 2, "sender": 6}, 2), ({"stamp": 1, "positions": POSITIONS + 1e-6}, 1), ({"stamp": 1}, 0)],
+    ids=["sender", "time", "repeated"],
+)
+def test_contradictory_joint_states_are_counted(second, conflicts, commanded):
+    driver, bus, *_ = commanded
+    bus.measure(**second)
+    bus.measure(3)
+    assert driver.read().conflicts == conflicts
+
+
 class FollowingRobot:
     """Arm that follows targets without delay, over DDS in this process; a plane below the tool stops it."""
 

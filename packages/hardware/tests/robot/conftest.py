@@ -30,8 +30,7 @@ def make_executor(monkeypatch):
             # The skill's station would open another bus in memory by its URL.
             patch.setattr("guiderail_hardware.drivers.lcm.open_bus", lambda url: lcm)
             skill = make_skill("BncConnector", policy, **OPTIONS, **options)
-        task = EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
-        monkeypatch.setattr(task, "num_steps", num_steps)
+        task = EnvConfig.resolve("BncConnector", OPTIONS | options).declared
         clock = SteppedRobotClock(task.workcell(), lcm, start, has_monitor)
         skill = type(skill)(skill.diagram, skill.control_period, num_steps, skill.randomize)
         return SkillExecutor(task, skill, clock, is_stop_requested), clock

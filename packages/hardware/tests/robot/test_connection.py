@@ -56,7 +56,7 @@ def test_sim_driver_and_monitor_import_the_modules_of_the_run(tmp_path, monkeypa
         yield
 
     def run_sim_driver(url, seconds, command_timeout, task, **options):
-        tasks.append(type(EnvConfig.resolve(task, {}).make_task()).__name__)
+        tasks.append(type(EnvConfig.resolve(task, {}).declared).__name__)
         return True
 
     def run_safety_monitor(url, robot, task, rate, log):

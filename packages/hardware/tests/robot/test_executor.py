@@ -18,8 +18,7 @@ from guiderail.diagrams.stations.station import max_wrench
 from guiderail.models.common.errors import InputError
 from guiderail.systems.policy_system import PolicyError
 from guiderail.tools.cli.main import main
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.models.joint_status import Fault, StatusLimits
 from guiderail_hardware.robot import executor as executing
 from guiderail_hardware.robot import preflight
@@ -50,7 +49,7 @@ def test_executor_approaches_executes_rests_and_records(make_executor, tmp_path)
 
 def test_deploy_writes_a_new_recording_when_the_policy_fails(monkeypatch, tmp_path):
     lcm, requests, imported_modules, messages = DrakeLcm("memq://"), [], [], []
-    task = EnvConfig.resolve("BncConnector", {}).make_task()
+    task = EnvConfig.resolve("BncConnector", {}).declared
     clock = SteppedRobotClock(task.workcell(), lcm, task.start_pose(np.random.default_rng(0)))
 
     def policy(observation):
@@ -353,8 +352,8 @@ def test_connection_raises_when_options_contradict(options, message):
 def test_clone_has_the_same_parameters_and_driver():
     limits = StatusLimits((1.0,) * 7, max_age=0.1)
     options = {"period": 0.002, "wrench_time_constant": 0.05, "robot_url": "memq://x", "status_limits": limits}
-    station = HardwareStation(EnvConfig.resolve("BncConnector", {}).make_task().workcell(), robot="panda", **options)
-    clone = station.clone(EnvConfig.resolve("BncConnector", {}).make_task().workcell())
+    station = HardwareStation(EnvConfig.resolve("BncConnector", {}).declared.workcell(), robot="panda", **options)
+    clone = station.clone(EnvConfig.resolve("BncConnector", {}).declared.workcell())
     assert (clone.limits, clone.impedance, clone.driver) == (station.limits, station.impedance, station.driver)
     assert clone.driver is station.driver
     assert (clone.period, clone.driver.url, clone.status_limits) == (0.002, "memq://x", limits)

@@ -61,22 +61,23 @@ def test_monitor_names_the_supported_robots_when_unknown():
 
 
 def test_part_offsets_equal_the_simulation_for_the_same_seed():
-    task = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
+    task = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).declared
     lcm = DrakeLcm("memq://")
     robot = SimulatedIiwa(task.workcell(), lcm)
     context = robot.CreateDefaultContext()
     subscribe_part_offsets(lcm, task, robot, context)
     randomize = PartRandomizer(task, partial(publish_part_offsets, IiwaDriver(lcm)), SEED)
     rng = np.random.default_rng(7)
-    simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).make_task()
-    simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"))
+    simulated = EnvConfig.resolve("BncConnector", {"fixture_offset": "per_run"}).declared
+    run = {}
+    simulated.offsets.draw(np.random.default_rng(SEED), validate_options(simulated.Reset, {}, "a reset"), run)
     simulation_rng, jack_positions = np.random.default_rng(7), []
     plant = robot.plant
     plant_context = plant.GetMyContextFromRoot(context)
     for options in ({}, {"held_out": True}):
         offsets = randomize(rng, options)
         lcm.HandleSubscriptions(0)
-        expected = simulated.offsets.draw(simulation_rng, validate_options(simulated.Reset, options, "a reset"))
+        expected = simulated.offsets.draw(simulation_rng, validate_options(simulated.Reset, options, "a reset"), run)
         np.testing.assert_array_equal(offsets["jack_offset"], expected[0])
         np.testing.assert_array_equal(offsets["grasp_offset"], expected[1])
         jack_positions.append(plant.GetBodyByName("jack").EvalPoseInWorld(plant_context).translation())

@@ -19,24 +19,24 @@ from guiderail.diagrams.envs.env import DiagramEnv
 from guiderail.diagrams.envs.make import make_guidance, make_station
 from guiderail.diagrams.stations.station import max_wrench
 from guiderail.diagrams.tasks.insertion import HOLD_DISTANCE, MAX_HOLD_MOTION, HoldTest
+from guiderail.diagrams.tasks.task import World
 from guiderail.models.common.errors import InputError
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.configure import configure
-from guiderail.tools.learning.pipelined import PipelinedLearner
-from guiderail.tools.learning.run_folder import RunFolder
+from guiderail.tools.learning.processes import PipelinedLearner
+from guiderail.tools.learning.run_folder import RunFolder, configure
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.models.joint_status import Fault, JointStatus
 from guiderail_hardware.robot import preflight
 from guiderail_hardware.robot.connection import RobotConnection
-from guiderail_hardware.robot.evaluate import evaluate_on_robot
 from guiderail_hardware.robot.operator import OperatorKeys
 from guiderail_hardware.robot.preflight import SPEED
 from guiderail_hardware.robot.robot_env import RobotEnv
+from guiderail_hardware.robot.robot_evaluation import evaluate_on_robot
+from guiderail_hardware.robot.robot_training import _train, train_on_robot
 from guiderail_hardware.robot.session import robot_session
 from guiderail_hardware.robot.sim_driver import START
-from guiderail_hardware.robot.train import _train, train_on_robot
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
 OPTIONS = {"station": "hardware", "guidance": "kgrl", "fixture_offset": "none", "reward": "shaped", "action_repeat": 5}
@@ -48,7 +48,7 @@ def make_robot_env(patch, start, **options):
     Its additional attributes are `clock` and `keys`, `questions` (the reasons of all confirmations that it requested)
     and `begin` (the start pose of the episodes).
     """
-    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options).make_task()
+    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS | options)
     patch.setattr(declaration, "num_steps", 10)
     with patch.context() as bus:
         bus.setattr("guiderail_hardware.drivers.lcm.open_bus", lambda url: lcm)
@@ -114,7 +114,7 @@ def test_evaluate_writes_a_row_per_episode(env, monkeypatch, tmp_path):
         assert (config.environment["station"], config.environment["guidance"]) == ("hardware", "kgrl")
         yield env, dict
 
-    monkeypatch.setattr("guiderail_hardware.robot.evaluate.robot_session", fake_session)
+    monkeypatch.setattr("guiderail_hardware.robot.robot_evaluation.robot_session", fake_session)
     trained_on = {"station": "arm", "robot": "panda", "guidance": "kgrl"}
     RunFolder(tmp_path).write_config(configure("BncConnector", trained_on, seed=0, episodes=1))
     env.keys.is_pause_requested = True
@@ -269,7 +269,7 @@ def test_force_limit_remains_between_episodes(monkeypatch):
     env.preflight.repeat()
     np.testing.assert_array_equal(env._station.read_max_wrench(env._context), max_wrench(8.0))
     env.reset()
-    env.diagram.task.episode_constants["max_wrench"].set(env._root_context, max_wrench(11.0))
+    World(None, None, env.diagram.diagram, env._root_context).set("max_wrench", max_wrench(11.0))
     for _ in range(2):
         env.idle()
         assert env._station is env._transfer_station
@@ -307,7 +307,7 @@ def test_row_of_a_stopped_episode_includes_its_last_action(monkeypatch):
 @pytest.fixture
 def session(monkeypatch):
     """Return clock of an arm at rest, list of requested confirmations, and function that starts a `robot_session`."""
-    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS).make_task()
+    lcm, declaration = DrakeLcm("memq://"), EnvConfig.resolve("BncConnector", OPTIONS)
     clock, questions = SteppedRobotClock(declaration.workcell(), lcm, START), []
 
     @contextmanager

@@ -48,7 +48,7 @@ class ChunkLearner(BcLearner):
         if not hasattr(env.unwrapped, "trace"):
             raise InputError(f"{config.algorithm} needs an environment that is built from a task's diagram")
         self._env = cast(Any, env.unwrapped)
-        dims = self._env.diagram.task.config.options.get("action_dims")
+        dims = self._env.diagram.config.options.get("action_dims")
         self._dims = slice(None) if dims is None else list(dims)
         self._episode_observations: list[np.ndarray] = []
         self._starts: list[int] = []  # control step of each observation of the episode

@@ -6,8 +6,8 @@ from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.config import BatchSize, BcConfig, Fraction, NetArch, Noise
 from guiderail.tools.learning.learner import NonNegative, Positive
+from guiderail.tools.learning.learner_config import BatchSize, BcConfig, Fraction, NetArch, Noise
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

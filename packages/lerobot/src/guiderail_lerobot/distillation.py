@@ -52,7 +52,7 @@ class DistillationLearner(ChunkLearner):
                 f"the policy of {config.teacher} has other observations or actions than this environment: give the "
                 "--env of its training"
             )
-        declared = self._env.diagram.task.config
+        declared = self._env.diagram.config
         prior = make_prior_knowledge(declared).primitive
         if declared.guidance != "kgrl" or prior is None or prior.motion is not None or prior.progress is not None:
             raise InputError("distillation needs kgrl with a clock-driven phase: give --guidance kgrl")

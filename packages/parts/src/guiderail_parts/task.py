@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal, cast
+from typing import ClassVar, Literal, cast
 
 import numpy as np
 from pydantic import Field
@@ -16,10 +16,11 @@ from pydrake.systems.framework import DiagramBuilder, OutputPort
 from pydrake.systems.primitives import Multiplexer
 from scipy.linalg import block_diag
 
-from guiderail.diagrams.envs.observation import ObservationTerm, affine
+from guiderail.diagrams.envs.observation import ObservationTerm, Observed, affine
 from guiderail.diagrams.envs.options import STANDARD, Number
-from guiderail.diagrams.envs.scene import ARM_VIEW, Camera, Scene, box_edges, front_camera, in_frame, viewpoint
+from guiderail.diagrams.envs.scene import ARM_VIEW, Scene, box_edges, front_camera, in_frame, viewpoint
 from guiderail.diagrams.envs.task_diagram import Symmetry
+from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import MovableWorkcell
 from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
@@ -27,6 +28,7 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import (
     HOLD_DISTANCE,
     MAX_HOLD_MOTION,
+    PRIVILEGED,
     DemonstratedInsertion,
     HoldTest,
     sides_of_the_rim,
@@ -35,23 +37,22 @@ from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
     HISTORY_VARIANCE,
-    OBSERVATIONS,
-    REWARDS,
+    DemonstratedOptions,
     FixtureOffsetOptions,
     ForceOptions,
 )
-from guiderail.diagrams.tasks.task import ScriptedPolicy, Threshold
+from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import write_atomically
 from guiderail.models.common.parsing import add_models
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.objects.sdf import TriangleMesh
 from guiderail.models.objects.surfaces import Hull, Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.episode_monitor import TerminationTerm
-from guiderail.systems.history_buffer import HistoryBuffer
-from guiderail.tools.learning.config import resolve_preset
+from guiderail.systems.history import HistoryBuffer
+from guiderail.tools.learning.learner_config import resolve_preset
 from guiderail_parts.geometry.assembly_check import SYMMETRIES
 from guiderail_parts.geometry.mesh_file import part_sdf
 from guiderail_parts.task_file import (
@@ -62,10 +63,6 @@ from guiderail_parts.task_file import (
     read_task_file,
     task_folder_digest,
 )
-
-if TYPE_CHECKING:
-    from guiderail.diagrams.envs.config import EnvConfig
-
 
 PLUG, SOCKET = "plug", "socket"
 """Names of the bodies, and of their SDF files without the suffix."""
@@ -155,8 +152,12 @@ COMMON_FORCE_LIMIT = 15.0  # force limit at which the wrench has the same scale 
 LAG = slice(18, 20)  # indices into the observation "shared" of the lateral distance of the plug from the command
 
 
-class PartOptions(FixtureOffsetOptions, ForceOptions):
+class PartOptions(DemonstratedOptions, FixtureOffsetOptions, ForceOptions):
     """Options of a task of two meshes."""
+
+    observation: Literal["state", "center_of_pressure", "image", "image_and_state", "shared"] = Field(
+        "state", description="name of the observation"
+    )
 
     offset_shape: Literal["ring", "square"] = Field(
         "ring",
@@ -250,7 +251,7 @@ class ScriptedSearch:
         return self._action.copy()
 
 
-class PartInsertion(DemonstratedInsertion):
+class PartInsertion(PartOptions, DemonstratedInsertion):
     """Insert a plug into a socket.
 
     Observations and rewards: see `DemonstratedInsertion`. The observation "shared" has units that all parts share, for
@@ -260,35 +261,42 @@ class PartInsertion(DemonstratedInsertion):
     in the last 0.2 and 0.6 s, which shows whether anything moves.
     """
 
-    Options = PartOptions
-    options: PartOptions
     workpiece, fixture = PLUG, SOCKET
     simulated_rewards = ("aligned",)
-    rewards = REWARDS
-    observations = (*OBSERVATIONS, "shared")
     folder: ClassVar[Path]
     file: ClassVar[PartTaskFile]  # content of `task.yaml`
 
-    def __init__(self, config: EnvConfig):
-        super().__init__(config)
-        if self.options.offset_shape == "square" and self.options.fixture_offset != "per_episode":
+    def check(self) -> None:
+        """Refuse a square of offsets that are not sampled in every episode, and a `task.yaml` without success."""
+        if self.offset_shape == "square" and self.fixture_offset != "per_episode":
             raise InputError(
                 "offset_shape=square samples the fixture's offset in every episode: choose fixture_offset=per_episode, "
                 "or offset_shape=ring"
             )
-        self.offsets = PartUncertainty(self.options)
-        self.collision = Threshold("impedance_force", self.options.largest_force_limit)
-        self.num_steps = self.reference().num_steps
-        self.insertion_length = self.file.motion.travel
         self._check_length_and_start()
+
+    @property
+    def offsets(self) -> PartUncertainty:
+        """Sampler of the offsets."""
+        return PartUncertainty(self)
+
+    @property
+    def insertion_length(self) -> float:
+        """Length of the insertion [m]."""
+        return self.file.motion.travel
+
+    @property
+    def duration(self) -> float:
+        """Duration of the demonstrations [s]."""
+        return self.reference().num_steps * CONTROL_PERIOD
 
     def _check_length_and_start(self) -> None:
         """Raise an InputError if `task.yaml` excludes every success, or the start of the demonstrations."""
         steps, start = self.file.tolerance.steps, self.reference().means[0]
-        if self.steps_of(steps) > self.num_steps:
+        if steps * CONTROL_PERIOD > self.duration:
             raise InputError(
                 f"tolerance.steps in {self.folder / FILE_NAME} is {steps}, longer than an episode of "
-                f"{self.num_steps * self.control_period:.3g} s: give fewer steps"
+                f"{self.duration:.3g} s: give fewer steps"
             )
         shift = np.abs(self.file.bounds.nearest(start, 0) - start)
         if (shift > MAX_START_SHIFT).any():
@@ -307,30 +315,41 @@ class PartInsertion(DemonstratedInsertion):
         return write_workcell(self.folder, self.file)
 
     @classmethod
+    def supports(cls, station: str) -> bool:
+        """Return True for every station, except that MuJoCo needs convex pieces."""
+        return cls.file.is_convex or station != "mujoco"
+
+    @classmethod
     def folder_digest(cls) -> str:
         """Return the digest of the task folder; see `task_folder_digest`."""
         return task_folder_digest(cls.folder)
 
     def reference(self) -> ReferenceTrajectory:
         """Return the reference trajectory of the folder's demonstrations."""
-        return self.on_clock(self.file.demonstrations.reference(self.folder))
+        return self.file.demonstrations.reference(self.folder)
 
-    def constraints(self) -> LinearConstraints:
+    def constraints(self, num_steps: int = 0) -> LinearConstraints:
         """Return the bounds of `task.yaml`; the option `bound`, if given, replaces the bounds of x and y.
 
         Raises:
             InputError: If `bound` is given, and the bounds of `task.yaml` change between phases.
         """
-        return self._bounds().constraints(self.reference().num_steps)
+        return self._bounds().constraints(num_steps or self.reference().num_steps)
+
+    def prior(self) -> Prior:
+        """Return the demonstrations and the bounds, without walls if the bounds change between phases."""
+        prior = replace(super().prior(), constraints=self.constraints)
+        return prior if self.file.bounds.phases is None else replace(prior, keep_out=None)
 
     def _bounds(self) -> Bounds:
-        bounds, limit = self.file.bounds, self.options.bound
+        bounds, limit = self.file.bounds, self.bound
         if limit is None:
             return bounds
         if bounds.phases is not None:
-            difficulty = self.config.difficulty
-            is_set = self.difficulties[difficulty].get("bound") == limit
-            remedy = f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if is_set else "leave it out"
+            difficulty = next((name for name, preset in self.presets.items() if preset.get("bound") == limit), "")
+            remedy = (
+                f"give bound=None (--env bound=null) with difficulty={difficulty!r}" if difficulty else "leave it out"
+            )
             raise InputError(f"bound replaces constant bounds, and those of task.yaml change between phases: {remedy}")
         return Bounds(lower=(-limit, -limit, *bounds.lower[2:]), upper=(limit, limit, *bounds.upper[2:]), phases=None)
 
@@ -356,7 +375,7 @@ class PartInsertion(DemonstratedInsertion):
         tests = []
         for direction in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
             target = pose + (play + HOLD_DISTANCE) * np.array([*direction, 0.0, 0.0, 0.0, 0.0])
-            x, y = (constraints.nearest(target, self.num_steps) - pose)[:2].tolist()
+            x, y = (constraints.nearest(target, self.reference().num_steps) - pose)[:2].tolist()
             if direction[0] * x + direction[1] * y >= play + MIN_PUSH:
                 tests.append(HoldTest((x, y, 0.0), play + MAX_HOLD_MOTION))
         return tests
@@ -367,27 +386,21 @@ class PartInsertion(DemonstratedInsertion):
         reference = partial(cls.file.demonstrations.reference, cls.folder)
         return {"scripted_search": ScriptedSearch(cls.file, lambda: reference().num_steps * CONTROL_PERIOD)}
 
-    @classmethod
-    def provides(cls) -> tuple[str, ...]:
-        """Return the kinds of prior knowledge, without walls ("keep_out") if the bounds change between phases."""
-        has_phases = cls.file.bounds.phases is not None
-        return tuple(kind for kind in super().provides() if not (kind == "keep_out" and has_phases))
-
-    def observation_terms(self) -> Sequence[ObservationTerm] | Camera:
+    def observe(self) -> Observed:
         """Return time, pose and wrench, with further terms by the observation's name, or the wrist camera."""
         height, turn = 0.5 * self.file.motion.travel, 0.5 * self.file.turn
         center = np.array([0.0, 0.0, height, -turn, 0.0, 0.0])
         scale_of_turn = max(abs(turn), 3 * DEGREE, self.file.motion.search_turn * DEGREE)
         scale = np.array([2 * MM, 2 * MM, height, scale_of_turn, 1.5 * DEGREE, 1.5 * DEGREE])
-        if self.config.observation != "shared":
-            return self.scaled_terms(center, scale, WRENCH_SCALE)
-        half, reach, file = 0.5 * self.num_steps * self.control_period, self._reach, self.file
+        if self.observation != "shared":
+            return self.observed(center, scale, WRENCH_SCALE)
+        half, reach, file = 0.5 * self.duration, self._reach, self.file
         scale[:2] = reach
         lag = np.array([*[SLIDING + file.clearance] * 2, NEAR])
-        return (
+        terms = (
             ObservationTerm("time", half, half),
             ObservationTerm("pose", center, scale),
-            ObservationTerm("wrench", 0.0, WRENCH_SCALE * self.options.largest_force_limit / COMMON_FORCE_LIMIT),
+            ObservationTerm("wrench", 0.0, WRENCH_SCALE * self.largest_force_limit / COMMON_FORCE_LIMIT),
             ObservationTerm("center_of_pressure", 0.0, CENTER_OF_PRESSURE_SCALE * file.search.lever_sign),
             ObservationTerm("desired_pose", 0.0, reach, (0, 1)),
             ObservationTerm("pose", file.motion.first_contact, NEAR, (2,)),
@@ -395,12 +408,13 @@ class PartInsertion(DemonstratedInsertion):
             ObservationTerm("progress", 0.0, PROGRESS),
             *self.force_limit_terms(),
         )
+        return Observed(terms, privileged=PRIVILEGED)
 
     @cached_property
     def _reach(self) -> float:
-        """Lateral displacement of the command by a constant action of 1, mean over the motion [m]."""
+        """Mean lateral displacement of the command by an action of 1, at the task's own `action_scale` [m]."""
         lateral = self.reference().standard_deviations[:, :2]
-        return float(np.sqrt(3.0) * self.config.options.get("action_scale", 1.0) * np.sqrt((lateral**2).mean()))
+        return float(np.sqrt(3.0) * self.defaults.get("action_scale", 1.0) * np.sqrt((lateral**2).mean()))
 
     def signals(self, builder: DiagramBuilder, station: Station) -> Mapping[str, OutputPort]:
         """Return the signals of `DemonstratedInsertion`; for "shared" also `lag` (3,) and `progress` (6,) [m].
@@ -409,7 +423,7 @@ class PartInsertion(DemonstratedInsertion):
         `DELAYS`.
         """
         signals = super().signals(builder, station)
-        if self.config.observation != "shared":
+        if self.observation != "shared":
             return signals
         pose = station.get_pose_output_port()
         command = builder.GetSubsystemByName("guidance").GetOutputPort("desired_pose")
@@ -433,33 +447,23 @@ class PartInsertion(DemonstratedInsertion):
         progress = add_system(builder, "progress", affine(D, np.zeros(len(D))), joined.get_output_port())
         return {**signals, "lag": lag.get_output_port(), "progress": progress.get_output_port()}
 
-    def termination_terms(self) -> list[TerminationTerm]:
+    def done(self) -> Mapping[str, Callable[..., bool] | Condition]:
         """Return success at the target, and collision above the force limit."""
         tolerance = self.file.tolerance
-        seated = TerminationTerm("success", {PLUG: POSE_SIZE}, tolerance.accepts, steps=self.steps_of(tolerance.steps))
-        return [seated, self.force_limit()]
+        seated = Condition(tolerance.accepts, seconds=tolerance.steps * CONTROL_PERIOD)
+        return {Termination.SUCCESS: seated, Termination.COLLISION: self.exceeds_force_limit()}
 
-    def symmetry(self) -> Symmetry | None:
-        """Return the symmetries of both parts; None if none applies."""
-        return self._select_symmetries(self.file.sides)
-
-    def near_symmetry(self) -> Symmetry | None:
-        """Return the symmetries of both parts and those that nearly hold on the rim; None if none applies."""
-        return self._select_symmetries((*self.file.sides, *self.file.rim_sides))
+    def symmetries(self) -> tuple[Symmetry | None, Symmetry | None]:
+        """Return the symmetries of both parts, and those that nearly hold on the rim as well; None if none applies."""
+        sides = self.file.sides
+        return self._select_symmetries(sides), self._select_symmetries((*sides, *self.file.rim_sides))
 
     def _select_symmetries(self, names: Sequence[str]) -> Symmetry | None:
-        more = _shared_sides if self.config.observation == "shared" else _no_sides
-        symmetries = sides_of_the_rim(self.config.observation, self.action_dims(), more)
         selected = [index for index, name in enumerate(SYMMETRIES) if name in names]
-        if symmetries is None or not selected or self.has_image:
+        if not selected or self.has_image:
             return None
+        symmetries = sides_of_the_rim(self.observation, _shared_sides if self.observation == "shared" else _no_sides)
         return Symmetry(*(matrices[selected] for matrices in symmetries)).pad(len(self.force_limit_terms()))
-
-    def camera(self) -> Camera:
-        """Return a camera that looks slightly down at the socket."""
-        size = self.file.motion.travel
-        target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
-        return front_camera(target, distance=6 * size, height=3 * size)
 
     def scene(self) -> Scene:
         """Return the demonstrations and the box of the bounds of each phase in `task.yaml`, or of `bound`."""
@@ -468,8 +472,10 @@ class PartInsertion(DemonstratedInsertion):
         lower, upper = (np.atleast_2d(bound)[:, :3] for bound in self._bounds().arrays())
         lower[:, 2], upper[:, 2] = np.maximum(lower[:, 2], 0.0), np.minimum(upper[:, 2], size)
         boxes = [corners for corners in zip(lower, upper, strict=True) if np.isfinite(corners).all()]
+        target = np.array(self.file.place) + [0.0, 0.0, 0.5 * size]
         return Scene(
             to_world=to_world,
+            camera=front_camera(target, distance=6 * size, height=3 * size),
             demonstrations=tuple(Demonstrations.load(self.folder / self.file.demonstrations.file).outputs),
             constraint=tuple(to_world(edge) for corners in boxes for edge in box_edges(*corners)),
             viewpoint=near,
@@ -548,7 +554,6 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
     file = read_task_file(folder)
     defaults = {
         "guidance": "skgrl",
-        "station": "gantry",
         "action_repeat": 10,
         "action_dims": file.action_dims,
         "history.variance": HISTORY_VARIANCE,
@@ -558,12 +563,11 @@ def _task_class(folder: Path, content: str) -> type[PartInsertion]:
     }
     members = {
         "name": file.name,
-        "difficulties": {STANDARD: {}, "hard": file.hard, "automate": AUTOMATE},
+        "presets": {"hard": file.hard, "automate": AUTOMATE},
         "folder": folder,
         "file": file,
         "defaults": defaults,
         "learner": file.recommended.learner,
-        "excluded_stations": () if file.is_convex else ("mujoco",),
         "__module__": __name__,
     }
     task = type(f"PartInsertion({folder})", (PartInsertion,), members)

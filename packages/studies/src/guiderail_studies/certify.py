@@ -178,7 +178,7 @@ def _find_skill(subject: str, environment: Mapping[str, Any], start_within: floa
             "history of fixed length that contains commands (neither history.adaptive nor history.source=measured)"
         )
     loop = _make_loop(config, start_within)
-    impedance = config.make_task().impedance()
+    impedance = config.declared.impedance()
     if impedance is None and loop.primitive.num_outputs == len(Impedance().stiffness):
         impedance = Impedance()
     if impedance is None:
@@ -225,7 +225,9 @@ def _make_loop(config: EnvConfig, start_within: float | None) -> CertifiedLoop:
     has_actions = config.guidance != "kmp"
     primitive = demonstrated.primitive(history=config.guidance == "skgrl", constrained=has_actions)
     # A reset starts at the demonstrations, not at the via-points that the primitive passes through.
-    start = primitive.constraints.nearest(config.make_task().reference().means[0])
+    reference = config.reference()
+    assert reference is not None
+    start = primitive.constraints.nearest(reference.means[0])
     within = _declared_start(config, len(start)) if start_within is None else np.full(len(start), start_within)
     if not (np.isfinite(within).all() and (within >= 0.0).all()):
         raise InputError(f"the start offset must be finite and not negative, not {within.tolist()}")
@@ -280,7 +282,7 @@ def _find_corrected_steps(loop: CertifiedLoop, certified: CertifiedBounds) -> np
 
 def _declared_start(config: EnvConfig, size: int) -> np.ndarray:
     """Return the largest measured start offset (O,): the offset of a reset plus the error of the pose measurement."""
-    declared = config.make_task().start_within()
+    declared = config.declared.prior().start_within
     try:
         within = np.array(np.broadcast_to(declared, size), dtype=float)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""`guiderail study`, `guiderail robustness`, `guiderail converge`, `guiderail certify` and `guiderail report`."""
+"""Commands `study`, `robustness`, `converge`, `certify`, `report` and `benchmark`."""
 
 from importlib import import_module
 from pathlib import Path
@@ -9,8 +9,8 @@ import typer
 from guiderail.models.common.errors import InputError, RunsFailedError
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_result, to_json
-from guiderail.tools.cli.evaluate import SEED, split_names
 
+cli.CHOICES["methods"] = lambda: [*import_module("guiderail_studies.benchmark.protocol").shipped_methods()]
 cli.CHOICES["axes"] = lambda: [axis.name for axis in import_module("guiderail_studies.robustness").AXES]
 
 
@@ -62,7 +62,7 @@ def robustness(
     ],
     task: cli.PolicyTask = None,
     episodes: Annotated[int, option("Number of held-out episodes of each policy at each value.")] = 30,
-    seed: cli.Seed = SEED,
+    seed: cli.Seed = cli.SEED,
     axes: Annotated[str | None, option("Disturbances, comma-separated: {axes}.  [default: all]")] = None,
     env: cli.Env = None,
     baselines: cli.Baselines = None,
@@ -94,7 +94,7 @@ def robustness(
         seed=seed,
         environment=cli.parse_environment(env),
         axes=axes,
-        baselines=split_names(baselines),
+        baselines=cli.split_names(baselines),
         out=out,
         log=print_message,
         processes=processes,
@@ -119,7 +119,7 @@ def converge(
     steps: Annotated[str, option("Plant steps in Drake [ms], comma-separated.")] = "10,5,2.5,1.25",
     engines: Annotated[str, option("Engines: drake and mujoco, comma-separated.")] = "drake",
     episodes: Annotated[int, option("Number of held-out episodes of each step and engine.")] = 40,
-    seed: cli.Seed = SEED,
+    seed: cli.Seed = cli.SEED,
     env: cli.Env = None,
     out: Annotated[Path | None, option("Folder to write.  [default: converge in the run]")] = None,
     processes: cli.Processes = None,
@@ -229,3 +229,111 @@ def report(
 
     page = write_report(runs, out, episodes=episodes)
     typer.echo(to_json({"page": str(page)}) if as_json else page)
+
+
+benchmark = cli.command_group("benchmark", "Compare methods on the benchmark's tasks by the rules of a protocol.")
+Version = Annotated[int, option("Version of the protocol.")]
+Tasks = Annotated[str | None, option("Tasks of the protocol, comma-separated.  [default: all]")]
+Processes = Annotated[int, option("Number of runs in parallel.")]
+
+
+@cli.command("benchmark run residual --protocol 1 --task clamp --seeds 0,1,2 --out runs/residual", "run", benchmark)
+def benchmark_run(
+    method: Annotated[
+        str, argument("Method of this package ({methods}), or a YAML file of a method.", "METHOD", "methods")
+    ],
+    out: Annotated[Path, option("Folder of the method's runs; the same command continues interrupted runs.")],
+    protocol: Version = 1,
+    task: Tasks = None,
+    seeds: Annotated[str | None, option("Seeds of the protocol, comma-separated.  [default: all]")] = None,
+    processes: Processes = 1,
+    as_json: cli.Json = False,
+) -> None:
+    """Train and evaluate a method by the rules of a protocol.
+
+    The expected cost in core-hours is printed before anything is run. A method's YAML file names the options of the
+    environment and the learner that it chooses; see docs/benchmark.md.
+    """
+    from guiderail_studies.benchmark.protocol import load_method, load_protocol
+    from guiderail_studies.benchmark.run import run_method
+    from guiderail_studies.engines.engine import make_engine
+
+    result = run_method(
+        load_protocol(protocol),
+        load_method(method),
+        out,
+        tasks=cli.split_names(task),
+        seeds=cli.parse_integers(seeds, "--seeds"),
+        engine=make_engine("process", processes),
+        log=print_message,
+    )
+    print_result(result, as_json)
+
+
+@cli.command("benchmark floors --protocol 1 --task clamp --out floors", "floors", benchmark)
+def benchmark_floors(
+    out: Annotated[Path, option("Folder of the evaluated episodes; the same command continues.")],
+    protocol: Version = 1,
+    task: Tasks = None,
+    episodes: Annotated[int | None, option("Episodes of each policy.  [default: the protocol's]")] = None,
+    processes: Processes = 1,
+    as_json: cli.Json = False,
+) -> None:
+    """Measure the success of policies without learning, and check the protocol's bounds on them.
+
+    Uniform random actions must fail in most episodes, and the scripted policy must succeed in most; the exit code is 1
+    otherwise.
+    """
+    from guiderail_studies.benchmark.protocol import load_protocol
+    from guiderail_studies.benchmark.run import check_floors
+    from guiderail_studies.engines.engine import make_engine
+
+    engine = make_engine("process", processes)
+    rows, failures = check_floors(
+        load_protocol(protocol), out, tasks=cli.split_names(task), episodes=episodes, engine=engine
+    )
+    rates = {f"{row['task']}, {row['policy']}": row["success_rate"] for row in rows}
+    print_result(rates | {"refused": failures}, as_json)
+    if failures:
+        raise RunsFailedError(failures, None)
+
+
+@cli.command("benchmark submit runs/residual --out submissions/residual", "submit", benchmark)
+def benchmark_submit(
+    runs: Annotated[Path, argument("Folder that guiderail benchmark run wrote.", "RUNS")],
+    out: Annotated[Path, option("Folder of the submission to write; it must not exist.")],
+    as_json: cli.Json = False,
+) -> None:
+    """Write the finished runs of a method as a submission: policies, episodes, digests, versions and the table."""
+    from guiderail_studies.benchmark.submission import submit
+
+    print_result(submit(runs, out), as_json)
+
+
+@cli.command("benchmark verify submissions/residual --episodes 5", "verify", benchmark)
+def benchmark_verify(
+    folder: Annotated[Path, argument("Folder of a submission.", "FOLDER")],
+    episodes: Annotated[int, option("Number of held-out episodes of each run that are repeated.")] = 5,
+    seed: Annotated[int | None, option("Seed of the sample.  [default: another sample each time]")] = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Repeat a sample of a submission's held-out episodes, and refuse it if any number differs.
+
+    The table is computed again from all episodes. Nothing of the submission is executed: its policies are arrays.
+    """
+    from guiderail_studies.benchmark.submission import verify
+
+    log = (lambda text: None) if as_json else print_message
+    print_result(verify(folder, episodes=episodes, seed=seed, log=log), as_json)
+
+
+@cli.command("benchmark page submissions", "page", benchmark)
+def benchmark_page(
+    folder: Annotated[Path, argument("Folder of submissions.", "FOLDER")],
+    out: Annotated[Path | None, option("Path without ending.  [default: leaderboard in the folder]")] = None,
+    as_json: cli.Json = False,
+) -> None:
+    """Write the leaderboard of all submissions in a folder, as Markdown and HTML."""
+    from guiderail_studies.benchmark.page import write_page
+
+    print_result(write_page(folder, out), as_json)

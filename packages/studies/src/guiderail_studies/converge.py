@@ -174,7 +174,7 @@ def _trained_step(task: str, environment: Mapping[str, Any]) -> float:
     from guiderail.diagrams.envs.config import EnvConfig
 
     config = EnvConfig.resolve(task, dict(environment))
-    return float(environment.get("time_step") or plant_period(config.make_task().workcell()))
+    return float(environment.get("time_step") or plant_period(config.declared.workcell()))
 
 
 def _statistics(rows: pd.DataFrame) -> dict[str, Any]:
@@ -195,7 +195,7 @@ def _measure_contact(task: str, condition: Condition) -> dict[str, Any]:
     from guiderail.diagrams.envs.config import EnvConfig
     from guiderail.diagrams.tasks.contact_probe import probe_contact
 
-    made = EnvConfig.resolve(task, dict(condition.environment)).make_task()
+    made = EnvConfig.resolve(task, dict(condition.environment)).declared
     names = ("drag_20", "drag_40", "lever_mm", "capture_mm", "cost")
     if getattr(made, "rim_contact", lambda: None)() is None:
         return dict.fromkeys(names)

@@ -71,13 +71,13 @@ SweepValue = Annotated[float, Field(allow_inf_nan=False)]
 Seeds = Annotated[tuple[Seed, ...], Field(min_length=1), AfterValidator(_check_distinct_seeds)]
 
 
-class _Strict(BaseModel):
+class Strict(BaseModel):
     """Base class of the declarations: unknown keys are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class LearnerChoice(_Strict):
+class LearnerChoice(Strict):
     """Learner of a method, by default that of the task."""
 
     algorithm: str | None = None  # registered name of the learner
@@ -95,7 +95,7 @@ class LearnerChoice(_Strict):
         return settings
 
 
-class Method(_Strict):
+class Method(Strict):
     """Environment and policy that a study compares with others."""
 
     env: dict[str, Any] = {}  # options of the environment, in addition to the study's
@@ -105,7 +105,7 @@ class Method(_Strict):
     seeds: Seeds | None = None  # default: the study's; one seed is enough for a policy without learning
 
 
-class EvalSet(_Strict):
+class EvalSet(Strict):
     """Held-out episodes on which a policy is evaluated."""
 
     name: str = "held out"  # name in the table
@@ -126,7 +126,7 @@ class EvalSet(_Strict):
         return value
 
 
-class Sweep(_Strict):
+class Sweep(Strict):
     """Quantity of the environment that makes the task harder; results of the policies are plotted over its values."""
 
     quantity: str  # name and unit, the label of the axis
@@ -150,13 +150,13 @@ class Sweep(_Strict):
         return EvalSet(name=name, env=self.at[value], options=self.options, episodes=self.episodes, file=file)
 
 
-class _SeedChoice(_Strict):
+class _SeedChoice(Strict):
     """Seeds that replace those of a study."""
 
     seeds: Seeds
 
 
-class Ratio(_Strict):
+class Ratio(Strict):
     """Ratio of a column's value for one method to its value for another method."""
 
     of: str  # name of the column
@@ -164,7 +164,7 @@ class Ratio(_Strict):
     against: str  # method of the denominator
 
 
-class Study(_Strict):
+class Study(Strict):
     """Study: every method is trained with every seed and evaluated on every evaluation set.
 
     A policy is evaluated after each number of training episodes in `after_episodes`.
@@ -240,7 +240,7 @@ class Study(_Strict):
         try:
             changed_seeds = self.seeds if seeds is None else _SeedChoice(seeds=tuple(seeds)).seeds
         except ValidationError as error:
-            raise InputError(_sentence(error)) from error
+            raise InputError(sentence(error)) from error
         subset = self.model_copy(update={"methods": chosen, "seeds": changed_seeds})
         subset._whole = self.all_methods
         return subset
@@ -264,7 +264,7 @@ def load_study(file: Path | str) -> Study:
     try:
         study = Study.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{path}: {_sentence(error)}") from error
+        raise InputError(f"{path}: {sentence(error)}") from error
     task, folders = task_named(study.task)
     return study.model_copy(update={"task": task, "imports": (*study.imports, *folders)})
 
@@ -274,14 +274,15 @@ def source_file(out: Path, study: str) -> Path:
     return out / "logs" / f"{study}.json"
 
 
-def _sentence(error: ValidationError) -> str:
-    """Return the first validation error as one sentence."""
+def sentence(error: ValidationError, kinds: tuple[type[Strict], ...] = ()) -> str:
+    """Return the first validation error as one sentence; `kinds` are the declarations, by default those of a study."""
     first = error.errors()[0]
     where = " ".join(", ".join(str(part) for part in first["loc"]).split())  # a key may have line breaks
     if first["type"] == "extra_forbidden":
-        kinds = (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio)
-        known = {name for kind in kinds for name in kind.model_fields}
-        return f"a study has no key {where}: {did_you_mean(str(first['loc'][-1]), known)}"
+        known = {
+            n for kind in kinds or (Study, Method, LearnerChoice, EvalSet, Sweep, Ratio) for n in kind.model_fields
+        }
+        return f"a {'method' if kinds else 'study'} has no key {where}: {did_you_mean(str(first['loc'][-1]), known)}"
     if first["type"] == "value_error":
         return " ".join(str(first["ctx"]["error"]).split())
     return f"{where}: {first['msg'][:1].lower()}{first['msg'][1:]}, not {first['input']!r}"[:300]

@@ -43,13 +43,13 @@ from guiderail.tools.evaluation.policies import check_compatible
 from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
-from guiderail.tools.learning.config import flat_settings
-from guiderail.tools.learning.configure import configure, with_defaults
-from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, installed_versions
+from guiderail.tools.learning.learner_config import flat_settings
+from guiderail.tools.learning.run_folder import RunConfig, RunFolder, as_arguments, configure, installed_versions
 from guiderail_studies.declaration import LEARNED, EvalSet, Study
 from guiderail_studies.engines.engine import Outcome
 
 BEST_CONSTANT = "best_constant"
+CPU_TIME = " CPU time "  # begins the line with the CPU time of an attempt in the log of a job
 BEGIN = " begins on "  # marks each attempt of a worker in the log of a job
 RUN_FILES = ("config.yaml", "episodes.csv", "policy.json", "policy.safetensors", "checkpoint", "steps", "logs")
 SELECTION_EPISODES = 10  # training episodes of each constant action, to select the best action
@@ -108,7 +108,7 @@ class Job:
             settings["init_from"] = str(self.out / settings["init_from"].format(seed=self.seed))
         given["settings"] = settings
         of_study, of_method = (flat_environment(study.task, env) for env in (study.env, method.env))
-        environment, given = {**of_study, **of_method}, with_defaults(study.task, given)
+        environment, given = {**of_study, **of_method}, given
         given |= {"imports": study.imports, "seed": self.seed}
         config = configure(study.task, environment, episodes=max(episodes, 1), **given)
         if config.learner.stop_after_successes:
@@ -438,12 +438,27 @@ def attempt(
                 "everywhere, because results depend on them"
             )
     _append(job, f" attempt of study call {call}{BEGIN}{host}, process {os.getpid()}\n")
+    started = _process_times()
     try:
         rows = work(job)
     except (Exception, SystemExit) as error:  # Drake's own assertions arrive as SystemExit
         return log_failure(job, error)
+    finally:
+        _append(job, f"{CPU_TIME}{_process_times() - started:.1f} s\n")
     _append(job, " is done\n")
     return Outcome(tuple(rows))
+
+
+def cpu_time(log: Path) -> float:
+    """Return the CPU time of all attempts in the log of a job that ended [s]; that of killed attempts is unknown."""
+    text = log.read_text(encoding="utf-8", errors="replace") if log.exists() else ""
+    return sum(float(number) for number in re.findall(rf"{CPU_TIME}([0-9.]+) s$", text, re.MULTILINE))
+
+
+def _process_times() -> float:
+    """Return the CPU time of this process and of its child processes that have ended [s]."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
 
 
 def log_failure(job: Job, error: BaseException) -> Outcome:

@@ -12,7 +12,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from guiderail.tools.console import PrintableConsole
+from guiderail.tools.progress import PrintableConsole
 from guiderail_studies.engines.engine import Outcome
 from guiderail_studies.job import count_attempts
 

@@ -19,18 +19,15 @@ from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.metrics import (
     TOLERANCE,
     VIOLATION,
-    bootstrap_band,
     episodes_to_convergence,
-    interquartile_mean,
-    median_survival,
-    survival,
     wilson,
 )
 from guiderail.tools.files import check_page, write_atomically
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import cell
-from guiderail.tools.visualization.style import WINDOW, draw_runs, legend_above, new_figure
+from guiderail.tools.visualization.figures import WINDOW, draw_runs, legend_above, new_figure
 from guiderail_studies.report_data import LEARNED, ReportData, Run, command, flat, gather
+from guiderail_studies.run_statistics import bootstrap_band, interquartile_mean, median_survival, survival
 
 PAGE = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(
     Path(__file__).with_name("report.html").read_text(encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import re
@@ -26,10 +27,10 @@ from guiderail.tools.evaluation.evaluate import evaluate_once, evaluate_trained
 from guiderail.tools.evaluation.evaluation import BASELINES_FOLDER, POLICY, stored_episodes
 from guiderail.tools.evaluation.metrics import TOLERANCE
 from guiderail.tools.evaluation.step_log import read_step_log
-from guiderail.tools.learning.config import PRESETS
+from guiderail.tools.learning.learner_config import PRESETS
 from guiderail.tools.learning.run_folder import RunConfig, RunFolder
-from guiderail.tools.tables import read_columns, read_table
-from guiderail.tools.visualization.style import color, label
+from guiderail.tools.tables import read_table
+from guiderail.tools.visualization.figures import color, label
 from guiderail_studies.declaration import source_file
 
 LEARNED = "learned"
@@ -141,7 +142,8 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
     """Read runs and studies from their folders.
 
     A run is evaluated on `episodes` held-out episodes, together with baseline policies, if its own folder is given or
-    if the given folder has runs but no study's table. If `episodes` is 0, only stored evaluations are read.
+    if the given folder has runs but no study's table. If `episodes` is 0, only stored evaluations are read, and no code
+    that the runs name is imported.
 
     Raises:
         InputError: If no folder is given, a folder contains neither a run nor a study's table, no run has a finished
@@ -166,7 +168,8 @@ def gather(paths: Sequence[Path], episodes: int = 0) -> ReportData:
         held_out += study_tables
         has_tables = has_tables or bool(study_tables)
     run_folders = {folder.resolve(): RunFolder(folder) for folder in folders}
-    runs = [Run(folder.path, folder.config(), _episodes(folder)) for folder in run_folders.values()]
+    runs_code = episodes > 0
+    runs = [Run(folder.path, folder.config(runs_code=runs_code), _episodes(folder)) for folder in run_folders.values()]
     runs = [run for run in runs if len(run.episodes)]
     if not runs and not held_out:
         raise InputError(f"{paths[0]} has no finished episode yet: let it train, then report on it")
@@ -211,7 +214,7 @@ def _study_tables(folder: Path) -> list[pd.DataFrame]:
     """
     tables: dict[str, pd.DataFrame] = {}
     for file in sorted(folder.glob("*.csv"), key=lambda path: (len(path.stem), path.stem)):
-        if file.is_file() and not {*STUDY_COLUMNS} <= {*read_columns(file)}:
+        if file.is_file() and not {*STUDY_COLUMNS} <= {*_read_columns(file)}:
             continue
         table = read_table(file)
         studies = _studies_of(file.stem, table)
@@ -359,3 +362,17 @@ def command(config: RunConfig, out: str) -> str:
     if config.human_in_the_loop:
         words.append("--human-in-the-loop")
     return shlex.join([*words, "--out", out])
+
+
+_MAX_HEADER = 100_000  # largest number of characters of a header
+
+
+def _read_columns(path: Path) -> list[str]:
+    """Return the names in the first line of a CSV file; none if that line is empty, or not CSV in UTF-8."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return next(csv.reader([file.readline(_MAX_HEADER)], strict=True), [])
+    except (UnicodeError, csv.Error):
+        return []
+    except OSError as error:
+        raise InputError(f"the table '{path}' can't be read ({error.strerror}): check the path") from error

@@ -34,7 +34,7 @@ from guiderail.tools.evaluation.subject import (
 )
 from guiderail.tools.learning.run_folder import RunConfig
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import label, legend, new_figure, save_figure
+from guiderail.tools.visualization.figures import label, legend, new_figure, save_figure
 
 Environment = Mapping[str, Any]
 

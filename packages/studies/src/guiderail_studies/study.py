@@ -27,7 +27,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.imports import import_modules
 from guiderail.tools.learning.run_folder import installed_versions
 from guiderail.tools.tables import write_table
-from guiderail.tools.visualization.style import legend, new_figure, save_figure
+from guiderail.tools.visualization.figures import legend, new_figure, save_figure
 from guiderail_studies.declaration import Ratio, Study, Sweep, source_file
 from guiderail_studies.engines.engine import Engine, Outcome, make_engine
 from guiderail_studies.job import (

@@ -1,1 +1,1 @@
-"""Formats of recordings: CSV files, ROS 2 bags and MCAP, LeRobot datasets."""
+"""Formats of recordings: CSV files, ROS bags and MCAP, LeRobot datasets."""

@@ -221,7 +221,8 @@ def _read(
         )
     positions = np.column_stack([column.values for column in position])
     units = _units(file, position, UNITS, unit, "--unit")
-    orientation, rotations = _rotations(file, columns, quaternion, angles, assumptions)
+    unstated: list[tuple[str, str]] = []  # what the file does not state, and the option that states it
+    orientation, rotations = _rotations(file, columns, quaternion, angles, assumptions, unstated)
     stated = _stated_meters(file, position, orientation)
     if None in units and stated:
         units = [known or "m" for known in units]
@@ -230,7 +231,10 @@ def _read(
         missing = [o for o, known in enumerate(units) if known is None]
         size = float(np.ptp(positions[:, missing], axis=0).max())
         which = _listed(["xyz"[o] for o in missing])
-        raise InputError(f"{file} does not state the unit of {which}, moving by {size:.4g}: give --unit m or mm")
+        unstated.insert(0, (f"the unit of {which}, moving by {size:.4g}", "--unit m or mm"))
+    if unstated:
+        described, options = zip(*unstated, strict=True)
+        raise InputError(f"{file} does not state {', nor '.join(described)}: give {', and '.join(options)}")
     positions = positions * [UNITS[str(known)] for known in units]
     frames = _frames_of(columns)
     if rotations is None:
@@ -490,8 +494,12 @@ def _rotations(
     quaternion: str | None,
     angles: str | None,
     assumptions: list[str],
+    unstated: list[tuple[str, str]],
 ) -> tuple[list[_Column], Rotation | None]:
-    """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation."""
+    """Return the columns of the orientation and its rotations (N,); no columns and None without an orientation.
+
+    If the unit of the angles is not stated, a text about it and the option that states it are added to `unstated`.
+    """
     for names in _QUATERNION:
         if matches := _columns(file, columns, names):
             places = {id(column): place for place, column in enumerate(columns)}
@@ -524,7 +532,8 @@ def _rotations(
             units = _units(file, matches, _ANGLE_UNITS, angles, "--angles")
             if None in units:
                 name = matches[units.index(None)].name
-                raise InputError(f"{file} does not state whether {name} is in degrees: give --angles deg or rad")
+                unstated.append((f"whether {name} is in degrees", "--angles deg or rad"))
+                return matches, None
             assumptions.append("roll, pitch and yaw are about fixed axes, Rz(yaw) Ry(pitch) Rx(roll)")
             scales = [_ANGLE_UNITS[str(unit)] for unit in units]
             rotation_angles = np.column_stack([column.values for column in matches]) * scales

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -114,49 +116,77 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         InputError: If the demonstrations have no common rate, the rate rounds to zero, a value exceeds the range of
             32-bit floats, or the folder cannot be written.
     """
-    import pandas as pd
-    import pyarrow as arrow
-    import pyarrow.parquet as parquet
-
     steps = np.concatenate([np.diff(t) for t in demonstrations.times])
     period = float(np.median(steps))
     if np.abs(steps - period).max() > 1e-3 * period:
         raise InputError(
             "a LeRobot dataset has one rate, and these demonstrations have several: give --rate to resample them"
         )
+    motion = Feature(tuple(demonstrations.names), demonstrations.outputs)
+    write_features(folder, {"action": motion, "observation.state": motion}, period)
+    notes = ["action and observation.state are both the demonstrated motion, as 32-bit numbers"]
+    return notes + describe_time_shift(demonstrations)
+
+
+@dataclass(frozen=True)
+class Feature:
+    """Signal of every episode of a dataset."""
+
+    names: tuple[str, ...]  # names of its components
+    episodes: Sequence[np.ndarray]  # values (n, size) of each episode
+
+
+def write_features(folder: Path, signals: Mapping[str, Feature], period: float, task: str = TASK) -> None:
+    """Write a dataset of signals that are sampled together.
+
+    Args:
+        folder: Folder, new or empty.
+        signals: Signals by the name of their feature; an episode has equally many samples of each.
+        period: Time between samples [s].
+        task: Description of the task.
+
+    Raises:
+        InputError: If the rate rounds to zero, a value exceeds the range of 32-bit floats, or the folder cannot be
+            written.
+    """
+    import pandas as pd
+    import pyarrow as arrow
+    import pyarrow.parquet as parquet
+
     fps = round(1.0 / period, 6)
     if fps == 0.0:
         raise InputError(
             f"a LeRobot dataset states frames per second, and {period:g} s between frames is too long: give --rate"
         )
     fps = int(fps) if float(fps).is_integer() else fps
-    size, lengths = demonstrations.num_outputs, [len(t) for t in demonstrations.times]
-    outputs = np.concatenate(demonstrations.outputs)
-    largest = np.abs(outputs).max()
+    values = {name: np.concatenate([*signal.episodes]) for name, signal in signals.items()}
+    largest = max(float(np.abs(array).max()) for array in values.values())
     if largest > np.finfo(np.float32).max:
         raise InputError(f"a LeRobot dataset holds numbers of 32 bits, which a value of {largest:g} exceeds")
-    values = outputs.astype(np.float32)
+    values = {name: array.astype(np.float32) for name, array in values.items()}
+    lengths = [len(episode) for episode in next(iter(signals.values())).episodes]
     frames = np.concatenate([np.arange(n) for n in lengths])
     episodes = np.repeat(np.arange(len(lengths)), lengths)
-    flat = arrow.FixedSizeListArray.from_arrays(arrow.array(values.ravel()), size)
     columns = {
-        "action": flat,
-        "observation.state": flat,
+        **{
+            name: arrow.FixedSizeListArray.from_arrays(arrow.array(array.ravel()), array.shape[1])
+            for name, array in values.items()
+        },
         "timestamp": arrow.array((frames / fps).astype(np.float32)),
         "frame_index": arrow.array(frames.astype(np.int64)),
         "episode_index": arrow.array(episodes.astype(np.int64)),
         "index": arrow.array(np.arange(len(frames), dtype=np.int64)),
         "task_index": arrow.array(np.zeros(len(frames), dtype=np.int64)),
     }
-    names = list(demonstrations.names)
     features: dict[str, Any] = {
-        name: {"dtype": "float32", "shape": [size], "names": names} for name in ("action", "observation.state")
+        name: {"dtype": "float32", "shape": [len(signal.names)], "names": list(signal.names)}
+        for name, signal in signals.items()
     }
     features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _INDEX_FEATURES.items()}
     ends = np.cumsum(lengths)
     episode_columns = {
         "episode_index": list(range(len(lengths))),
-        "tasks": [[TASK]] * len(lengths),
+        "tasks": [[task]] * len(lengths),
         "length": lengths,
         "data/chunk_index": [0] * len(lengths),
         "data/file_index": [0] * len(lengths),
@@ -187,19 +217,17 @@ def write_lerobot(folder: Path, demonstrations: Demonstrations) -> list[str]:
         ):
             (part / path).parent.mkdir(parents=True)
             parquet.write_table(arrow.table(table), part / path)
-        tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([TASK], name="task"))
+        tasks = pd.DataFrame({"task_index": [0]}, index=pd.Index([task], name="task"))
         tasks.to_parquet(part / "meta" / "tasks.parquet")
         (part / INFO).write_text(json.dumps(info, indent=4), encoding="utf-8")
         stats = json.dumps(_statistics(columns, values), indent=4)
         (part / "meta" / "stats.json").write_text(stats, encoding="utf-8")
-    notes = ["action and observation.state are both the demonstrated motion, as 32-bit numbers"]
-    return notes + describe_time_shift(demonstrations)
 
 
-def _statistics(columns: dict[str, Any], values: np.ndarray) -> dict[str, Any]:
+def _statistics(columns: Mapping[str, Any], values: Mapping[str, np.ndarray]) -> dict[str, Any]:
     statistics = {}
     for name, column in columns.items():
-        numbers = values.astype(float) if name in ("action", "observation.state") else column.to_numpy()[:, None]
+        numbers = values[name].astype(float) if name in values else column.to_numpy()[:, None]
         reduced = {"min": numbers.min(0), "max": numbers.max(0), "mean": numbers.mean(0), "std": numbers.std(0)}
         statistics[name] = {key: value.tolist() for key, value in reduced.items()} | {"count": [len(numbers)]}
     return statistics

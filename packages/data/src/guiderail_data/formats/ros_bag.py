@@ -1,4 +1,4 @@
-"""ROS 2 bags and MCAP files with ROS 2 messages, read and written with rosbags."""
+"""Bags of ROS 1 and ROS 2, and MCAP files with ROS 2 messages, read and written with rosbags."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _MAX_TIME = 9e9  # largest time of a bag [s], which counts nanoseconds in 63 bit
 def find_bags(path: Path) -> list[Path]:
     """Return the bag at a path, or all bags in the folder that are not hidden, sorted by name.
 
-    A folder is a bag if it has a `metadata.yaml`, and a file if its name ends in .mcap.
+    A folder is a bag if it has a `metadata.yaml`, and a file if its name ends in .mcap or, of ROS 1, in .bag.
     """
     if _is_bag(path):
         return [path]
@@ -57,7 +57,7 @@ def find_bags(path: Path) -> list[Path]:
 
 
 def _is_bag(path: Path) -> bool:
-    return (path.suffix == ".mcap" and path.is_file()) or (path / "metadata.yaml").is_file()
+    return (path.suffix in (".mcap", ".bag") and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
 def read_bags(path: Path, topic: str | None, target: Sequence[float] | None) -> Recorded:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import random
 import time as clock
+from collections import deque
 from dataclasses import dataclass
 from typing import Any, ClassVar
 from urllib.parse import parse_qsl, urlsplit
@@ -32,6 +33,8 @@ from guiderail_hardware.models.robot_impedance import RobotImpedance
 logger = logging.getLogger(__name__)
 
 MAX_WRENCH_AGE = 0.1  # age above which a wrench is no measurement of the present contact [s]
+MAX_STATUS_AGE = 0.02  # age above which a joint state is no target of a stop [s]
+NUM_POSES = 3  # number of targets until most wrong statuses are detected
 NUM_MESSAGES = 32  # number of messages that are taken at a time
 SWITCH_TIMEOUT = 2.0  # longest wait for the controller manager [s]
 MAX_DOMAIN = 232  # largest number of a DDS domain
@@ -134,7 +137,9 @@ class Ros2Bus:
             self.target = DataWriter(self._participant, targets, qos=target)
             self.responses = DataReader(self._participant, switched, qos=service)
             self.requests = DataWriter(self._participant, switch, qos=service)
-        self.targets = DataReader(self._participant, targets, qos=target)
+        # The reader keeps more than the newest: a target of another program must not hide behind one of this program.
+        received = Qos(Policy.Reliability.Reliable(0), Policy.History.KeepLast(NUM_MESSAGES))
+        self.targets = DataReader(self._participant, targets, qos=received)
 
     @staticmethod
     def take(reader: Any) -> list[Any]:
@@ -150,8 +155,9 @@ class Ros2Driver(PoseDriver):
     measured pose until stiffness times error is inside the bound of the force, so that the controller, configured with
     the station's stiffness, applies no larger force. The measured wrench is reported as joint torques Jᵀ F.
 
-    A status is malformed if no joint states or wrenches arrive, a joint is missing, or the controller left the network.
-    A second robot on the topic counts as a conflict, a second sender of targets as a foreign command.
+    A status is malformed if no joint states or wrenches arrive, a joint is missing, or the wrench is late.
+    Joint states of alternating senders, or different ones with the same time stamp, count as conflicts, and targets of
+    another sender as foreign commands.
     """
 
     name = robot = "panda"
@@ -191,7 +197,10 @@ class Ros2Driver(PoseDriver):
         self._status: JointStatus | None = None
         self._wrench: np.ndarray | None = None
         self._wrench_arrival = -np.inf
-        self._senders: set[int] = set()  # writers of joint states since the connection
+        self._last: Any = None  # last joint state
+        self._arrival = -np.inf  # local time of its arrival [s]
+        self._poses: deque[RigidTransform] = deque(maxlen=NUM_POSES)  # measured poses at the last targets
+        self._positions, self._positions_time = np.zeros(0), -np.inf  # joint positions at the last, and its local time
         self._is_active = False
         self._conflicts = 0
 
@@ -207,11 +216,10 @@ class Ros2Driver(PoseDriver):
             self._wrench, self._wrench_arrival = np.array([F.x, F.y, F.z, M.x, M.y, M.z]), clock.monotonic()
         samples = self._bus.take(self._bus.joints)
         for sample in samples:
-            sender = int(sample.sample_info.publication_handle)
-            self._conflicts += bool(self._senders) and sender not in self._senders
-            self._senders.add(sender)
+            self._conflicts += self._last is not None and contradicts(sample, self._last)
+            self._last = sample
         if samples:
-            self._status = self._decode(samples[-1])
+            self._status, self._arrival = self._decode(samples[-1]), clock.monotonic()
         return self._status
 
     def _decode(self, message: Any) -> JointStatus:
@@ -277,7 +285,8 @@ class Ros2Driver(PoseDriver):
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
         """Send a target whose force stays inside the bound; the first call activates the controller.
 
-        `time` is not used: targets are stamped with the time of this machine's clock.
+        `time` is not used: targets are stamped with the time of this machine's clock. If the measured positions are
+        farther from those of the last target than the arm can have moved, nothing is sent.
 
         Raises:
             InputError: If the driver is not configured or has no status, or the controller cannot be activated.
@@ -286,13 +295,23 @@ class Ros2Driver(PoseDriver):
         impedance, status = self._impedance, self._status
         if impedance is None or status is None or not status.is_readable:
             raise InputError("the driver ros2 is used before it is configured, or without a status")
+        if self._is_active and not self._is_reachable(status.positions):
+            return  # the station stops the arm at its next step; a target beside a wrong pose would move it
+        self._positions, self._positions_time = status.positions, clock.monotonic()
         X_BaseActual = self._calc_pose_at(status.positions)
         if not self._is_active:
             self._send(X_BaseActual)  # a controller that is activated would jump to an older target
             if self.address.controller:
                 self._switch([self.address.controller], [self.address.hold] if self.address.hold else [])
             self._is_active = True
+            self._poses.clear()
+        self._poses.append(X_BaseActual)
         self._send(bounded_target(X_BaseTool, X_BaseActual, impedance))
+
+    def _is_reachable(self, positions: np.ndarray) -> bool:
+        """Return True if the arm can have moved to positions (n,) since the last target [rad]."""
+        elapsed = clock.monotonic() - self._positions_time + self.period
+        return bool((np.abs(positions - self._positions) <= self._plant.GetVelocityUpperLimits() * elapsed).all())
 
     def _send(self, X_BaseTool: RigidTransform) -> None:
         messages, p = self._bus.messages, X_BaseTool.translation()
@@ -329,12 +348,16 @@ class Ros2Driver(PoseDriver):
             )
 
     def stop(self) -> None:
-        """Hold the arm: the target becomes the measured pose, and the controller `hold` takes over if there is one."""
+        """Hold the arm: the target becomes its last valid pose, and the controller `hold` takes over if there is one.
+
+        The newest statuses may be the wrong ones for which the arm is stopped, so that the pose is that of a target a
+        few periods before. If joint states have stopped, this pose is old, and the controller keeps the last target.
+        """
         if not self._is_active:
             return
         self._is_active = False
-        if self._status is not None and self._status.is_readable:
-            self._send(self._calc_pose_at(self._status.positions))
+        if clock.monotonic() - self._arrival <= MAX_STATUS_AGE:
+            self._send(self._poses[0])
         if self.address.hold:
             self._switch([self.address.hold], [self.address.controller], waits=False)
 
@@ -360,6 +383,14 @@ class Ros2UrDriver(Ros2Driver):
 
     name = robot = "ur5e"
     torque_reflex_limits = (60.0, 60.0, 60.0, 14.0, 14.0, 14.0)  # largest external joint torques [Nm]
+
+
+def contradicts(sample: Any, last: Any) -> bool:
+    """Return True if a joint state has another sender than the last one, or the same time but other values."""
+    if sample.sample_info.publication_handle != last.sample_info.publication_handle:
+        return True
+    values = [(message.position, message.velocity) for message in (sample, last)]
+    return bool(sample.header.stamp == last.header.stamp and values[0] != values[1])
 
 
 def bounded_target(

@@ -222,9 +222,7 @@ class RobotConnection:
         rate = None if self.synchronous else self.clock_rate
         scenario = None if self.scenario is None else str(self.scenario.resolve())
         if self.scenario is not None and (directives := load_scenario(self.scenario).directives):
-            SimulatedIiwa(
-                EnvConfig.resolve(task, {}).make_task().workcell(), DrakeLcm("memq://"), directives=directives
-            )
+            SimulatedIiwa(EnvConfig.resolve(task, {}).declared.workcell(), DrakeLcm("memq://"), directives=directives)
         code = (
             "import sys\n"
             "from pathlib import Path\n"

@@ -18,7 +18,7 @@ from pydrake.systems.framework import Context
 from guiderail.diagrams.envs.assemble import SkillDiagram
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_skill
-from guiderail.diagrams.envs.options import Options, option_fields
+from guiderail.diagrams.envs.options import Options, choices_of, option_fields
 from guiderail.diagrams.envs.trace import EpisodeTrace
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.insertion import InsertionTask
@@ -27,7 +27,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM
 from guiderail.models.policy import Policy
 from guiderail.tools.evaluation.step_log import step_log_file, table, write_step_log
-from guiderail.tools.files import check_room, check_writable, write_atomically, write_record
+from guiderail.tools.files import check_writable, write_atomically
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail_hardware.drivers.clock import Clock, garbage_collection_disabled, set_realtime_priority
@@ -53,6 +53,7 @@ from guiderail_hardware.robot.preflight import (
     slow_approach,
     start_simulator,
 )
+from guiderail_hardware.robot.records import check_room, write_record
 from guiderail_hardware.station import HardwareStation
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
 
@@ -352,18 +353,19 @@ def deploy(
     check_writable(step_log_file(recordings, 0))
     environment = hardware_environment(config.task, config.environment, station)
     environment |= connection.environment_options(station)
-    task = EnvConfig.resolve(config.task, environment).make_task()
+    resolved = EnvConfig.resolve(config.task, environment)
+    task = resolved.declared
     if not isinstance(task, InsertionTask):
         raise InputError(f"{config.task} has no start pose for an arm: deploy the policy of an insertion")
-    check_room(step_log_file(recordings, 0), record_size(task.num_steps))
+    check_room(step_log_file(recordings, 0), record_size(resolved.num_steps))
     if force_limit is not None:
-        if not force_limit <= task.collision.above:
+        if not force_limit <= task.largest_force_limit:
             raise InputError(
-                f"the policy was learned with a force limit of {task.collision.above:g} N: give a lower one"
+                f"the policy was learned with a force limit of {task.largest_force_limit:g} N: give a lower one"
             )
         name = "force_limit" if environment.get("force_limit_range") is None else "force_limit_range"
         environment[name] = force_limit if name == "force_limit" else (force_limit, force_limit)
-        task = EnvConfig.resolve(config.task, environment).make_task()
+        task = EnvConfig.resolve(config.task, environment).declared
         assert isinstance(task, InsertionTask)
     skill = make_skill(config.task, policy, **environment)
     skill_station: HardwareStation = skill.diagram.GetSubsystemByName("station")
@@ -421,5 +423,5 @@ def hardware_environment(task: str, environment: Mapping[str, Any], station: str
     task_class = TASKS.get(config.task)
     simulated = getattr(task_class, "simulated_rewards", ())
     if environment.get("reward") in simulated:
-        options["reward"] = next(reward for reward in task_class.rewards if reward not in simulated)
+        options["reward"] = next(each for each in choices_of(task_class, "reward") if each not in simulated)
     return options

@@ -219,19 +219,20 @@ class RobotEnv(DiagramEnv):
         """Extend the return path by the motion back along the measured poses of the episode."""
         self._return_path.extend(retrace(self.trace.measured, self.diagram.control_period)[::-1])
 
-    def _statistics(self, first: int) -> tuple[float, float, tuple[float, float], bool]:
+    def _statistics(self, first: int) -> tuple[float, float, tuple[float, float], float, bool]:
         """Return statistics of the control steps from `first` on.
 
         Returns:
-            The largest commanded and measured violation, the largest forces of impedance and contact [N], and True if a
-            step was a fallback.
+            The largest commanded and measured violation, the largest forces of impedance and contact [N], the cost,
+            and True if a step was a fallback.
         """
         signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
         if not len(self.trace) > first:
-            return *self._violations, self._forces(0.0, 0.0), False
+            return *self._violations, self._forces(0.0, 0.0), 0.0, False
         commanded, measured = (float(signals[name].max()) for name in ("commanded_violation", "measured_violation"))
         forces = self._forces(float(self.trace.force[first:].max()), float(signals["contact_force"].max()))
-        return commanded, measured, forces, bool(signals["fallback"].any())
+        cost = float(self.trace.unsafe(first).sum())
+        return commanded, measured, forces, cost, bool(signals["fallback"].any())
 
     def pause(self) -> None:
         """Bring the arm to rest between episodes if the operator has requested a pause; the next reset resumes."""

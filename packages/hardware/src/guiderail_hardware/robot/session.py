@@ -45,16 +45,17 @@ def robot_session(
         InputError: If the task has no observable success, its reward needs simulation state, no robot answers, a check
             fails or is not confirmed, or a signal arrives before the arm may move.
     """
-    task = EnvConfig.resolve(config.task, config.environment).make_task()
+    resolved = EnvConfig.resolve(config.task, config.environment)
+    task = resolved.declared
     if not isinstance(task, InsertionTask) or task.observable_success() is None:
         raise InputError(f"{config.task} has no success that a robot can observe: train it in simulation")
-    if task.config.reward in task.simulated_rewards:
-        raise InputError(f"the reward {task.config.reward!r} needs simulation state: choose another")
+    if task.reward in task.simulated_rewards:
+        raise InputError(f"the reward {task.reward!r} needs simulation state: choose another")
     threadpool_limits(1)
     torch.set_num_threads(1)
-    station = make_station(task)
+    station = make_station(resolved)
     assert isinstance(station, HardwareStation)
-    diagram = build_task_diagram(task, station, make_guidance(task, station))
+    diagram = build_task_diagram(resolved, station, make_guidance(resolved, station))
     with (
         connection.simulated_driver(config.task, station.driver.url, config.imports) as process,
         operator_keys() as keys,

@@ -105,7 +105,9 @@ def run_sim_driver(
                 f'the simulated Franka needs {name}: pip install "guiderail[fci,mujoco]" franky-sim'
             ) from error
 
-        parts = (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset)
+        parts = (
+            (np.zeros(2), np.zeros(2)) if reset is None else insertion.offsets.draw(np.random.default_rng(0), reset, {})
+        )
         friction = fci_simulated.RESIDUAL_FRICTION if joint_friction is None else joint_friction
         robot = fci_simulated.WorkcellSimulator(insertion.workcell(), friction)
         fci_simulated.serve(robot, start, part_poses(*parts), seconds, rate or 1.0, url or "127.0.0.1", log)
@@ -132,7 +134,7 @@ def run_sim_driver(
         IiwaDriver(monitor_lcm), plant, safety_limits(plant, IiwaDriver), clock=simulator.get_context().get_time
     )
     if reset is not None:
-        fixture, workpiece = insertion.offsets.draw(np.random.default_rng(0), reset)
+        fixture, workpiece = insertion.offsets.draw(np.random.default_rng(0), reset, {})
         insertion.set_part_offsets(robot, simulator.get_mutable_context(), fixture, workpiece)
     subscribe_part_offsets(lcm if rate is None else monitor_lcm, insertion, robot, simulator.get_mutable_context())
     simulator.Initialize()
@@ -180,7 +182,7 @@ def run_safety_monitor(
 
 
 def _insertion_task(name: str) -> InsertionTask:
-    task = EnvConfig.resolve(name, {}).make_task()
+    task = EnvConfig.resolve(name, {}).declared
     if not isinstance(task, InsertionTask):
         raise InputError(f"{name} is not a task of an arm with a tool: name an insertion")
     return task
@@ -198,7 +200,9 @@ class PartRandomizer:
             seed: Seed of the run.
         """
         self._task, self._move_parts = task, move_parts
-        task.offsets.draw(np.random.default_rng(seed), validate_options(task.Reset, {}, "a simulated driver"))
+        self._run: dict[str, Any] = {}
+        reset = validate_options(task.Reset, {}, "a simulated driver")
+        task.offsets.draw(np.random.default_rng(seed), reset, self._run)
 
     def __call__(self, rng: np.random.Generator, options: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Sample the offsets of the parts with the options of a simulated reset, send them, and return them by name.
@@ -209,7 +213,7 @@ class PartRandomizer:
             InputError: If the task has no such option, or a value is out of range.
         """
         reset = validate_options(self._task.Reset, options, "a simulated driver")
-        fixture, workpiece = self._task.offsets.draw(rng, reset)
+        fixture, workpiece = self._task.offsets.draw(rng, reset, self._run)
         self._move_parts([fixture.tolist(), workpiece.tolist()])
         return {f"{self._task.fixture}_offset": fixture.copy(), "grasp_offset": workpiece.copy()}
 

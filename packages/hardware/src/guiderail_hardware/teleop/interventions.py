@@ -24,6 +24,8 @@ from guiderail.models.primitives.reference import pass_through
 from guiderail.tools.environments import make_environment
 from guiderail.tools.evaluation.episode import Callback, EnvCallback, PolicyFn, Transition
 from guiderail.tools.evaluation.rollout import rollout
+from guiderail.tools.learning.episodes import Episodes
+from guiderail.tools.learning.learner import Learner
 from guiderail.tools.learning.run_folder import RunConfig
 
 LABEL_REWARDS: dict[str, float] = {
@@ -141,17 +143,17 @@ class ViaPointCorrections:
             InputError: If the guidance has no demonstrations to correct.
         """
         config = EnvConfig.resolve(task, environment)
-        instance, kind = config.make_task(), config.guidance_kind
+        kind, reference = config.guidance_kind, config.reference()
         if not any("demonstrations" in alternative for alternative in kind.needs):
             raise InputError(f"guidance {kind.name!r} has no demonstrations to correct: choose another, such as kgrl")
         values = config.options
         self.points = tuple(values["via_points"])
-        reference = instance.reference()
+        assert reference is not None
         self._reference = pass_through(reference, self.points, kernel_from_options(values))
         action_dims = values["action_dims"]
         self._action_dims = list(range(reference.num_outputs)) if action_dims is None else list(action_dims)
         self.reach = np.sqrt(3.0) * values["action_scale"] * deviation(reference)[self._action_dims]
-        self._constraints = instance.constraints()
+        self._constraints = config.constraints()
 
     def check_offset(self, offset: np.ndarray) -> np.ndarray:
         """Return a correction (A,) as doubles; raise an `InputError` unless it has this shape and is finite."""
@@ -194,48 +196,52 @@ class ViaPointCorrections:
         return output if self._constraints is None else self._constraints.nearest(output, step)
 
 
-class SupervisedTraining:
+class SupervisedTraining(Episodes):
     """Episodes of a run with a supervisor, each in an environment with the via-points of all previous episodes."""
 
-    def __init__(self, config: RunConfig, supervisor: Supervisor, state: Mapping[str, Any]):
-        """Construct the first episode's environment; `state` has the values of a checkpoint, or is empty in a new run.
+    def __init__(self, config: RunConfig, supervisor: Supervisor):
+        """Construct the episodes from the via-points of the configuration.
 
         Raises:
             InputError: If the guidance has no demonstrations to correct.
         """
-        self._config, self._supervisor = config, supervisor
-        self._build(tuple(state.get("via_points", config.environment.get("via_points", ()))))
+        self._supervisor = supervisor
+        super().__init__(config, self._make_environment(config))
 
     @property
     def points(self) -> tuple[float, ...]:
         """Via-points so far, as the option `via_points`."""
         return self._corrections.points
 
-    @property
-    def config(self) -> RunConfig:
-        """Configuration of the run with the via-points so far, for evaluation in the corrected environment."""
-        return replace(self._config, environment={**self._config.environment, "via_points": self.points})
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return the via-points so far."""
+        return {}, {"via_points": list(self.points)}
 
-    def state(self) -> dict[str, Any]:
-        """Return the values for a checkpoint."""
-        return {"via_points": list(self.points)}
+    def restore(self, rows: list[dict[str, Any]], arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
+        """Restore the via-points of a result of `state`."""
+        self._pass_through(tuple(values["via_points"]))
 
-    def rollout(self, act: PolicyFn, *callbacks: Callback, index: int) -> dict[str, Any]:
+    def run(self, learner: Learner, *callbacks: Callback, index: int) -> dict[str, Any]:
         """Run one episode and return its row with the column `interventions`; build the next environment."""
-        policy = InterventionPolicy(self.env, self._supervisor, act, self._corrections)
-        row = rollout(SupervisedEnv(self.env, self._supervisor), policy, *callbacks, index=index)
-        if policy.via_points != self.points:
-            random_state = self.env.unwrapped.np_random.bit_generator.state
-            self.env.close()
-            self._build(policy.via_points)
-            self.env.unwrapped.np_random.bit_generator.state = random_state
+        act = InterventionPolicy(self.env, self._supervisor, self.policy(learner, index), self._corrections)
+        row = rollout(SupervisedEnv(self.env, self._supervisor), act, learner, *callbacks, index=index)
+        if act.via_points != self.points:
+            self._pass_through(act.via_points)
             for callback in callbacks:
                 if isinstance(callback, EnvCallback):
                     callback.env, callback.base = self.env, self.env.unwrapped
         return row
 
-    def _build(self, points: tuple[float, ...]) -> None:
-        environment = {**self._config.environment, "via_points": points}
-        self._corrections = ViaPointCorrections(self._config.task, environment)
-        self.env: Any = make_environment(self._config.task, environment)
-        self.env.reset(seed=self._config.seed)  # samples the hidden offset of the run, as in training
+    def _pass_through(self, points: tuple[float, ...]) -> None:
+        """Replace the environment by one whose demonstrations pass through the points, with the same random state."""
+        random_state = self.env.unwrapped.np_random.bit_generator.state
+        self.env.close()
+        self.config = replace(self.config, environment={**self.config.environment, "via_points": points})
+        self.env = self._make_environment(self.config)
+        self.env.unwrapped.np_random.bit_generator.state = random_state
+
+    def _make_environment(self, config: RunConfig) -> Any:
+        self._corrections = ViaPointCorrections(config.task, config.environment)
+        env: Any = make_environment(config.task, config.environment)
+        env.reset(seed=config.seed)  # samples the hidden offset of the run, as in training
+        return env

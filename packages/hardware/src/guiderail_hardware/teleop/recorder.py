@@ -24,7 +24,9 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_station
 from guiderail.diagrams.envs.scene import Viewpoint, add_meshcat
 from guiderail.diagrams.tasks.insertion import InsertionTask
+from guiderail.diagrams.tasks.task import Condition, signals_of
 from guiderail.models.common.errors import InputError
+from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES, POSE_SIZE
 from guiderail.models.primitives import Demonstrations
 from guiderail.models.primitives.demonstrations import compute_bounds
@@ -32,7 +34,8 @@ from guiderail.systems.support.drake_multibody import transform_to_vector
 from guiderail.tools.environments import make_environment, task_of
 from guiderail.tools.evaluation.episode import EnvCallback, PolicyFn, Transition
 from guiderail.tools.evaluation.rollout import rollout
-from guiderail.tools.files import check_new, check_room, write_record
+from guiderail.tools.files import check_new
+from guiderail_hardware.robot.records import check_room, write_record
 from guiderail_hardware.systems.meshcat_device import MeshcatDevice
 from guiderail_hardware.teleop.teleoperator import (
     GAMEPAD_AXES,
@@ -189,14 +192,14 @@ class DemonstrationRecorder:
         if out.suffix not in (".npz", ".csv"):
             raise InputError(f"{out} must end in .npz or .csv")
         check_room(out, MIN_ROOM)
-        self.task, self.out = EnvConfig.resolve(task, environment).make_task(), out
-        if self.task.workcell_kind != "insertion":
+        config = EnvConfig.resolve(task, environment)
+        self.task, self.out, kind = config.declared, out, config.station_kind
+        if kind.workcell_kind != "insertion":
             raise InputError(f"{task} has no tool that an operator can move: demonstrate a task that inserts a part")
-        kind = self.task.config.station_kind
         if not kind.is_simulated:
             raise InputError(f"demonstrations are recorded in simulation: leave station={kind.name} out")
         builder = DiagramBuilder()
-        self.station = builder.AddNamedSystem("station", make_station(self.task))
+        self.station = builder.AddNamedSystem("station", make_station(config))
         builder.ExportInput(self.station.get_desired_pose_input_port(), "desired_pose")
         meshcat = add_meshcat(builder, self.station.GetOutputPort("query")) if meshcat is None else meshcat
         self.simulator = Simulator(builder.Build())
@@ -314,15 +317,16 @@ class DemonstrationRecorder:
         task = self.task
         if not isinstance(task, InsertionTask):
             return None
-        success = next((term for term in task.termination_terms() if term.termination == "success"), None)
-        if success is None or list(success.inputs) != [task.workpiece]:
+        success = task.done().get(Termination.SUCCESS)
+        is_success = success.holds if isinstance(success, Condition) else success
+        if is_success is None or signals_of(is_success, "success") != (task.workpiece,):
             return None
         # Read from the station's output port: if another engine simulates, the plant's context lacks the poses.
         context = self.station.GetMyContextFromRoot(self.simulator.get_context())
         poses = self.station.GetOutputPort("body_poses").Eval(context)
         bodies = (self.station.plant.GetBodyByName(name) for name in (task.fixture, task.workpiece))
         X_WFixture, X_WWorkpiece = (poses[body.index()] for body in bodies)
-        return bool(success.condition(transform_to_vector(X_WFixture.InvertAndCompose(X_WWorkpiece))))
+        return bool(is_success(transform_to_vector(X_WFixture.InvertAndCompose(X_WWorkpiece))))
 
     def summarize(self) -> dict[str, Any]:
         """Replay the mean of the demonstrations, draw it with its spread, and return statistics."""

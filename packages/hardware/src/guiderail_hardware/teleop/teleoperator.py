@@ -13,7 +13,7 @@ import numpy as np
 
 from guiderail.diagrams.envs.scene import View, Viewpoint, open_meshcat
 from guiderail.models.common.errors import InputError
-from guiderail.tools.learning.supervision import Supervise
+from guiderail.tools.learning.episodes import Supervise
 from guiderail_hardware.teleop.interventions import SupervisedTraining, Supervisor
 
 DEAD_ZONE = 0.15  # largest deflection of a gamepad's axis that moves no slider
@@ -187,4 +187,4 @@ def browser_supervision(log: Callable[[str], None]) -> Supervise:
     """Block until a browser connects; return the start of episodes that its user supervises. `log` shows a message."""
     supervisor = MeshcatSupervisor(log)
     supervisor.wait()
-    return lambda config, state: SupervisedTraining(config, supervisor, state)
+    return lambda config: SupervisedTraining(config, supervisor)

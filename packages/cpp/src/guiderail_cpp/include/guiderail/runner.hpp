@@ -30,7 +30,7 @@ inline const char* describe(RunnerState state) {
     case RunnerState::kIdle: return "idle";
     case RunnerState::kRunning: return "running";
     case RunnerState::kFinished: return "finished: the last target is held";
-    case RunnerState::kStale: return "measurements are stale or not finite: the last target is held";
+    case RunnerState::kStale: return "measurements are stale, or no pose and wrench: the last target is held";
     default: return "a safe pose is commanded instead of the requested one";
   }
 }
@@ -51,6 +51,12 @@ inline Transform inverse(const Transform& X) {
 
 inline Transform operator*(const Transform& A, const Transform& B) { return {A.R * B.R, A.p + A.R * B.p}; }
 
+// True for a finite pose (7,) whose quaternion has norm one, up to the rounding of single precision.
+inline bool is_pose(const double* pose) {
+  const double squared = pose[3] * pose[3] + pose[4] * pose[4] + pose[5] * pose[5] + pose[6] * pose[6];
+  return is_finite(pose, 7) && std::abs(squared - 1.0) < 1e-3;
+}
+
 class Runner {
  public:
   Runner(const Data& data, const RunnerSettings& settings)
@@ -58,6 +64,11 @@ class Runner {
         limiter_(settings.update_period, settings.max_speed, settings.max_angular_speed) {
     wrench_slot_ = skill_.signal("wrench"), wrench_size_ = skill_.signal_size("wrench");
     if (skill_.outputs() != 6) throw std::runtime_error("a skill on a robot commands poses of six coordinates");
+    if (!is_pose(settings.task_frame.data())) throw std::runtime_error("the task frame is no pose with a quaternion of norm one");
+    for (double value : {settings.max_speed, settings.max_angular_speed, settings.timeout})
+      if (!(value > 0 && std::isfinite(value))) throw std::runtime_error("limits of speed and timeout are positive numbers");
+    if (!(settings.update_period > 0 && settings.update_period <= skill_.period() + 1e-9))
+      throw std::runtime_error("the update period is positive, and at most the skill's period");
   }
 
   Skill& skill() { return skill_; }
@@ -67,10 +78,10 @@ class Runner {
   double violation() const { return violation_; }
   long fallbacks() const { return fallbacks_; }
 
-  // Begins an episode at a measured pose (7,) in the base; returns false if the pose is not finite.
+  // Begins an episode at a measured pose (7,) in the base; returns false if it is no pose.
   bool start(const double* measured) {
     state_ = RunnerState::kIdle;
-    if (!is_finite(measured, 7)) return false;
+    if (!is_pose(measured)) return false;
     to_task(measured, pose_.data());
     skill_.start(pose_.data());
     limiter_.start(pose_.data());
@@ -83,15 +94,16 @@ class Runner {
   }
 
   // Computes the target (7,) of an update `period` [s] after the last one, for the measured pose (7,) in the base and
-  // wrench (6,), and their age [s].
+  // wrench (6,), and their age [s]. While they are stale or no numbers, the last target is held, and the skill waits. A
+  // late update does not make the skill faster: it never takes more than one step in an update.
   const double* update(double period, const double* measured, const double* wrench, double age) {
     if (state_ == RunnerState::kIdle) return target_.data();
-    elapsed_ += period;
-    const bool is_stale = !(age <= settings_.timeout) || !is_finite(measured, 7) || !is_finite(wrench, 6);
+    const bool is_stale = !(age <= settings_.timeout) || !(period >= 0) || !is_pose(measured) || !is_finite(wrench, 6);
     if (is_stale) {
       state_ = RunnerState::kStale;
       return target_.data();
     }
+    elapsed_ += std::min(period, skill_.period());
     to_task(measured, pose_.data());
     const std::array<double, 6> moved = pose_difference(pose_.data(), last_pose_.data());
     for (int i = 0; i < 6; ++i) velocity_[i] = period > 0 ? moved[i] / period : 0.0;
@@ -102,10 +114,12 @@ class Runner {
       write_wrench(wrench);
       const Command command = skill_.step(pose_.data());
       std::copy_n(command.pose, 6, desired_.begin());
-      skill_time_ += skill_.period();
+      skill_time_ = std::max(skill_time_ + skill_.period(), elapsed_);
       violation_ = command.violation;
       fallbacks_ += command.fallback;
       state_ = command.fallback ? RunnerState::kFallback : RunnerState::kRunning;
+    } else if (state_ == RunnerState::kStale) {
+      state_ = RunnerState::kRunning;
     }
     const double* limited = limiter_.step(desired_.data(), pose_.data());
     if (settings_.bounds_force && skill_.governor()) {

@@ -1,0 +1,108 @@
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from guiderail.models.common.errors import InputError
+from guiderail.tools.environments import changed_environment
+from guiderail.tools.evaluation.evaluate import evaluate
+from guiderail.tools.evaluation.subject import find_subject
+from guiderail.tools.learning.environment_set import load_variants
+from guiderail_calibration.calibrate import calibrate
+from guiderail_calibration.parameters import select_parameters
+from guiderail_calibration.probe import probe_options, record_options
+from guiderail_calibration.recordings import load_recordings
+from guiderail_calibration.simulations import Simulator, draw_prior, simulate_all
+from guiderail_calibration.summaries import summarize
+
+RUN, GANTRY = "pretrained:connector", {"station": "gantry"}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Return a folder with a probing motion and with recordings of two episodes of it on a stiff robot."""
+    folder = tmp_path_factory.mktemp("calibration")
+    record_options(RUN, GANTRY, folder / "probe.npz")
+    config = find_subject(RUN, None).config
+    base = changed_environment(config.task, config.environment, GANTRY)
+    robot = {**base, **probe_options(folder / "probe.npz"), "disturbances.stiffness_factor": 1.7}
+    evaluate("zero", config.task, 2, environment=robot, baselines=(), processes=1, steps=folder / "recordings")
+    return folder
+
+
+def test_probing_motion_presses_within_the_force_limit(recorded):
+    episodes = load_recordings(recorded / "recordings")
+    assert len(episodes) == 2
+    for episode in episodes:
+        force = np.linalg.norm(episode.wrench[:, :3], axis=1)
+        assert 3.0 < force.max() < 20.0
+        assert np.ptp(episode.pose[:, 0]) > 1e-4  # slides
+
+
+def test_summaries_tell_robots_apart_more_than_episodes(recorded):
+    a, b = (summarize([episode], 98) for episode in load_recordings(recorded / "recordings"))
+    assert np.isfinite(a).all()
+    assert a.shape == b.shape
+
+
+def test_calibration_is_resumed_and_writes_its_files(recorded, monkeypatch):
+    sentences = []
+    arguments = {
+        "probe": recorded / "probe.npz", "environment": GANTRY, "parameters": ["stiffness"], "draws": 40,
+        "predicted": 1, "out": recorded / "out", "processes": 1, "log": sentences.append,
+    }  # fmt: skip
+    result = calibrate(RUN, recorded / "recordings", **arguments)
+    (row,) = result["parameters"]
+    assert row["identifiable"] == "yes"
+    assert row["low"] <= 1.7 <= row["high"]
+    assert row["high"] / row["low"] < 0.5 * row["prior_high"] / row["prior_low"]
+    assert sentences
+    assert sentences[0].startswith("stiffness: the summaries explain")
+    assert result["prediction"]["episodes"] == 2
+    stored = load_variants(result["variants"])
+    assert len(stored) == 10
+    assert all(0.5 <= variant["disturbances.stiffness_factor"] <= 2.0 for variant in stored.values())
+    page = (recorded / "out" / "calibration.html").read_text()
+    assert "impedance stiffness (factor)" in page
+    assert page.count("<svg") == 2
+    assert json.loads((recorded / "out" / "calibration.json").read_text())["parameters"] == result["parameters"]
+    assert yaml.safe_load((recorded / "out" / "variants.yaml").read_text())
+
+    def refuse(*_):
+        raise AssertionError("simulated again")
+
+    monkeypatch.setattr("guiderail_calibration.simulations._write", refuse)
+    again = calibrate(RUN, recorded / "recordings", **arguments)
+    assert again["parameters"] == result["parameters"]
+
+
+def test_recordings_that_cannot_be_used_are_refused(recorded, tmp_path):
+    with pytest.raises(InputError, match="has no recorded episode"):
+        load_recordings(tmp_path)
+    with pytest.raises(InputError, match="there is no folder"):
+        load_recordings(tmp_path / "missing")
+    other = find_subject(RUN, None).config
+    nominal = np.zeros((98, 6))
+    with pytest.raises(InputError, match="another motion than the probing motion"):
+        load_recordings(recorded / "recordings", nominal)
+    (source, *_) = sorted((recorded / "recordings").glob("*.parquet"))
+    (tmp_path / source.name).write_bytes(source.read_bytes()[:-200])
+    with pytest.raises(InputError, match="damaged"):
+        load_recordings(tmp_path)
+    assert other.task == "BncConnector"
+
+
+def test_too_few_draws_are_refused(recorded):
+    with pytest.raises(InputError, match="at least 40 draws"):
+        calibrate(RUN, recorded / "recordings", draws=3, out=recorded / "few")
+
+
+def test_damaged_simulation_is_named(recorded, tmp_path):
+    config = find_subject(RUN, None).config
+    base = changed_environment(config.task, config.environment, GANTRY)
+    parameters, _ = select_parameters(config.task, base, ["friction"])
+    simulator = Simulator(config.task, {**base, **probe_options(recorded / "probe.npz")}, parameters)
+    (tmp_path / "00000.npz").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match="is damaged: delete it"):
+        simulate_all(simulator, tmp_path, draw_prior(1, 1), processes=1)
