@@ -87,7 +87,10 @@ _SOFTWARE: dict[str, dict[str, str]] = {
     "ray": {"ray": "Ray"},
     "onnx": {"onnxruntime": "ONNX Runtime"},
     "wandb": {"wandb": "Weights & Biases"},
-    **{name: {f"guiderail_{name}": f"guiderail-{name}"} for name in ("hardware", "data", "studies", "lerobot", "calibration")},
+    **{
+        name: {f"guiderail_{name}": f"guiderail-{name}"}
+        for name in ("hardware", "data", "studies", "lerobot", "calibration")
+    },
 }
 _SOFTWARE["mujoco"]["guiderail_mujoco"] = "guiderail-mujoco"
 _SOFTWARE["parts"]["guiderail_parts"] = "guiderail-parts"

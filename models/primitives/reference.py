@@ -245,8 +245,8 @@ class ReferenceTrajectory:
 def _checked_floor(floor: float | np.ndarray, num_outputs: int) -> np.ndarray:
     """Return a floor of standard deviations (O,)."""
     checked = as_numbers(floor, "floor")
-    if not (np.isfinite(checked).all() and (checked >= 0).all()):
-        raise InputError(f"floor is a standard deviation and must not be negative: {checked}")
+    if checked.shape not in ((), (1,), (num_outputs,)) or not (np.isfinite(checked) & (checked >= 0)).all():
+        raise InputError(f"floor is one standard deviation, or {num_outputs}, none negative, not {checked}")
     return np.broadcast_to(checked, num_outputs)
 
 

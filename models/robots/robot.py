@@ -135,7 +135,11 @@ robot_names, end_effector_names = ROBOTS.names, END_EFFECTORS.names
 
 
 def register_robot(robot: Robot) -> Robot:
-    """Add a robot, whose name is not registered yet, to the registry and return it."""
+    """Add `robot`, whose name is not registered yet, to the registry and return it.
+
+    Args:
+        robot: Robot.
+    """
     return ROBOTS.register(getattr(robot, "name", "?"), robot)
 
 
@@ -145,7 +149,7 @@ def find_robot(name: str | Robot) -> Robot:
 
 
 def register_end_effector(end_effector: EndEffector) -> EndEffector:
-    """Add an end effector, whose name is not registered yet, to the registry and return it."""
+    """Add `end_effector`, whose name is not registered yet, to the registry and return it."""
     return END_EFFECTORS.register(getattr(end_effector, "name", "?"), end_effector)
 
 

@@ -221,10 +221,11 @@ SECTIONS: dict[str, list[Section]] = {
         Section(
             "Pouring, hard",
             [
-                Row("RL-SCT", "pouring_hard", "rl_sct"),
-                Row("RL-SCT, more episodes", "pouring_hard", "rl_sct_longer"),
+                Row("RL-SCT", "pouring_hard_shield", "rl_sct"),
+                Row("RL-SCT without the shield", "pouring_hard", "rl_sct_longer"),
+                Row("RL-SCT without the shield, 100 episodes", "pouring_hard", "rl_sct"),
                 Row("RL, reward shaped by hand", "pouring_hard", "rl"),
-                *_baselines("pouring_hard_baselines", _ALL_ZERO, names=NO_DEMONSTRATION),
+                *_baselines("pouring_hard_shield", _ALL_ZERO, names=NO_DEMONSTRATION),
             ],
             guided=("RL-SCT",),
         ),

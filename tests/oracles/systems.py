@@ -145,7 +145,7 @@ def check_stale_outputs(system):
 
 def check_start(system):
     """Check that a system whose last command is a state refuses to command without an initialization."""
-    source = inspect.getsource(inspect.getmodule(type(system)))
+    source = inspect.getsource(type(system))
     if "unset_state(" not in source and "LastValidPose(" not in source:
         return
     context = system.CreateDefaultContext()

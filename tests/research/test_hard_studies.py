@@ -11,7 +11,7 @@ from research.studies import study_path
 
 HARD = (
     "pouring_hard",
-    "pouring_hard_baselines",
+    "pouring_hard_shield",
     "pouring_balls_baselines",
     "narrow_passage_hard",
     "narrow_passage_hard_baselines",

@@ -415,8 +415,8 @@ def check_compatible(policy: PolicyFn, env: gymnasium.Env, learned_in: Mapping[s
         taken, hint = describe_space(env.observation_space), f": it must return an action {expected}"
     else:
         hint = ": give another policy"
-    task = getattr(getattr(env.unwrapped, "diagram", None), "task", None)  # None for an environment of another origin
-    options = {} if task is None else task.config.options
+    config = getattr(getattr(env.unwrapped, "diagram", None), "config", None)  # None for another origin
+    options = {} if config is None else config.options
     changed = [
         f"{name}={brief(value)} instead of {brief(options[name])}"
         for name, value in (learned_in or {}).items()

@@ -284,7 +284,7 @@ class RunFolder:
         return check_rows(read_table(self.path / "episodes.csv"), self.path / "episodes.csv")
 
 
-def _shown_settings(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
+def _shown_settings(algorithm: str, settings: dict[str, Any]) -> LearnerConfig:
     """Return the stored settings of a learner whose code is not imported."""
     base = {name: settings.pop(name) for name in LearnerConfig.__dataclass_fields__ if name in settings}
     kind = make_dataclass(

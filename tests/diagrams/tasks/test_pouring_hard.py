@@ -31,13 +31,22 @@ def run(env, policy, **options):
     return reset_info, info
 
 
-def test_aimed_policy_pours_and_blind_policy_spills(env):
-    for policy, termination in ((scripted_pour_aimed, "success"), (scripted_pour_blind, "spill")):
-        reset_info, info = run(env, policy, mug_error=ERROR)
-        np.testing.assert_array_equal(reset_info["mug_error"], ERROR)
-        assert info["termination"] == termination
-        assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
-        assert env.trace.statistics()["collisions"] == 0.0
+@pytest.mark.parametrize(
+    ("shield", "policy", "termination"),
+    [
+        (True, scripted_pour_aimed, "success"),
+        (True, scripted_pour_blind, "time_limit"),
+        (False, scripted_pour_aimed, "success"),
+        (False, scripted_pour_blind, "spill"),
+    ],
+)
+def test_aimed_policy_pours_and_blind_policy_spills_without_the_shield(env, shield, policy, termination):
+    env = env if shield else make_env("Pouring", difficulty="hard", shield=False)
+    reset_info, info = run(env, policy, mug_error=ERROR)
+    np.testing.assert_array_equal(reset_info["mug_error"], ERROR)
+    assert info["termination"] == termination
+    assert env.trace.statistics()["max_commanded_violation"] <= 1e-9
+    assert env.trace.statistics()["collisions"] == 0.0
 
 
 def command_states(template, frames, actions, X_TP):

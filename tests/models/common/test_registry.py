@@ -22,7 +22,7 @@ REGISTRIES = {
     "end_effector": END_EFFECTORS, "learner": LEARNERS,
 }  # fmt: skip
 OPTIONS = {
-    "task_options": (TASKS, "Options"),
+    "task_options": (TASKS, "__base__"),  # a task derives from its options
     "station_options": (STATIONS, "options"),
     "learner_config": (LEARNERS, "Config"),
 }

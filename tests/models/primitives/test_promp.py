@@ -87,7 +87,7 @@ def test_reference_from_promp_equals_reference_with_promp_model():
     np.testing.assert_allclose(single.standard_deviations, np.tile([0.1, 0.2], (100, 1)), rtol=1e-2)
     with pytest.raises(InputError, match="gmr or promp"):
         ReferenceTrajectory.from_demonstrations(d, model="dmp")
-    for floor in (-0.01, [0.01, np.nan]):
+    for floor in (-0.01, [0.01, np.nan], [0.01] * 3):
         with pytest.raises(InputError, match="floor"):
             ReferenceTrajectory.from_promp(ProMp.fit(d), T, floor=floor)
 

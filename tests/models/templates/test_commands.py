@@ -10,9 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import SharedControlTemplate, TemplateState, Transition
-from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates import mappings as im
-from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates import transitions as td
 from guiderail.models.templates.geometry import angle_between, between
 
@@ -225,9 +224,9 @@ def test_frame_names_are_those_of_all_parts_of_a_state():
 
 
 OUTSIDE = [
-    sc.OutsideSphere(frame="f", radius_m=0.02),
-    sc.OutsideCylinder(frame="f", radius_m=0.01, min_m=-0.05, max_m=0.05, margin_m=0.002),
-    sc.OutsideBox(frame="f", lower_m=(-0.02, -0.01, -0.03), upper_m=(0.02, 0.02, 0.01)),
+    ac.OutsideSphere(frame="f", radius_m=0.02),
+    ac.OutsideCylinder(frame="f", radius_m=0.01, min_m=-0.05, max_m=0.05, margin_m=0.002),
+    ac.OutsideBox(frame="f", lower_m=(-0.02, -0.01, -0.03), upper_m=(0.02, 0.02, 0.01)),
 ]
 
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
-from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates import load_template, parse_template
-from guiderail.models.templates import shape_constraints as sc
 from guiderail.models.templates.consistency import find_contradiction
 from guiderail.models.templates.schema import shipped_templates
 
@@ -39,8 +38,8 @@ UPRIGHT = ac.FixedOrientation()
         ([ac.HalfSpace((1.0, 0.0, 0.0), 1.0), ac.HalfSpace((-1.0, 0.0, 0.0), -0.9999)], (0, 1)),
         ([ac.HalfSpace((1.0, 1.0, 0.0), 0.1), ac.HalfSpace((-1.0, 1.0, 0.0), 0.1), ac.HalfSpace((0.0, -1.0, 0.0), 0.0)],
          (0, 1, 2)),
-        ([sc.InsideSphere(0.05), sc.OutsideSphere(0.1)], (0, 1)),
-        ([BOX, sc.OutsideBox((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))], (0, 1)),
+        ([ac.InsideSphere(0.05), ac.OutsideSphere(0.1)], (0, 1)),
+        ([BOX, ac.OutsideBox((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))], (0, 1)),
         ([ac.Funnel("world", 0.1, 0.1, 0.5), ac.KeepAbove(0.3), ac.Cylinder("world", 0.0, 0.2)], (0, 1, 2)),
     ],
 )  # fmt: skip
@@ -82,8 +81,8 @@ def test_find_contradiction_accepts_constraints_around_a_pose(seed):
         ac.Sector("world", azimuth - room, azimuth + float(rng.choice([0.0, 90.0, 200.0]))),
         ac.KeepAbove(p[2] - 0.2 - room, points_m=((0.0, 0.0, -0.2), (0.2, 0.0, 0.0))),
         ac.Funnel("world", 0.1, p[2] + room, 0.5),
-        sc.InsideSphere(float(np.linalg.norm(p)) + room + 1e-12),
-        sc.OutsideSphere(0.1, tuple(p + [0.1 + room + 1e-9, 0.0, 0.0])),
+        ac.InsideSphere(float(np.linalg.norm(p)) + room + 1e-12),
+        ac.OutsideSphere(0.1, tuple(p + [0.1 + room + 1e-9, 0.0, 0.0])),
     ]
     chosen = [around[i] for i in rng.permutation(len(around))[: rng.integers(2, len(around) + 1)]]
     assert all(constraint.violation(X_WE, {}) < 1e-8 for constraint in chosen)

@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix, pose_to_transform
-from guiderail.models.templates import constraints as ac
-from guiderail.models.templates import shape_constraints as sc
+from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates.geometry import angle_between, largest
 
 F = "object"
@@ -23,10 +22,10 @@ CONSTRAINTS = [
     ac.TiltLimits(frame=F, min_deg=60.0, max_deg=122.0),
     ac.TiltByDistance(frame=F, distance_m=(0.07, 0.25), tilt_deg=(65.0, 0.0), rpy_deg=(0.0, 0.0, 15.0)),
     ac.TiltLimits(frame=F, min_deg=0.0, max_deg=90.0, rpy_deg=(5.0, 0.0, -90.0), turns_along=True),
-    sc.OutsideSphere(frame=F, radius_m=0.4, center_m=(0.1, 0.0, -0.1)),
-    sc.OutsideCylinder(frame=F, radius_m=0.3, min_m=-0.2, max_m=0.4, margin_m=0.01),
-    sc.OutsideBox(frame=F, lower_m=(-0.3, -0.25, -0.4), upper_m=(0.3, 0.4, 0.2), margin_m=0.02),
-    sc.InsideSphere(frame=F, radius_m=0.2, center_m=(0.1, 0.0, -0.1)),
+    ac.OutsideSphere(frame=F, radius_m=0.4, center_m=(0.1, 0.0, -0.1)),
+    ac.OutsideCylinder(frame=F, radius_m=0.3, min_m=-0.2, max_m=0.4, margin_m=0.01),
+    ac.OutsideBox(frame=F, lower_m=(-0.3, -0.25, -0.4), upper_m=(0.3, 0.4, 0.2), margin_m=0.02),
+    ac.InsideSphere(frame=F, radius_m=0.2, center_m=(0.1, 0.0, -0.1)),
     ac.Arc(frame=F, radius_m=0.3, height_m=0.1, min_deg=0.0, max_deg=80.0, rpy_deg=(90.0, 0.0, 0.0)),
 ]
 IDS = [f"{type(c).__name__}_{i}" for i, c in enumerate(CONSTRAINTS)]
@@ -105,14 +104,14 @@ def test_turns_along_tilts_about_a_constant_axis_of_the_tool():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: sc.OutsideSphere(radius_m=0.0),
-        lambda: sc.OutsideSphere(radius_m=0.1, center_m=(0.0, 0.0)),
-        lambda: sc.OutsideCylinder(frame=F, radius_m=0.0, min_m=0.0, max_m=1.0),
-        lambda: sc.OutsideCylinder(frame=F, radius_m=0.1, min_m=1.0, max_m=1.0),
-        lambda: sc.OutsideCylinder(frame=F, radius_m=0.1, min_m=0.0, max_m=1.0, margin_m=-0.1),
-        lambda: sc.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 0.0, 1.0)),
-        lambda: sc.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 1.0, 1.0), margin_m=-0.1),
-        lambda: sc.InsideSphere(radius_m=-0.1),
+        lambda: ac.OutsideSphere(radius_m=0.0),
+        lambda: ac.OutsideSphere(radius_m=0.1, center_m=(0.0, 0.0)),
+        lambda: ac.OutsideCylinder(frame=F, radius_m=0.0, min_m=0.0, max_m=1.0),
+        lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=1.0, max_m=1.0),
+        lambda: ac.OutsideCylinder(frame=F, radius_m=0.1, min_m=0.0, max_m=1.0, margin_m=-0.1),
+        lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 0.0, 1.0)),
+        lambda: ac.OutsideBox(lower_m=(0.0, 0.0, 0.0), upper_m=(1.0, 1.0, 1.0), margin_m=-0.1),
+        lambda: ac.InsideSphere(radius_m=-0.1),
     ],
 )
 def test_shape_constraint_refuses_invalid_dimensions(make):
@@ -135,7 +134,7 @@ def test_violation_of_a_nan_pose_is_never_small(constraint):
 
 def test_half_space_of_a_shape_is_nan_when_the_last_pose_is_nan():
     X_WE, frames = RigidTransform([0.0, np.nan, 0.0]), {F: RigidTransform()}
-    for outside in (sc.OutsideSphere(0.1), sc.OutsideCylinder(F, 0.1, 0.0, 1.0), sc.OutsideBox((0.0,) * 3, (1.0,) * 3)):
+    for outside in (ac.OutsideSphere(0.1), ac.OutsideCylinder(F, 0.1, 0.0, 1.0), ac.OutsideBox((0.0,) * 3, (1.0,) * 3)):
         assert np.isnan(outside.at(X_WE, frames).project(X_WE, frames).translation()).any()
 
 

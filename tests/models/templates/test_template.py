@@ -8,7 +8,7 @@ import pytest
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import RigidTransform, RotationMatrix
 from guiderail.models.templates import Command, SharedControlTemplate, TemplateState, Transition, load_template
-from guiderail.models.templates import constraints as ac
+from guiderail.models.templates import active_constraints as ac
 from guiderail.models.templates import mappings as im
 from guiderail.models.templates import transitions as td
 from guiderail.models.templates.geometry import angle_between

@@ -36,7 +36,7 @@ def test_baselines_succeed_at_standard_tasks():
     ("study", "baseline"),
     [
         ("connector_hard_baselines", "demonstration"),
-        ("pouring_hard_baselines", "zero"),
+        ("pouring_hard_shield", "zero"),
     ],
 )
 def test_baselines_fail_and_scripted_succeeds_when_hard(study, baseline):
@@ -195,12 +195,15 @@ def test_only_residual_violates_a_bound_within_its_reach():
 
 
 def test_template_learns_the_displaced_mug():
+    shielded = rows_of("pouring_hard_shield", "rl_sct")
+    assert len(shielded) == 10 and shielded["success_rate"].min() == 0.99
+    assert (shielded["training_ended_in_spill"] == 0).all() and shielded["training_collisions"].sum() == 3
     assert rows_of("pouring_hard", "rl_sct")["success_rate"].tolist() == [0.93, 0.87, 0.98]
     assert rows_of("pouring_hard", "rl_sct_longer")["success_rate"].tolist() == [0.99, 0.91, 0.99]
     assert (rows_of("pouring_hard", "rl_sct_longer")["training_episodes"] == 150).all()
     assert rows_of("pouring_hard", "rl")["success_rate"].tolist() == [0.0, 0.0, 0.0]
     assert (rows_of("pouring_hard", "rl")["training_episodes"] == 300).all()
-    assert rows_of("pouring_hard_baselines", "scripted_blind")["success_rate"].max() < 1 / 5
+    assert rows_of("pouring_hard_shield", "scripted_blind")["success_rate"].max() < 1 / 5
 
 
 def test_per_episode_policies_succeed_in_mujoco():

@@ -13,7 +13,7 @@ import matplotlib
 import numpy as np
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.tools.visualization.style import new_figure
+from guiderail.tools.visualization.figures import new_figure
 from guiderail_calibration.prediction import LEVEL
 from guiderail_calibration.recordings import Episode
 

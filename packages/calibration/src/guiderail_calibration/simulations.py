@@ -20,9 +20,10 @@ from guiderail.models.common.files import write_atomically
 from guiderail.tools.environments import make_environment, task_content
 from guiderail.tools.evaluation.baselines import MakePolicy, zero_policy
 from guiderail.tools.evaluation.forks import Forks, can_fork
-from guiderail.tools.evaluation.rollout import EpisodeProgress, rollout
+from guiderail.tools.evaluation.rollout import rollout
 from guiderail.tools.evaluation.subject import has_constant_offset
 from guiderail.tools.learning.run_folder import installed_versions
+from guiderail.tools.progress import EpisodeProgress
 from guiderail_calibration.parameters import Parameter, options_of
 from guiderail_calibration.recordings import Episode
 

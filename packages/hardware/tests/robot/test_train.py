@@ -586,8 +586,7 @@ def test_train_raises_when_a_setting_needs_a_simulation(setting, tmp_path):
             tmp_path / "run",
             RobotConnection(sim=True),
             environment={"station": "hardware", "guidance": "kgrl"},
-            given={},
-            settings={setting: 1},
+            given={"settings": {setting: 1}},
         )
     assert not (tmp_path / "run").exists()
 
