@@ -32,7 +32,7 @@ POLICIES: dict[str, dict[str, Any]] = {
         },
     },
     "connector": {
-        "task": "BncConnector", "guidance": "kgrl", "episodes": 80, "seed": 2200001, **ARM,
+        "task": "BncConnector", "guidance": "kgrl", "episodes": 180, "seed": 2200002, **ARM,
         "demonstrations": "firm_search", "settings": {"symmetry": "near", "privileged_critic": True},
     },
     "clamp": {
@@ -45,7 +45,7 @@ POLICIES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 """Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,
-connector_robot_sensing, grid_clamp_robot_sensing and pouring_hard_shield."""
+grid_clamp_robot_sensing and pouring_hard_shield, and the second one of connector_robot_sensing."""
 FILES = ("config.yaml", "policy.json", "policy.safetensors", "evaluation.json")
 MAX_SIZE = 200_000  # largest total size of the files of one policy [bytes]
 EPISODES = 40  # held-out episodes of the policy and of each baseline policy

@@ -156,7 +156,7 @@ def plug_surfaces(dimensions: BncDimensions, friction: float = FRICTION) -> list
 
 
 def bore_hulls(dimensions: BncDimensions) -> list[np.ndarray]:
-    """Return the vertices (20, 3) [m] of the convex pieces of the ring, with the polygonal surface of `bore_mesh`."""
+    """Return the vertices (20, 3) [m] of the convex pieces of the ring, whose polygons enclose the bore."""
     d = dimensions
     profile = [
         [d.bore_radius + d.mouth_chamfer, 0.0],
