@@ -196,8 +196,10 @@ def test_only_residual_violates_a_bound_within_its_reach():
 
 def test_template_learns_the_displaced_mug():
     shielded = rows_of("pouring_hard_shield", "rl_sct")
-    assert len(shielded) == 10 and shielded["success_rate"].min() == 0.99
-    assert (shielded["training_ended_in_spill"] == 0).all() and shielded["training_collisions"].sum() == 3
+    assert len(shielded) == 10
+    assert shielded["success_rate"].min() == 0.99
+    assert (shielded["training_ended_in_spill"] == 0).all()
+    assert shielded["training_collisions"].sum() == 3
     assert rows_of("pouring_hard", "rl_sct")["success_rate"].tolist() == [0.93, 0.87, 0.98]
     assert rows_of("pouring_hard", "rl_sct_longer")["success_rate"].tolist() == [0.99, 0.91, 0.99]
     assert (rows_of("pouring_hard", "rl_sct_longer")["training_episodes"] == 150).all()
