@@ -24,6 +24,7 @@ from guiderail_hardware.drivers.driver import find_driver, safety_limits
 from guiderail_hardware.drivers.lcm import IiwaDriver
 from guiderail_hardware.drivers.lcm_simulated import LockstepClock, SimulatedIiwa
 from guiderail_hardware.models.joint_status import Fault, StatusLimits
+from guiderail_hardware.models.state_estimator import SOURCE_TIME
 from guiderail_hardware.robot.sim_driver import START
 from guiderail_hardware.station import HardwareStation, tool_jacobian
 from guiderail_hardware.systems.torque_safety_limiter import ArmState
@@ -172,6 +173,7 @@ def test_station_stops_at_a_faulty_status_and_resumes(shared_loop, name):
     np.testing.assert_array_equal(loop["iiwa.torque_commanded"], 0.0)
     assert loop.commands[-1].joint_torque == (0.0,) * 7
     assert np.abs(loop["iiwa.velocity_estimated"]).max() < 0.02
+    loop.advance(goal, SOURCE_TIME)  # the replaced status looks like one of a second robot
     before = loop["pose"].copy()
     loop.station.resume(loop.context)
     loop.advance(goal, 0.05)
