@@ -271,7 +271,7 @@ def _has_symmetry(config: RunConfig) -> bool:
 
     guidance = config.environment.get("guidance")
     displaces = guidance in GUIDANCE.names() and GUIDANCE.get(guidance).displaces
-    return displaces and TASKS.get(config.task).symmetry is not Task.symmetry
+    return displaces and TASKS.get(config.task).symmetries is not Task.symmetries
 
 
 def _learner_differences(config: RunConfig, setting: Setting) -> list[str]:

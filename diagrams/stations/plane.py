@@ -95,7 +95,10 @@ class PlaneStation(Station):
     ):
         """Construct the station from the geometry of walls, goal and obstacles.
 
-        A `control_period` [s], a whole multiple of the plant's period, replaces the control period of the `config`.
+        Args:
+            passage: Geometry of walls, goal and obstacles.
+            config: Periods and gains of the station.
+            control_period: Whole multiple of the plant's period [s] that replaces the control period of the `config`.
 
         Raises:
             InputError: If `control_period` is no whole multiple of the plant's period.

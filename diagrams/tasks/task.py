@@ -87,7 +87,16 @@ def terminal_reward(rewards: Mapping[str, float]) -> Callable[..., float]:
 
 
 def add_constant(builder: DiagramBuilder, name: str, default: ArrayLike) -> OutputPort:
-    """Add a signal (n,) that a reset may set by `World.set`; until then it has the `default` values, (n,)."""
+    """Add a signal that a reset may set by `World.set`.
+
+    Args:
+        builder: Builder of the diagram.
+        name: Name of the system, by which `World.set` finds it.
+        default: Values before the first reset that sets them, (n,).
+
+    Returns:
+        The port of the signal, (n,).
+    """
     return builder.AddNamedSystem(name, ConstantVectorSource(np.array(default, dtype=float))).get_output_port()
 
 
@@ -220,6 +229,9 @@ class Task(option_models.TaskOptions):
             world: Robot and objects.
             rng: Random generator of the environment.
             given: Instance of `Reset`. If its `held_out` is true, sample from the held-out distribution.
+
+        Raises:
+            InputError: If the task has neither a reference nor a `reset` of its own.
         """
         reference = self.prior().reference
         if reference is None:

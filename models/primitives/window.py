@@ -32,9 +32,15 @@ class Window:
         """Return the window of given means and covariances.
 
         Raises:
-            InputError: If means or covariances are not finite, or a covariance is not symmetric.
+            InputError: If means or covariances are not finite, their shape does not match the constraints, or a
+                covariance is not symmetric.
         """
         means, covariances = as_numbers(means, "means"), as_numbers(covariances, "covariances")
+        steps, _, outputs = G.shape
+        if means.shape != (steps, outputs) or covariances.shape != (steps, outputs, outputs):
+            raise InputError(
+                f"means and covariances must have shapes {(steps, outputs)} and {(steps, outputs, outputs)}"
+            )
         if not (np.isfinite(means).all() and np.isfinite(covariances).all()):
             raise InputError("means and covariances must be finite")
         worst = find_asymmetric(covariances)

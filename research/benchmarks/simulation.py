@@ -45,7 +45,6 @@ CALLBACKS: tuple[tuple[type, str], ...] = (
     (ContactDetector, "_update"),
     (LastValidPose, "_update"),
     (LastValidPose, "eval"),
-    (ForceMonitor, "_impedance_force"),
     (ForceMonitor, "_saturation"),
     (Recorder, "_record"),
 )

@@ -95,8 +95,8 @@ def test_printed_evaluate_command_is_trusted_and_quoted(bead_run, canary):
 
 
 COMMANDS = (
-    ("evaluate", "RUN"), ("robustness", "RUN"), ("certify", "RUN"), ("visualize", "RUN"), ("report", "RUN"),
-    ("train", "--resume", "--out", "RUN"), ("deploy", "RUN", "--sim", "--yes"),
+    ("evaluate", "RUN"), ("robustness", "RUN"), ("certify", "RUN"), ("visualize", "RUN"),
+    ("report", "RUN", "--episodes", "1"), ("train", "--resume", "--out", "RUN"), ("deploy", "RUN", "--sim", "--yes"),
     ("deploy", "RUN", "--sim", "--yes", "--episodes", "1"), ("study", "STUDY", "--out", "OUT"),
 )  # fmt: skip
 

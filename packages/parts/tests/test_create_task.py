@@ -274,11 +274,11 @@ def test_seated_plug_may_be_turned_by_up_to_20_degrees(folder):
     assert turned == [True, False]
 
 
-def test_bound_is_refused_when_the_file_has_phases(folder):
+def test_bound_is_refused_when_the_file_has_phases(folder, monkeypatch):
     task = EnvConfig.resolve(str(folder), {"bound": 3e-3}).declared
     lower, upper = ((x, x, *[None] * 4) for x in (-1e-3, 1e-3))
     phases = Bounds.model_validate({"lower": (lower,) * 2, "upper": (upper,) * 2, "phases": (0.0, 0.5)})
-    task.file = task.file.model_copy(update={"bounds": phases})
+    monkeypatch.setattr(type(task), "file", task.file.model_copy(update={"bounds": phases}))
     with pytest.raises(InputError, match="bound replaces constant bounds"):
         task.constraints()
 
@@ -346,7 +346,7 @@ def test_unknown_turn_is_demonstrated_and_reached_by_actions(turning):
     rng = np.random.default_rng(0)
     turns = np.rad2deg([task.offsets.draw(rng, InsertionReset(), RUN)[0][2] for _ in range(200)])
     assert 4.3 < np.abs(turns).max() <= 4.5
-    assert list(task.action_dims()) == [0, 1, 3]
+    assert list(task.defaults["action_dims"]) == [0, 1, 3]
     limit = np.rad2deg(task.constraints().nearest(np.full(6, 1.0))[3])
     assert limit == pytest.approx(6.75)  # [°]; 1.5 times the unknown turn
     outputs = np.array(Demonstrations.load(turning / "demonstrations.npz").outputs)

@@ -130,7 +130,7 @@ def test_hardware_station_is_tared_and_adds_no_errors(sensing, is_tared):
     options = {"station": "hardware", "robot_url": "memq://", "sensing": sensing}
     task = EnvConfig.resolve("BncConnector", options)
     station = make_station(task)
-    for copy in (station, station.clone(task.workcell())):
+    for copy in (station, station.clone(task.declared.workcell())):
         assert any(system.get_name() == "tare" for system in copy.GetSystems()) == is_tared
     noisy = EnvConfig.resolve("BncConnector", {**options, "sensing.wrench_noise": (0.1, 0.01)})
     with pytest.raises(InputError, match="disturbances of its own"):

@@ -339,7 +339,7 @@ def test_action_beyond_the_range_is_clipped():
         ({"guidance": "residual", "action_scale": -1.0}, "action_scale .* must be positive"),
         (
             {"demonstrations": [Segment(RECORDED, floor=[0.1] * 2)], "constraints": None, "frame": None},
-            "floor .* 3 outputs",
+            "floor is one standard deviation, or 3",
         ),
         ({"template": "pouring"}, "guidance='kgrl' does not use template"),
         ({"guidance": "template", "template": "pouring", "template_frames": pose}, "does not use demonstrations"),

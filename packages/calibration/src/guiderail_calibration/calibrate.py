@@ -19,11 +19,12 @@ from guiderail.models.common.files import write_atomically
 from guiderail.tools.evaluation.forks import check_processes
 from guiderail.tools.evaluation.subject import find_subject
 from guiderail.tools.tables import write_table
-from guiderail_calibration.inference import FALSE_ALARMS, Posterior
+from guiderail_calibration.inference import Posterior
 from guiderail_calibration.parameters import Parameter, options_of, select_parameters
 from guiderail_calibration.prediction import LEVEL, Prediction, predict
 from guiderail_calibration.probe import probe_options
 from guiderail_calibration.recordings import Episode, load_recordings
+from guiderail_calibration.report import render
 from guiderail_calibration.simulations import (
     EPISODES,
     POSTERIOR_SEED,
@@ -200,8 +201,6 @@ def _digest(quantiles: np.ndarray) -> str:
 
 def _write(out: Path, task: str, environment: Mapping[str, Any], calibration: Calibration) -> dict[str, str]:
     """Write the results into a folder; return the paths of page, table of draws and variants."""
-    from guiderail_calibration.report import render
-
     columns = {p.name: p.value(calibration.quantiles[:, i]) for i, p in enumerate(calibration.parameters)}
     rows = [dict(zip(columns, map(float, values), strict=True)) for values in zip(*columns.values(), strict=True)]
     table = write_table(out / "posterior", rows).with_suffix(".csv")
@@ -220,13 +219,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, tuple | list):
         return [_plain(entry) for entry in value]
     return value.item() if isinstance(value, np.generic) else value
-
-
-def describe_check(is_explained: bool, p_value: float) -> str:
-    """Return the result of the check of the model in one sentence."""
-    if is_explained:
-        return f"The model explains the recordings (p = {p_value:.2g})."
-    return (
-        f"Not explained by this model (p = {p_value:.2g}, and {FALSE_ALARMS:g} or less is an alarm): the robot differs "
-        "in something that no parameter describes, such as a grasp that slips; do not rely on posterior and prediction."
-    )

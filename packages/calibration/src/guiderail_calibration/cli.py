@@ -41,7 +41,7 @@ def calibrate(
     TASK --variants FILE --set init_from=RUN. Simulations are stored, so the same command resumes.
     """
     from guiderail_calibration.calibrate import calibrate as run_calibration
-    from guiderail_calibration.calibrate import describe_check
+    from guiderail_calibration.inference import describe_check
 
     result = run_calibration(
         run,

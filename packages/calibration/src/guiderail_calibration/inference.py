@@ -267,3 +267,13 @@ def _quiet() -> Any:
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
         yield
+
+
+def describe_check(is_explained: bool, p_value: float) -> str:
+    """Return the result of the check of the model in one sentence."""
+    if is_explained:
+        return f"The model explains the recordings (p = {p_value:.2g})."
+    return (
+        f"Not explained by this model (p = {p_value:.2g}, and {FALSE_ALARMS:g} or less is an alarm): the robot differs "
+        "in something that no parameter describes, such as a grasp that slips; do not rely on posterior and prediction."
+    )

@@ -14,6 +14,7 @@ import numpy as np
 
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.tools.visualization.figures import new_figure
+from guiderail_calibration.inference import describe_check
 from guiderail_calibration.prediction import LEVEL
 from guiderail_calibration.recordings import Episode
 
@@ -26,8 +27,6 @@ RECORDED, SIMULATED = "#1c1f24", "#1f5fbf"
 
 def render(task: str, calibration: Any) -> str:
     """Return the text of the page of a `Calibration` for a task."""
-    from guiderail_calibration.calibrate import describe_check
-
     return PAGE.render(
         task=task,
         episodes=len(calibration.recordings),

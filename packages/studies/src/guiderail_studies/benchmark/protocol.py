@@ -129,7 +129,7 @@ def _is_plain(value: Any) -> bool:
 
 
 class TaskChoice(Strict):
-    """What a method chooses for one task, in addition to its choices for all tasks."""
+    """Choices of a method for one task, in addition to those for all tasks."""
 
     env: dict[str, Any] = Field(default_factory=dict)
     learner: LearnerChoice = LearnerChoice()
