@@ -288,7 +288,7 @@ def test_heartbeats_have_sequence_and_sender_numbers(arm):
     second.advance(1)
     sent = [HEARTBEAT_FORMAT.unpack(message) for message in first.heartbeats]
     assert [sequence for sequence, *_ in sent] == [1, 2, 3]
-    assert len({sender for _, _, sender in sent}) == 1
+    assert len({sender for _, _, sender, _ in sent}) == 1
     assert sent[0][2] != HEARTBEAT_FORMAT.unpack(second.heartbeats[0])[2]
 
 

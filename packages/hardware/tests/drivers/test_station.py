@@ -21,7 +21,7 @@ from guiderail.diagrams.stations.station import Impedance
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail_hardware.drivers.driver import find_driver, safety_limits
-from guiderail_hardware.drivers.lcm import IiwaDriver
+from guiderail_hardware.drivers.lcm import HEARTBEAT_FORMAT, IiwaDriver
 from guiderail_hardware.drivers.lcm_simulated import LockstepClock, SimulatedIiwa
 from guiderail_hardware.models.joint_status import Fault, StatusLimits
 from guiderail_hardware.models.state_estimator import SOURCE_TIME
@@ -376,7 +376,7 @@ def test_heartbeat_is_received_within_a_larger_diagram():
     station.get_desired_pose_input_port().FixValue(context, START)
     station.receive(simulator.get_mutable_context())
     assert not station.has_safety_monitor(context)
-    lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(17))
+    lcm.Publish(IiwaDriver.heartbeat_channel(), bytes(HEARTBEAT_FORMAT.size))
     station.receive(simulator.get_mutable_context())
     assert station.has_safety_monitor(context)
 

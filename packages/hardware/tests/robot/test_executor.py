@@ -356,5 +356,8 @@ def test_clone_has_the_same_parameters_and_driver():
     clone = station.clone(EnvConfig.resolve("BncConnector", {}).declared.workcell())
     assert (clone.limits, clone.impedance, clone.driver) == (station.limits, station.impedance, station.driver)
     assert clone.driver is station.driver
-    assert (clone.period, clone.driver.url, clone.status_limits) == (0.002, "memq://x", limits)
+    assert (clone.period, clone.driver.url, clone.status_limits) == (0.002, "memq://x", station.status_limits)
+    longest = station.status_limits.max_round_trip  # from the impedance
+    assert 0.0 < longest < np.inf
+    assert station.status_limits == replace(limits, max_round_trip=longest)
     assert clone.GetSubsystemByName("wrench")._decay == station.GetSubsystemByName("wrench")._decay

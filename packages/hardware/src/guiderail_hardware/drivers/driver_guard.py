@@ -114,8 +114,10 @@ class DriverGuard:
 
     def write(self, torque: np.ndarray, time: float) -> bool:
         """Send torques (n,) [Nm] with their time [s]; return False if the driver raises an exception."""
-        self.round_trip.add_command(time, self._now)
-        return self._command("write", torque, time)
+        is_sent = self._command("write", torque, time)
+        if is_sent:  # the arrival of a command that failed is not awaited
+            self.round_trip.add_command(time, self._now)
+        return is_sent
 
     def write_pose(self, X_BaseTool: RigidTransform, time: float) -> None:
         """Send a desired pose with its time [s]."""
