@@ -40,8 +40,8 @@ POLICIES: dict[str, dict[str, Any]] = {
         "algorithm": "sac", "preset": "sac_gridclamp", "settings": {"demonstration_episodes": 3},
     },
     "pouring": {
-        "task": "Pouring", "guidance": "sct", "episodes": 150, "seed": 113, "difficulty": "hard", "reward": "shaped",
-        "algorithm": "sac", "preset": "pouring", "settings": {"net_arch": "128,128"},
+        "task": "Pouring", "guidance": "sct", "episodes": 150, "seed": 113, "difficulty": "hard", "shield": False,
+        "reward": "shaped", "algorithm": "sac", "preset": "pouring", "settings": {"net_arch": "128,128"},
     },
 }  # fmt: skip
 """Arguments of `guiderail.train` by the name of the policy: the first seeds of the studies narrow_passage_hard,

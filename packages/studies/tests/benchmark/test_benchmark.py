@@ -115,7 +115,7 @@ def test_measured_floors_of_protocol_1_are_within_its_bounds():
         ({"guidance": "residual", "force_limit": 30}, "does not let a method choose 'force_limit'"),
         ({"guidance": "residual", "seconds": 3.0}, "fixes the option seconds of clamp"),
         ({"guidance": "code.py"}, "is a name, a number"),
-        ({"guidance": "/tmp/guidance"}, "is a name, a number"),
+        ({"guidance": "folder/guidance"}, "is a name, a number"),
     ],
 )
 def test_method_is_refused_when_it_chooses_what_is_fixed(env, message, protocol):
