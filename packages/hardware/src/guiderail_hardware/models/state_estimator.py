@@ -271,8 +271,13 @@ class StateEstimator:
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         state = replace(state, pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
         deviation, explained, allowed = self._momentum_deviation(state, M)
+        is_contradictory = (deviation > allowed).any()
+        if is_held:
+            # The prediction, unlike the sums of momentum, does not decay.
+            deviation = np.abs(values[self._velocities] - state.velocity)
+            is_contradictory |= status.time - before.accepted_time > self._limits.max_age
         is_explained = is_doubted or (deviation <= explained).all()
-        fault = fault or self._find_contradiction(state, (deviation > allowed).any())
+        fault = fault or self._find_contradiction(state, is_contradictory and not is_explained)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
         velocity = values[self._velocities]
@@ -483,7 +488,7 @@ class StateEstimator:
         explained = limits.velocity_noise + np.abs(inverse) @ state.tolerance
         return deviation, explained, explained + np.minimum(REACTION * state.reaction, limits.velocity_jump)
 
-    def _find_contradiction(self, state: EstimatorState, is_unexplained: bool) -> Fault:
+    def _find_contradiction(self, state: EstimatorState, is_contradictory: bool) -> Fault:
         counts = (
             (state.equal_positions, MAX_EQUAL_POSITIONS),
             (state.equal_velocities, MAX_EQUAL_VELOCITIES),
@@ -494,7 +499,7 @@ class StateEstimator:
         tolerance = self._limits.position_tolerance
         if (np.abs(state.residual) > tolerance).any() or (np.abs(state.drift) > MAX_DRIFT * tolerance).any():
             return Fault.INCONSISTENT
-        if is_unexplained or (state.excess > MAX_EXCESS).any():
+        if is_contradictory or (state.excess > MAX_EXCESS).any():
             return Fault.NOT_REACTING
         return Fault.NONE
 
