@@ -185,7 +185,9 @@ class InsertionTask(ForceOptions, Task):
 
     def impedance(self) -> Impedance | None:
         """Return an impedance with a force below the force limit; None if the option `bounded_force` is false."""
-        return Impedance().with_max_force(self.largest_force_limit) if self.bounded_force else None
+        if not self.bounded_force:
+            return None
+        return Impedance().with_max_force(self.largest_force_limit, self.transient_force_limit)
 
     def exceeds_force_limit(self) -> Callable[..., bool]:
         """Return the condition of a collision: a force above `force_limit` [N], or above a sampled limit."""

@@ -107,6 +107,12 @@ class ForceOptions(TaskOptions):
         True,
         description="limit the force of the impedance so that it stays below force_limit; if false: to 40 N per axis",
     )
+    transient_force_limit: Number | None = Field(
+        None,
+        gt=0.0,
+        description="largest contact force in an impact [N], at least force_limit, on a contact of at most 200 N/mm; "
+        "limits the approach speed; default: force_limit on a contact of at most 25 N/mm",
+    )
 
     @property
     def largest_force_limit(self) -> float:

@@ -49,6 +49,21 @@ class Observation:
     failures: list[str] = field(default_factory=list)
 
 
+class HoldingDriver(IiwaDriver):
+    """Driver of a robot that can hold its position by itself.
+
+    Attributes:
+        bus: Bus whose `on_hold` replaces the robot's brakes.
+    """
+
+    can_hold = True
+    bus: Bus
+
+    def hold(self) -> bool:
+        """Call the bus's function."""
+        return self.bus.on_hold()
+
+
 class Bus:
     """Simulated robot, safety monitor and hardware station, and the bus between them.
 
@@ -60,17 +75,24 @@ class Bus:
         has_robot: True while the robot is stepped.
         has_controller: True while the station is stepped.
         has_safety_monitor: True while the monitor checks statuses and its heartbeats are relayed.
+        on_hold: Function that is called in place of the robot's brakes, if the driver can hold the arm.
+        station_clock_error: Error of the station's clock [s].
+        monitor_clock_error: Error of the monitor's clock [s].
         torques: Torques received by the robot since the list was cleared, each (7,) [Nm].
     """
 
-    def __init__(self) -> None:
+    def __init__(self, driver: type[IiwaDriver] = IiwaDriver) -> None:
+        """Construct the bus with the drivers of the given type."""
         workcell = BncWorkcell()
         self._arm, self.near_robot, self.near_station = (DrakeLcm("memq://") for _ in range(3))
         self.robot = SimulatedIiwa(workcell, self._arm)
         limits = safety_limits(self.robot.controller_plant.plant, IiwaDriver)
         limits = dataclasses.replace(limits, damping_time=0.2, ramp_time=0.1)
         self.limits = np.array(limits.torque)
-        self.station = HardwareStation(workcell, IiwaDriver(self.near_station), robot_timeout=1.0, limits=limits)
+        self._driver = driver
+        self.station_clock_error = self.monitor_clock_error = 0.0
+        self.on_hold: Callable[[], bool] = lambda: False
+        self.station = HardwareStation(workcell, self._open(self.near_station), robot_timeout=1.0, limits=limits)
         self._stop_limits = limits
         self.on_sensor = self.on_status = self.on_command = self.on_heartbeat = relay_unchanged
         self.has_robot = self.has_controller = self.has_safety_monitor = True
@@ -92,6 +114,12 @@ class Bus:
         self.start_robot()
         self.simulator = Simulator(self.station)
         self.start_controller()
+
+    def _open(self, lcm: DrakeLcm) -> IiwaDriver:
+        driver = self._driver(lcm)
+        if isinstance(driver, HoldingDriver):
+            driver.bus = self
+        return driver
 
     # Starts of the programs.
 
@@ -118,8 +146,8 @@ class Bus:
 
     def start_monitor(self) -> None:
         """Start the safety monitor without any earlier state."""
-        plant, clock = self.robot.controller_plant.plant, lambda: self.step * PERIOD
-        self.monitor = SafetyMonitor(IiwaDriver(self.near_robot), plant, self._stop_limits, clock=clock)
+        plant, clock = self.robot.controller_plant.plant, lambda: self.step * PERIOD + self.monitor_clock_error
+        self.monitor = SafetyMonitor(self._open(self.near_robot), plant, self._stop_limits, clock=clock)
         self.has_safety_monitor = True
 
     def start_controller(self) -> None:
@@ -179,7 +207,7 @@ class Bus:
             context = self.simulator.get_mutable_context()
             self.station.get_desired_pose_input_port().FixValue(context, self.desired())
             self.simulator.AdvancePendingEvents()
-            self.station.receive(context, self.step * PERIOD)
+            self.station.receive(context, self.step * PERIOD + self.station_clock_error)
             self.simulator.AdvanceTo(self._station_step * PERIOD)
             self._deliver(self.near_station)
         commands, self._commands[:] = list(self._commands), []
@@ -223,6 +251,10 @@ class Bus:
     def _deliver(self, lcm: DrakeLcm) -> None:
         while lcm.HandleSubscriptions(0):
             pass
+
+    def set_torque(self, torque: np.ndarray) -> None:
+        """Command torques (7,) [Nm] to the robot, past bus and monitor."""
+        self._arm.Publish(IiwaDriver.command_channel, IiwaDriver.encode(torque, self.step * PERIOD))
 
     def _receive_command(self, message: bytes) -> None:
         self._arm.Publish(IiwaDriver.command_channel, message)

@@ -7,7 +7,9 @@ instant the process is forked for every fault. `processes.py` kills and pauses r
 
 Every detectable fault must be detected within its bound. From 100 ms after the fault, all joints must be slower than
 0.15 rad/s. No joint may exceed 1.25 times the speed at the fault, or 1.25 times the largest speed of the undisturbed
-motion within the bound if that is higher. The exit code is 1 if a requirement is not met.
+motion within the bound if that is higher; a kind of fault that no check detects has a larger bound, or none. Some
+faults are present when the programs start, or begin while the commanding program is paused. The exit code is 1 if a
+requirement is not met, and `--out FILE` writes the table as CSV.
 
 A fault that only changes positions or velocities begins with the first error of at least `SENSITIVITY`: the frozen
 velocity of a joint at rest is correct until the joint moves. Of two injected faults one can mask the other, so the
@@ -17,6 +19,8 @@ longer bound applies to a pair.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import csv
 import os
 import pickle
 import struct
@@ -32,12 +36,21 @@ import numpy as np
 from drake import lcmt_iiwa_status
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from injections.bus import FREQUENCY, PERIOD, Bus
-from injections.kinds import KINDS, Kind, Q, V
+from guiderail.models.common.errors import InputError
+from guiderail_hardware.systems.torque_safety_limiter import ArmState
+from injections.bus import FREQUENCY, PERIOD, Bus, HoldingDriver
+from injections.kinds import BUS_KINDS, KINDS, Kind, Q, V
 
+CAMPAIGN = (*KINDS, *BUS_KINDS)
 SLOW, SLOW_AFTER = 0.15, 0.1  # required joint speed [rad/s], from this time after every fault on [s]
-GROWTH = 1.25  # largest joint speed after a fault, relative to the speed at the fault or of the undisturbed motion
+GROWTH = 1.25  # default of `Kind.growth`
 DURATION = 0.3  # duration of a fault [s]
+DURATIONS = {"start": 1.0, "pause": 2.5}  # duration of a fault in other situations than the motion [s]
+COLUMNS = (
+    *("kind", "injections", "bound [ms]", "median [ms]", "worst [ms]", "not detected"),
+    *("fastest joint after 100 ms [rad/s]", "largest relative speed", "failed", "faults"),
+)  # of the table as CSV
+PAUSE = 0.6  # duration of a pause of the commanding program [s]
 MAX_STEPS = round(1.0 / PERIOD)  # a fault without an effect within this number of steps is not checked
 SENSITIVITY = {Q: 1e-3, V: 0.05}  # smallest errors that must be detected [rad], [rad/s]
 
@@ -59,6 +72,9 @@ class Result:
     late_speed: float
     growth: float
     failures: list[str]
+
+
+PROGRAMS = {"robot": "has_robot", "controller": "has_controller", "monitor": "has_safety_monitor"}
 
 
 def largest_speed(bus: Bus) -> float:
@@ -97,13 +113,17 @@ def has_effect(message: bytes, relayed: list[bytes], where: str) -> bool:
 
 def begin(bus: Bus, kind: Kind, rng: np.random.Generator, effects: list[int]) -> None:
     """Begin a fault; append the step of the first effect to `effects` if the list is empty."""
+    if kind.change is not None:
+        kind.change(bus)
+        if kind.make is None:
+            effects.append(bus.step + 1)
     if kind.make is not None:
         start, fault = bus.step + 1, kind.make(rng)
         where = {"sensor": "on_sensor", "network": "on_status", "command": "on_command"}[kind.where]
 
         def relay(message: bytes) -> list[bytes]:
             relayed = fault(message, (bus.step - start) * PERIOD) if message else [message]
-            if not effects and has_effect(message, relayed, kind.where):
+            if not effects and kind.situation == "motion" and has_effect(message, relayed, kind.where):
                 effects.append(bus.step)
             return relayed
 
@@ -111,41 +131,61 @@ def begin(bus: Bus, kind: Kind, rng: np.random.Generator, effects: list[int]) ->
         if kind.delays_heartbeats and kind.where == "network":
             late = kind.make(rng)
             bus.on_heartbeat = lambda message: late(message, (bus.step - start) * PERIOD)
-        return
-    name = {"robot": "has_robot", "controller": "has_controller", "monitor": "has_safety_monitor"}[kind.action[1]]
-    setattr(bus, name, False)
-    effects.append(bus.step)
+    if kind.situation == "pause":
+        bus.has_controller = False
+        effects.append(bus.step + 1)
+    if kind.action[1]:
+        setattr(bus, PROGRAMS[kind.action[1]], False)
+        effects.append(bus.step)
+
+
+def advance(bus: Bus, situation: str, effects: list[int]) -> None:
+    """Advance by a period; after a pause, the station tries to resume in each period."""
+    if situation == "start" and not effects and bus.arm_state == ArmState.RAMPING:
+        effects.append(bus.step + 1)
+    if situation == "pause" and (bus.step - effects[0]) * PERIOD > PAUSE:
+        bus.has_controller = True
+        with contextlib.suppress(InputError):  # the fault persists
+            bus.station.resume(bus.simulator.get_mutable_context())
+    bus.step_once()
 
 
 def inject(bus: Bus, kinds: tuple[Kind, ...], speeds: np.ndarray, rng: np.random.Generator) -> Result:
-    """Inject one or more faults at the same time, and observe the arm for `DURATION`."""
+    """Inject one or more faults at the same time, and observe the arm."""
     first_step, effects, start = bus.step, list[int](), None
     bound = max((kind.bound for kind in kinds if kind.is_detectable), default=np.nan)
+    situation, largest_growth = kinds[0].situation, max(kind.growth for kind in kinds)
+    duration = DURATIONS.get(situation, max(DURATION, np.nan_to_num(bound) + SLOW_AFTER))
     for kind in kinds:
         begin(bus, kind, rng, effects)
     result, speed, elapsed = Result(np.nan, "", 0.0, 0.0, []), largest_speed(bus), 0.0
-    while elapsed < DURATION - 1e-9 and bus.step - first_step < MAX_STEPS:
+    while elapsed < duration - 1e-9 and bus.step - first_step < max(MAX_STEPS, duration / PERIOD):
         before = largest_speed(bus)
-        bus.step_once()
+        advance(bus, situation, effects)
         if start is None and effects:
             start = effects[0] - 1
-            reach = round((bound if np.isfinite(bound) else DURATION) / PERIOD) + 4
+            reach = round((bound if np.isfinite(bound) else duration) / PERIOD) + 4
             speed = max(before, speeds[(start + np.arange(1 + reach)) % len(speeds)].max())
         elapsed = 0.0 if start is None else (bus.step - start) * PERIOD
-        if np.isnan(result.detected) and bus.is_detected:
+        if start is not None and np.isnan(result.detected) and bus.is_detected:
             result.detected = elapsed
             result.cause = bus.fault.name if bus.has_controller and bus.fault else f"monitor: {bus.monitor.fault.name}"
         if bus.has_robot and start is not None:
             result.growth = max(result.growth, largest_speed(bus) / speed)
-            if elapsed > SLOW_AFTER - 1e-9:
+            is_slow = situation != "start" or elapsed > result.detected + SLOW_AFTER - 1e-9
+            if elapsed > SLOW_AFTER - 1e-9 and is_slow:
                 result.late_speed = max(result.late_speed, largest_speed(bus))
-    is_detectable = any(kind.is_detectable for kind in kinds) and start is not None
-    if is_detectable and not result.detected <= bound + 1e-9:
-        result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
-    if is_detectable and result.late_speed >= SLOW:
-        result.failures.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
-    if is_detectable and result.growth > GROWTH:
-        result.failures.append(f"{result.growth:.2f} times as fast")
+    if situation == "start" and start is None:
+        result.detected, result.cause = 0.0, bus.fault.name  # detected before the motion
+    elif start is not None:
+        if any(kind.is_detectable for kind in kinds):
+            if not result.detected <= bound + 1e-9:
+                result.failures.append(f"detected after {1000.0 * result.detected:.0f} ms")
+            # A fault whose bound is longer than `SLOW_AFTER` has no effect until its detection.
+            if bound <= SLOW_AFTER and result.late_speed >= SLOW:
+                result.failures.append(f"{result.late_speed:.2f} rad/s after {SLOW_AFTER} s")
+        if result.growth > largest_growth:
+            result.failures.append(f"{result.growth:.2f} times as fast")
     return result
 
 
@@ -175,6 +215,7 @@ def run_in_child(bus: Bus, work: Callable[[], Result]) -> Result:
 
 def random_pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> Iterator[tuple[Kind, Kind]]:
     """Yield random pairs of faults in different places: sensor, network, command or program."""
+    kinds = [kind for kind in kinds if kind in KINDS]
     while number and len({kind.where for kind in kinds}) > 1:
         first, second = (kinds[i] for i in rng.choice(len(kinds), 2, replace=False))
         if first.where != second.where:
@@ -182,9 +223,9 @@ def random_pairs(kinds: list[Kind], number: int, rng: np.random.Generator) -> It
             yield first, second
 
 
-def print_table(results: dict[str, list[Result]], kinds: Sequence[Kind] = KINDS) -> int:
-    """Print a row for each of the kinds; return the number of failed injections."""
-    bounds = {kind.name: kind.bound for kind in kinds}
+def print_table(results: dict[str, list[Result]], kinds: Sequence[Kind] = KINDS, out: Path | None = None) -> int:
+    """Print a row for each of the kinds, and write it to the CSV file `out`; return the number of failed injections."""
+    table, bounds = [], {kind.name: kind.bound for kind in kinds}
     print(
         f"{'kind':<32}{'bound':>6}{'median':>7}{'worst':>6} [ms]  {'missed':>6}{'speed':>7}{'growth':>7}{'failed':>7}"
     )
@@ -200,6 +241,11 @@ def print_table(results: dict[str, list[Result]], kinds: Sequence[Kind] = KINDS)
             f"{name:<32}{1000.0 * bounds.get(name, np.nan):>6.0f}{median:>7.0f}{worst:>6.0f}       {missed:>6}"
             f"{late:>7.2f}{growth:>7.2f}{failed:>7}  {causes}"
         )
+        times = [f"{time:.0f}" for time in (1000.0 * bounds.get(name, np.nan), median, worst)]
+        table.append([name, len(rows), *times, missed, f"{late:.2f}", f"{growth:.2f}", failed, causes])
+    if out is not None:
+        with out.open("w", newline="") as file:
+            csv.writer(file).writerows([COLUMNS, *table])
     return sum(bool(row.failures) for rows in results.values() for row in rows)
 
 
@@ -209,25 +255,35 @@ def main() -> int:
     parser.add_argument("--instants", type=int, default=25, help="instants for each kind of fault")
     parser.add_argument("--pairs", type=int, default=200, help="pairs of faults that begin together")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, help="CSV file of the table")
     parser.add_argument("--kinds", nargs="*", help="names of kinds (default: all)")
     arguments = parser.parse_args()
-    started, bus = time.monotonic(), Bus()
+    started, bus, holding_bus, new_bus = time.monotonic(), Bus(), Bus(HoldingDriver), Bus()
     speeds = undisturbed_speeds(bus)
-    kinds = [kind for kind in KINDS if not arguments.kinds or kind.name in arguments.kinds]
+    undisturbed_speeds(holding_bus)
+    kinds = [kind for kind in CAMPAIGN if not arguments.kinds or kind.name in arguments.kinds]
     results: dict[str, list[Result]] = {kind.name: [] for kind in kinds}
     for instant in range(arguments.instants):
         rng = np.random.default_rng([arguments.seed, instant])
-        bus.run_until_following(float(rng.uniform(0.02, 0.3)))
-        injections = [(KINDS.index(kind), (kind,)) for kind in kinds]
-        injections += [(len(KINDS), pair) for pair in random_pairs(kinds, arguments.pairs // arguments.instants, rng)]
+        seconds = float(rng.uniform(0.02, 0.3))
+        for each in (bus, holding_bus):
+            each.run_until_following(seconds)
+        injections = [(CAMPAIGN.index(kind), (kind,)) for kind in kinds]
+        injections += [
+            (len(CAMPAIGN), pair) for pair in random_pairs(kinds, arguments.pairs // arguments.instants, rng)
+        ]
         for index, (number, chosen) in enumerate(injections):
             rng = np.random.default_rng([arguments.seed, instant, number, index])
-            result = run_in_child(bus, partial(inject, bus, chosen, speeds, rng))
+            situation = chosen[0].situation
+            if situation == "start" and instant > 0:
+                continue  # the start does not depend on the instant
+            used = holding_bus if chosen[0].name.startswith("hold()") else new_bus if situation == "start" else bus
+            result = run_in_child(used, partial(inject, used, chosen, speeds, rng))
             results.setdefault(chosen[0].name if len(chosen) == 1 else "pairs", []).append(result)
             for failure in result.failures:
                 name = " and ".join(kind.name for kind in chosen)
                 print(f"FAIL  {name}, instant {instant}: {failure} ({result.cause})", flush=True)
-    failed = print_table(results)
+    failed = print_table(results, CAMPAIGN, arguments.out)
     total = sum(len(rows) for rows in results.values())
     print(f"{total} injections, {failed} with a failed requirement, in {time.monotonic() - started:.0f} s")
     return 1 if failed else 0

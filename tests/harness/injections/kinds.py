@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 from drake import lcmt_iiwa_command, lcmt_iiwa_status
@@ -34,6 +36,11 @@ class Kind:
             "command" (before the robot) or "program".
         action: For a fault of a program, "kill" or "stop", and the name of the program.
         delays_heartbeats: True if the fault also affects the monitor's heartbeats, as a late network does.
+        growth: Largest allowed joint speed after the fault, relative to the speed at the fault or of the undisturbed
+            motion within the bound if that is higher.
+        situation: "motion"; "start", if the fault is present when all programs start; or "pause", if the fault begins
+            while the commanding program is paused for 0.6 s and then tries to resume.
+        change: Function that changes the bus when the fault begins, for a fault of a clock or of a driver.
     """
 
     name: str
@@ -42,6 +49,9 @@ class Kind:
     where: str = "sensor"
     action: tuple[str, str] = ("", "")
     delays_heartbeats: bool = False
+    growth: float = 1.25
+    situation: str = "motion"
+    change: Callable[[Any], None] | None = None
 
     @property
     def is_detectable(self) -> bool:
@@ -267,12 +277,16 @@ def _reversed_groups(size: int) -> Callable[[np.random.Generator], Fault]:
     return make
 
 
-def _moving_robot(order: str, delay: float) -> Callable[[np.random.Generator], Fault]:
-    """Return a fault by a second robot in the same posture that oscillates with 0.5 rad/s.
+def _moving_robot(
+    order: str, delay: float, *, amplitude: float = 0.5, begins: float = 0.0
+) -> Callable[[np.random.Generator], Fault]:
+    """Return a fault by a second robot in the same posture that oscillates.
 
     Args:
         order: Senders of the statuses that arrive in a period, in turn: "1" or "2", or both, such as "21".
         delay: Difference between the clocks of the two robots [s].
+        amplitude: Largest joint speed of the second robot [rad/s].
+        begins: Time after the beginning of the fault until which only the first robot sends [s].
     """
 
     def make(rng: np.random.Generator) -> Fault:
@@ -280,19 +294,36 @@ def _moving_robot(order: str, delay: float) -> Callable[[np.random.Generator], F
         number = [0]
 
         def relay(message: bytes, elapsed: float) -> list[bytes]:
+            if elapsed < begins:
+                return [message]
             second = lcmt_iiwa_status.decode(message)
             if not first:
                 first.append(lcmt_iiwa_status.decode(message))
-            phase = 2.0 * np.pi * elapsed
+            phase = 2.0 * np.pi * (elapsed - begins)
             second.utime += round(1e6 * delay)
-            second.joint_velocity_estimated = [0.5 * np.cos(phase)] * 7
+            noise = rng.normal(0.0, 1e-6, (2, 7))
             start = first[0].joint_position_measured
-            second.joint_position_measured = [q + 0.5 / (2.0 * np.pi) * np.sin(phase) for q in start]
+            positions = start + amplitude / (2.0 * np.pi) * np.sin(phase) + noise[0]
+            second.joint_position_measured = positions.tolist()
+            second.joint_velocity_estimated = (amplitude * np.cos(phase) + noise[1]).tolist()
             senders = order.split(",")[number[0] % len(order.split(","))]
             number[0] += 1
             return [message if sender == "1" else second.encode() for sender in senders]
 
         return relay
+
+    return make
+
+
+def _imitator(speed: float) -> Callable[[np.random.Generator], Fault]:
+    """Return a fault by a second robot that replaces the first, and moves like it plus a constant speed [rad/s]."""
+
+    def make(rng: np.random.Generator) -> Fault:
+        def change(status: lcmt_iiwa_status, elapsed: float) -> None:
+            status.joint_velocity_estimated = [v + speed for v in status.joint_velocity_estimated]
+            status.joint_position_measured = [q + speed * elapsed for q in status.joint_position_measured]
+
+        return _status(change)
 
     return make
 
@@ -307,6 +338,31 @@ def _scaled_torques(scale: float) -> Callable[[np.random.Generator], Fault]:
         return relay
 
     return make
+
+
+def _clock_error(seconds: float, *names: str) -> Callable[[Any], None]:
+    """Return a change that adds an error [s] to the clocks with the given attribute names."""
+
+    def change(bus: Any) -> None:
+        for name in names:
+            setattr(bus, name, getattr(bus, name) + seconds)
+
+    return change
+
+
+def _hold(answer: Callable[[], bool], is_torque_zero: bool, bus: Any) -> None:
+    """Set how drivers react to `hold`: their answer, and whether the robot's torque is zero from then on."""
+
+    def hold() -> bool:
+        if is_torque_zero:
+            bus.set_torque(np.zeros(7))
+        return answer()
+
+    bus.on_hold = hold
+
+
+def _raise() -> bool:
+    raise RuntimeError("no brakes")
 
 
 def _replaced(make_message: Callable[[bytes, np.random.Generator], bytes]) -> Callable[[np.random.Generator], Fault]:
@@ -348,6 +404,7 @@ def _spike(size: float) -> Callable[[float, float], float]:
 # Bounds of the detection time [s], derived in docs/robot.md.
 NEXT, TWO, FEW = 2 * PERIOD, 3 * PERIOD, 6 * PERIOD
 TIMEOUT, HEARTBEAT, SLOW = 8 * PERIOD, 14 * PERIOD, 24 * PERIOD
+START_BOUND = 20 * PERIOD
 UNDETECTED = float("nan")
 # An error proportional to the velocity is detectable above 0.05 rad/s, and its growth depends on the motion. Its bound
 # is therefore the bound of a constant error of 0.05 rad/s.
@@ -372,9 +429,11 @@ KINDS = (
     Kind("velocities swapped", HEARTBEAT, _swapped(V)),
     Kind("velocity spike", NEXT, _changed(V, _spike(5.0), single_joint=True)),
     Kind("velocity noise 0.3 rad/s", HEARTBEAT, _noisy(V, 0.3)),
+    Kind("velocity drift 0.5 rad/s²", 60 * PERIOD, _changed(V, lambda v, t: v + 0.5 * t, single_joint=True)),
     Kind("velocity drift 5 rad/s²", HEARTBEAT, _changed(V, lambda v, t: v + 5.0 * t, single_joint=True)),
     Kind("position + 0.01 rad", NEXT, _changed(Q, lambda q, t: q + 0.01, single_joint=True)),
     Kind("position + 1 rad", NEXT, _changed(Q, lambda q, t: q + 1.0, single_joint=True)),
+    Kind("position drift 9 mrad/s", 140 * PERIOD, _changed(Q, lambda q, t: q + 9e-3 * t, single_joint=True)),
     Kind("position drift 0.1 rad/s", FEW, _changed(Q, lambda q, t: q + 0.1 * t, single_joint=True)),
     Kind("position drift 1 rad/s", NEXT, _changed(Q, lambda q, t: q + 1.0 * (t + PERIOD), single_joint=True)),
     Kind("positions swapped", NEXT, _swapped(Q)),
@@ -391,12 +450,16 @@ KINDS = (
     Kind("message cut off", NEXT, _replaced(lambda message, rng: message[: int(rng.integers(len(message)))])),
     Kind("clock twice as fast", 10 * PERIOD, _clock(lambda t: t)),
     Kind("clock 1.5 times as fast", 16 * PERIOD, _clock(lambda t: 0.5 * t)),
+    Kind("clock 1.1 times as fast", 34 * PERIOD, _clock(lambda t: 0.1 * t)),
     Kind("clock half as fast", HEARTBEAT, _clock(lambda t: -0.5 * t)),
-    Kind("clock + 1 s", NEXT, _clock(lambda t: 1.0)),
-    Kind("clock − 1 s", NEXT, _clock(lambda t: -1.0)),
+    Kind("clock 0.9 times as fast", 80 * PERIOD, _clock(lambda t: -0.1 * t)),
+    *(
+        Kind(f"clock {seconds:+g} s", NEXT if abs(seconds) > 0.04 else UNDETECTED, _clock(lambda t, s=seconds: s))
+        for size in (1e-3, 1e-2, 0.1, 1.0, 10.0)
+        for seconds in (size, -size)
+    ),
     Kind("clock from zero", NEXT, _reset_clock),
     Kind("values 50 ms old", FEW, _old_values(0.05)),
-    Kind("statuses 60 ms late", TIMEOUT, _delayed(0.06), "network"),
     Kind("statuses lost", TIMEOUT, _lost(1.0), "network"),
     Kind("statuses lost at the driver", TIMEOUT, _lost(1.0)),
     Kind("half of the statuses lost", UNDETECTED, _lost(0.5), "network"),
@@ -407,35 +470,94 @@ KINDS = (
     Kind("second robot, another clock", NEXT, _second_robot(7.0, 0.0)),
     Kind("second robot, another posture", NEXT, _second_robot(1e-3, 0.3)),
     Kind("commands lost", TIMEOUT, _lost(1.0), "command"),
-    Kind("commands 60 ms late", TIMEOUT, _delayed(0.06), "command"),
     Kind("half of the commands lost", UNDETECTED, _lost(0.5), "command"),
     Kind("second program, torque zero", FEW, _second_program(lambda torque: np.zeros(7), 0.0), "command"),
     Kind("second program, torque negated", FEW, _second_program(lambda torque: -torque, 0.0), "command"),
     Kind("second program, another clock", FEW, _second_program(lambda torque: -torque, 40.0), "command"),
     Kind("second program, clock + 1 ms", SLOW, _second_program(lambda torque: 0.5 * torque, 1e-3), "command"),
     *(
-        Kind(f"{name} {milliseconds} ms late for ever", bound, _delayed(1e-3 * milliseconds), where, ("", ""), True)
+        Kind(f"{name} {milliseconds} ms late", bound, _delayed(1e-3 * milliseconds), where, ("", ""), True)
         for name, where in (("commands", "command"), ("statuses", "network"))
         for milliseconds, bound in (
             (5, UNDETECTED),
             (10, 10 * PERIOD),
             (15, 11 * PERIOD),
             (20, 12 * PERIOD),
+            (25, 13 * PERIOD),
             (30, 14 * PERIOD),
             (45, HEARTBEAT),
+            (60, HEARTBEAT),
         )
     ),
     Kind("statuses reversed, groups of 8", 10 * PERIOD, _reversed_groups(8), "network"),
     *(
-        Kind(f"moving robot {order}, clock + {delay:g} s", bound, _moving_robot(order, delay))
+        Kind(f"moving robot {order}, clock {delay:+g} s", bound, _moving_robot(order, delay))
         for order, bound in (("2", TIMEOUT), ("21", NEXT), ("1,2", FEW), ("1,1,2", FEW), ("1,1,2,2", FEW))
         for delay in (0.0, 1e-3, 7.0)
     ),
-    *(Kind(f"torques times {scale:g}", UNDETECTED, _scaled_torques(scale), "command") for scale in (0.5, 1.5, 2, 3, 5)),
+    *(
+        Kind(f"resting robot {order}, clock +0 s", HEARTBEAT, _moving_robot(order, 0.0, amplitude=0.0))
+        for order in ("2", "21", "1,2", "1,1,2,2")
+    ),
+    Kind("moving robot 2, same motion + 0.1 rad/s", UNDETECTED, _imitator(0.1)),
+    *(
+        Kind(f"torques times {scale:g}", UNDETECTED, _scaled_torques(scale), "command", growth=growth)
+        for scale, growth in ((0.5, 1.25), (1.5, 1.25), (2, 1.25), (3, 1.25), (5, 3.0))
+    ),
     Kind("controller killed", TIMEOUT, None, "program", ("kill", "controller")),
     Kind("controller stopped", TIMEOUT, None, "program", ("stop", "controller")),
     Kind("robot killed", TIMEOUT, None, "program", ("kill", "robot")),
     Kind("robot stopped", TIMEOUT, None, "program", ("stop", "robot")),
     Kind("monitor killed", HEARTBEAT, None, "program", ("kill", "monitor")),
     Kind("monitor stopped", HEARTBEAT, None, "program", ("stop", "monitor")),
+)
+# Faults that only `bus.py` can inject. The time until the detection of a latency that is constant from the start on
+# begins with the first torque.
+LATENCIES = (
+    ("commands", "command", False, 1.25),
+    ("statuses", "network", True, 1.25),
+    ("statuses at the driver", "sensor", False, 4.0),  # before the monitor, so that its heartbeats do not show it
+)
+BUS_KINDS = (
+    *(
+        Kind(
+            f"{name} always {latency} ms late",
+            bound,
+            _delayed(1e-3 * latency),
+            where,
+            ("", ""),
+            is_late,
+            growth=growth,
+            situation="start",
+        )
+        for name, where, is_late, growth in LATENCIES
+        for latency in (5, 10, 15, 20, 30, 45, 60)
+        for bound in (UNDETECTED if latency == 5 or where == "sensor" else START_BOUND,)
+    ),
+    *(
+        Kind(f"{place} clock {seconds:+g} s", NEXT if size > 0.04 else UNDETECTED, None, "clock", change=change)
+        for place, name in (("station's", "station_clock_error"), ("monitor's", "monitor_clock_error"))
+        for size in (1e-3, 1e-2, 0.1, 1.0, 10.0)
+        for seconds in (size, -size)
+        for change in (_clock_error(seconds, name),)
+    ),
+    *(
+        Kind(f"hold() {name}, clock +1 s", NEXT, _clock(lambda t: 1.0), change=partial(_hold, answer, is_torque_zero))
+        for name, answer, is_torque_zero in (
+            ("repeats the last torque", lambda: True, False),
+            ("only ends the torque", lambda: True, True),
+            ("returns False", lambda: False, False),
+            ("raises an exception", _raise, False),
+        )
+    ),
+    *(
+        Kind(
+            f"paused, moving robot {order}, clock {delay:+g} s",
+            UNDETECTED if order == "2" and delay < 1.0 else TIMEOUT,
+            _moving_robot(order, delay, begins=0.1),
+            situation="pause",
+        )
+        for order in ("2", "21", "1,2", "1,1,2", "1,1,2,2")
+        for delay in (0.0, 1e-3, 7.0)
+    ),
 )

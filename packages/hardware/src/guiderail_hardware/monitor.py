@@ -152,9 +152,8 @@ class SafetyMonitor:
 
     def _is_effective(self, estimate: Estimate, now: float) -> bool:
         # The reported velocities: the prediction is wrong if the driver repeats its last torque.
-        velocities, elapsed = np.split(estimate.state.last_values, 3)[1], now - self._entered_at
-        speed, age = float(np.abs(velocities).max()), now - estimate.state.receipt_time
-        return not is_hold_ineffective(speed, self._initial_speed, elapsed, age, period=self._driver.period)
+        speed = estimate.state.reported_speed(self._driver.period)
+        return not is_hold_ineffective(speed, self._initial_speed, now - self._entered_at)
 
     def _on_command(self, torque: np.ndarray, command_time: float) -> None:
         if torque.shape != self._torque_limits.shape:
@@ -171,7 +170,7 @@ class SafetyMonitor:
                 self._num_repeats += 1
                 self._guard.write(self._command, self._commanded_at)
             return
-        self._command = torque
+        self._command, self._guard.has_torque = torque, True
         if self.state == MonitorState.IDLE:
             self.state = MonitorState.WATCHING
 

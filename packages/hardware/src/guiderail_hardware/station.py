@@ -208,6 +208,7 @@ class HardwareStation(Station):
             status_fault=heartbeat.get_fault_output_port(),
             status_age=status.get_age_output_port(),
             velocity=status.get_velocity_output_port(),
+            reported_speed=status.get_reported_speed_output_port(),
             command_timed_out=watchdog.get_command_timed_out_output_port(),
         )
         builder.Connect(state, controller.get_estimated_state_input_port())

@@ -29,6 +29,7 @@ class DriverGuard:
         command_error: Newest exception of a command, in words; empty if there was none.
         num_failed_commands: Number of commands that raised an exception.
         round_trip: Round trip of the torques that stations send.
+        has_torque: True if the robot may repeat a torque other than zero.
     """
 
     def __init__(self, driver: Any):
@@ -47,6 +48,7 @@ class DriverGuard:
         self._has_recovered = False  # a command succeeded after a failed one
         self._answer: object = None  # result of the last command
         self._has_refused_hold = False
+        self.has_torque = True  # the robot may repeat a torque
 
     @property
     def error(self) -> str:
@@ -114,7 +116,7 @@ class DriverGuard:
 
     def write(self, torque: np.ndarray, time: float) -> bool:
         """Send torques (n,) [Nm] with their time [s]; return False if the driver raises an exception."""
-        is_sent = self._command("write", torque, time)
+        self.has_torque, is_sent = True, self._command("write", torque, time)
         if is_sent:  # the arrival of a command that failed is not awaited
             self.round_trip.add_command(time, self._now)
         return is_sent
@@ -132,8 +134,14 @@ class DriverGuard:
         self._command("stop")
 
     def hold(self) -> bool:
-        """Hold the arm; return False if the driver returns False or raises an exception, so that torques are sent."""
+        """Hold the arm; return False if the driver returns False or raises an exception, so that torques are sent.
+
+        The torque is zero before, so that a driver that does not hold the arm does not repeat the last torque either.
+        """
         has_failed = self._has_failed_command, self._is_failing
+        if self.has_torque:
+            self._command("write", np.zeros(len(self._driver.torque_reflex_limits)), self._now)
+            self.has_torque = False
         if self._command("hold"):
             self._has_refused_hold = self._answer is False
         else:

@@ -25,20 +25,17 @@ def damping_torque(M: np.ndarray, v: np.ndarray, decay_time: float, *, period: f
     return (M @ v) * (np.expm1(-period / decay_time) / period)
 
 
-def is_hold_ineffective(speed: float, initial_speed: float, elapsed: float, age: float, *, period: float) -> bool:
+def is_hold_ineffective(speed: float, initial_speed: float, elapsed: float) -> bool:
     """Return True if an arm that its driver should hold still moves.
 
-    After `HOLD_TIME`, the speed must be below half of the initial one or `HELD_SPEED`. Without a fresh status the speed
-    is unknown, and the result False.
+    After `HOLD_TIME`, the speed must be below half of the initial one or `HELD_SPEED`.
 
     Args:
-        speed: Largest joint speed [rad/s].
+        speed: Largest reported joint speed [rad/s]; NaN if it is unknown, for which the result is False.
         initial_speed: Largest joint speed when the driver was asked to hold the arm [rad/s].
         elapsed: Time since then [s].
-        age: Age of the status with the speed [s].
-        period: Period of the statuses [s].
     """
-    return elapsed >= HOLD_TIME and age <= 2.0 * period and speed > max(0.5 * initial_speed, HELD_SPEED)
+    return elapsed >= HOLD_TIME and speed > max(0.5 * initial_speed, HELD_SPEED)
 
 
 class Fault(IntEnum):

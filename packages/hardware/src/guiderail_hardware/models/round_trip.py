@@ -51,7 +51,8 @@ class RoundTrip:
 
     A message reports the time stamp of the newest command that has arrived. If a command is not reported yet, the time
     since it was sent is a lower bound. The smallest of the last `WINDOW` measurements counts. The round trip is unknown
-    until the first command is reported, and `EXPIRY` after the last command.
+    `EXPIRY` after the last command, and before the first command is reported once a message reports a time stamp of no
+    pending command.
 
     Attributes:
         seconds: Round trip [s]; NaN if it is unknown.
@@ -63,6 +64,7 @@ class RoundTrip:
         self._pending: deque[tuple[int, float]] = deque(maxlen=MAX_PENDING)  # time stamp [µs] and local time [s]
         self._measured: deque[float] = deque(maxlen=WINDOW)
         self._is_reported = False  # True after the first report of a command
+        self._stamps = frozenset[int]()  # reported time stamps when no command was pending
 
     def add_command(self, stamp: float, now: float) -> None:
         """Add a command that is sent with a time stamp [s] at the local time [s]."""
@@ -79,6 +81,8 @@ class RoundTrip:
             self._pending.clear()
             self._measured.clear()
             self.seconds = np.nan
+        if not self._pending:
+            self._stamps = frozenset(stamps)
         # The newest match: two stations may use the same time stamps one after the other.
         index = next((i for i in reversed(range(len(self._pending))) if self._pending[i][0] in stamps), None)
         if index is not None:
@@ -86,7 +90,7 @@ class RoundTrip:
             sent = self._pending[index][1]
             for _ in range(index + 1):
                 self._pending.popleft()
-        elif self._pending and self._is_reported:
+        elif self._pending and (self._is_reported or (self._stamps and self._stamps.issuperset(stamps))):
             sent = self._pending[0][1]
         else:
             return

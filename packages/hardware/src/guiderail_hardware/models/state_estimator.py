@@ -142,6 +142,11 @@ class EstimatorState:
         )
         return replace(self, **{name: getattr(self, name) + seconds for name in names})
 
+    def reported_speed(self, period: float) -> float:
+        """Return the largest joint speed of the last readable status [rad/s]; NaN without one in two periods [s]."""
+        is_fresh = self.check_time - self.receipt_time <= 3.0 * period
+        return float(np.abs(np.split(self.last_values, 3)[1]).max()) if is_fresh else np.nan
+
     @property
     def last(self) -> LastStatus:
         """Last readable status, valid or not."""
@@ -252,7 +257,7 @@ class StateEstimator:
         is_other = {fault, self._find_fault(before, before.last, status, now)} & set(SOURCE_FAULTS)
         state, fault = self._check_source(state, values, now, fault, is_trusted=is_trusted, is_other=bool(is_other))
         # The last status had a velocity that the torques do not explain.
-        is_held = not is_doubted and before.last_time > before.accepted_time
+        is_held = not is_doubted and 0.0 < before.last_time - before.accepted_time <= self._limits.max_age
         if fault == Fault.CONFLICT and not is_doubted and not is_held:
             # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
@@ -308,6 +313,7 @@ class StateEstimator:
         if not is_explained:
             # A collision, or another robot: the external torque decides within `REACTION_WINDOW`.
             missing, is_missing = self._missing_velocity(state, M)
+            is_missing &= np.abs(velocity - state.velocity) > AGREEMENT
             if not is_held:
                 state = replace(state, velocity=np.where(is_missing, status.velocities + missing, velocity))
             return self._finish(state, before, fault, now)
@@ -474,10 +480,12 @@ class StateEstimator:
     def _missing_velocity(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the velocity change by recent torques that the reported velocity lacks (n,) [rad/s], and a mask (n,).
 
-        The change is computed with and without the external torques, and the smaller result is used. The mask is true
+        The change is computed with and without the external torques, and the smaller result is used. A change in the
+        last period is complete: its decay is compensated. The mask is true
         if both results have the same sign. Otherwise, not the velocity but the external torque is wrong.
         """
-        missing = np.linalg.inv(M) @ np.transpose([state.predicted, state.commanded] - state.measured)
+        sums = np.transpose([state.predicted, state.commanded] - state.measured)
+        missing = np.exp(self._period / MOMENTUM_WINDOW) * np.linalg.inv(M) @ sums
         is_missing = np.prod(np.sign(missing), axis=1) > 0.0
         return np.where(is_missing, np.sign(missing[:, 0]) * np.abs(missing).min(axis=1), 0.0), is_missing
 

@@ -35,6 +35,7 @@ class StatusWatchdog(LeafSystem):
         - external_torque
         - fault
         - age
+        - reported_speed
 
     ``status`` is abstract: the newest `JointStatus`, or None. ``torque`` is (n,), the torques that are sent after this
     check [Nm]. ``clock`` is (1,), the wall-clock time of this check [s]; if it is not connected, checks are one period
@@ -43,6 +44,7 @@ class StatusWatchdog(LeafSystem):
     `StateEstimator`. ``velocity`` is (n,), the velocity for damping [rad/s]: estimated from several sources, predicted
     while no status is accepted, and zero where it is unknown. ``fault`` is (1,), a code of `Fault`. ``age`` is (1,),
     the age of the last accepted status relative to the earliest arrival [s]; infinite before the first.
+    ``reported_speed`` is (1,), the largest joint speed of the last readable status [rad/s]; NaN without a recent one.
 
     Args:
         plant: Finalized model of only the arm and its payload; provides the inertia.
@@ -81,6 +83,9 @@ class StatusWatchdog(LeafSystem):
         )
         declare.part_output(self, "fault", self._estimate, lambda estimate: float(estimate.fault))
         declare.part_output(self, "age", self._estimate, lambda estimate: estimate.age)
+        declare.part_output(
+            self, "reported_speed", self._estimate, lambda estimate: estimate.state.reported_speed(period)
+        )
         declare.update(self, period, self._update)
 
     get_status_input_port = input_getter("status", "newest `JointStatus`; any other object counts as none")
@@ -91,6 +96,7 @@ class StatusWatchdog(LeafSystem):
     get_external_torque_output_port = output_getter("external_torque", "accepted external torques, (n,) [Nm]")
     get_fault_output_port = output_getter("fault", "present or recent fault, (1,), a code of `Fault`")
     get_age_output_port = output_getter("age", "age of the accepted status, (1,) [s]")
+    get_reported_speed_output_port = output_getter("reported_speed", "largest reported joint speed, (1,) [rad/s]")
 
     def forget_torque(self, context: Context) -> None:
         """Treat the torques since the last check as unknown, because a command was not sent.

@@ -18,6 +18,7 @@ from guiderail_hardware.models.joint_status import STATUS_FAULTS, Fault, damping
 # rad/s; 1 if the driver does not hold the arm although it was asked to].
 _ARM_STATE, _BLEND_FACTOR = 0, 3
 
+REST_SPEED, REST_TIME = 0.15, 0.15  # largest joint speed [rad/s], for this time [s] before an arm resumes
 ZERO_TORQUE_TIME = 0.05  # shortest time for which zero torque is sent after damping, even with a status fault [s]
 
 
@@ -109,6 +110,7 @@ class TorqueSafetyLimiter(LeafSystem):
         - status_fault
         - status_age
         - velocity
+        - reported_speed
         - command_timed_out
         output_ports:
         - safe_torque
@@ -122,8 +124,8 @@ class TorqueSafetyLimiter(LeafSystem):
     ``torque`` (commanded) and ``safe_torque`` are (n,) [Nm], ``estimated_state`` is (2n,) [rad, rad/s], and
     ``external_torque`` is (n,) [Nm], with joints in the order of the plant's positions. ``wrench`` is (6,), force
     first. ``pose`` and ``desired_pose`` are (6,); their positions are checked. ``status_fault`` (1,), ``status_age``
-    (1,) [s] and ``velocity`` (n,) [rad/s] are outputs of a `StatusWatchdog`; an unknown fault code counts as
-    `Fault.MALFORMED`. ``command_timed_out`` is (1,), from a `CommandWatchdog`.
+    (1,) [s], ``velocity`` (n,) [rad/s] and ``reported_speed`` (1,) [rad/s] are outputs of a `StatusWatchdog`; an
+    unknown fault code counts as `Fault.MALFORMED`. ``command_timed_out`` is (1,), from a `CommandWatchdog`.
 
     ``fault`` is (1,). While the arm is stopped, it is the code of the `Fault` that stopped the arm, otherwise the code
     of the present fault. ``arm_state`` is (1,), a value of `ArmState`. ``blend_factor`` is (1,). ``is_sending`` (1,) is
@@ -162,8 +164,10 @@ class TorqueSafetyLimiter(LeafSystem):
         self._status_fault_port = self.DeclareVectorInputPort("status_fault", 1)
         self._status_age_port = self.DeclareVectorInputPort("status_age", 1)
         self._velocity_port = self.DeclareVectorInputPort("velocity", num_joints)
+        self._reported_speed_port = self.DeclareVectorInputPort("reported_speed", 1)
         self._command_timed_out_port = self.DeclareVectorInputPort("command_timed_out", 1)
         self._state = self.DeclareDiscreteState([ArmState.WAITING, Fault.NONE, 0.0, 0.0, 0.0, 0.0])
+        self._rest_time = self.DeclareDiscreteState([np.inf])  # time since a joint was faster than `REST_SPEED` [s]
 
         self._plant_context = declare.plant_context(
             self, plant, self._estimated_state_port.Eval, [self._estimated_state_port]
@@ -194,6 +198,7 @@ class TorqueSafetyLimiter(LeafSystem):
     get_status_fault_input_port = input_getter("status_fault", "status fault, (1,), a code of `Fault`")
     get_status_age_input_port = input_getter("status_age", "age of the status, (1,) [s]")
     get_velocity_input_port = input_getter("velocity", "velocity for damping, (n,) [rad/s]")
+    get_reported_speed_input_port = input_getter("reported_speed", "largest reported joint speed, (1,) [rad/s]")
     get_command_timed_out_input_port = input_getter("command_timed_out", "flag that no command is valid, (1,)")
     get_safe_torque_output_port = output_getter("safe_torque", "limited torques, (n,) [Nm]")
     get_fault_output_port = output_getter("fault", "fault, (1,), a code of `Fault`")
@@ -228,7 +233,7 @@ class TorqueSafetyLimiter(LeafSystem):
         """Resume after a stop, from the present pose of the arm; `context` is this system's.
 
         Raises:
-            InputError: If the arm is not stopped, damping has not ended, or a fault is present.
+            InputError: If the arm is not stopped, damping has not ended, the arm moves, or a fault is present.
         """
         arm_state = self._state_of(context)[_ARM_STATE]
         if arm_state != ArmState.OFF:
@@ -236,6 +241,9 @@ class TorqueSafetyLimiter(LeafSystem):
         fault = self._present_fault.Eval(context)
         if fault:
             raise InputError(f"the arm can't resume yet: {fault.description}")
+        # Otherwise statuses of another robot, which moves, could be followed.
+        if context.get_discrete_state().value(self._rest_time).item() < REST_TIME - 1e-9:
+            raise InputError("the arm can't resume yet: it moves, although no torque is commanded; hold it still")
         context.SetDiscreteState(self._state, [ArmState.RAMPING, Fault.NONE, 0.0, 0.0, 0.0, 0.0])
 
     def _state_of(self, context: Context) -> np.ndarray:
@@ -292,12 +300,14 @@ class TorqueSafetyLimiter(LeafSystem):
                 if arm_state == ArmState.RAMPING and blend_factor == 1.0:
                     arm_state = ArmState.RUNNING
         elif self._is_holding(context) and is_hold_ineffective(
-            self._speed(context), speed, state_time, self._status_age_port.Eval(context)[0], period=self._period
+            self._reported_speed_port.Eval(context)[0], speed, state_time
         ):
             arm_state, state_time, is_refused = ArmState.DAMPING, 0.0, 1.0
         elif arm_state == ArmState.DAMPING and state_time >= self._limits.damping_time:
             arm_state, state_time = ArmState.OFF, 0.0
         discrete_state.set_value(self._state, [arm_state, fault, state_time, blend_factor, speed, is_refused])
+        rest_time = context.get_discrete_state().value(self._rest_time).item() + self._period
+        discrete_state.set_value(self._rest_time, [rest_time if self._speed(context) <= REST_SPEED else 0.0])
 
     def _safe_torque(self, context: Context) -> np.ndarray:
         arm_state, _, _, blend_factor, *_ = self._state_of(context)
