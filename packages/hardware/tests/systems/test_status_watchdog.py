@@ -183,7 +183,7 @@ def test_initialization_keeps_the_state(plant, has_clock):
 def test_ports_have_their_documented_sizes(plant):
     system = StatusWatchdog(plant, LIMITS, TOLERANCE, period=PERIOD)
     outputs = [system.get_output_port(i) for i in range(system.num_output_ports())]
-    sizes = {"estimated_state": 4, "velocity": 2, "external_torque": 2, "fault": 1, "age": 1}
+    sizes = {"estimated_state": 4, "velocity": 2, "external_torque": 2, "fault": 1, "age": 1, "reported_speed": 1}
     assert {port.get_name(): port.size() for port in outputs} == sizes
     assert (system.get_torque_input_port().size(), system.get_clock_input_port().size()) == (2, 1)
     torque = system.get_torque_input_port().get_index()
