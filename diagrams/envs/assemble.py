@@ -101,11 +101,10 @@ def template_of(config: EnvConfig) -> PlacedTemplate | None:
 
 
 _LIMITS = ("max_speed", "max_acceleration")
-_JOINTS = ("joint_margin", "min_singular_value")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
 _CONVERTED_OPTIONS = (
-    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag", *_LIMITS,
-    *_JOINTS,
+    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag",
+    "joint_margin", *_LIMITS,
 )  # fmt: skip
 
 
@@ -130,9 +129,7 @@ def _motion_constraints(
     """Return a task's motion constraints, extended by the limits in its options; None if there are neither."""
     limits: dict[str, Any] = {}
     if options["joint_margin"] is not None:
-        limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    elif options["min_singular_value"]:
-        raise InputError("min_singular_value has an effect with joint_margin only: give joint_margin=0 as well")
+        limits["state"] = [station.joint_range(options["joint_margin"])]
     outputs = constraints.num_outputs
     limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options[name]}
     if motion is None:

@@ -253,10 +253,10 @@ class ArmStation(Station):
         """Put the arm at rest with its tool center at `pose`, (6,); `context` is the root context."""
         self._controller_plant.place(self.plant, self.arm.model, context, pose)
 
-    def joint_range(self, margin: float, min_singular_value: float) -> JointRange:
+    def joint_range(self, margin: float) -> JointRange:
         """Return constraints on the joint positions at a commanded pose; see `JointRange`."""
         model = self._controller_plant
-        return JointRange(model.plant, model.target, model.tool_center, model.posture, margin, min_singular_value)
+        return JointRange(model.plant, model.target, model.tool_center, model.posture, margin)
 
     def _add_wrench_estimate(self, builder: DiagramBuilder, accuracy: JointTorqueAccuracy) -> OutputPort:
         """Add joint torque sensors and the estimate of the wrench; return its port."""

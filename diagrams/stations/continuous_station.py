@@ -59,9 +59,9 @@ class ContinuousStation(Station):
         """Multiply the friction and modulus of all contacts by factors until the next reset."""
         self._inner.set_contact(context, friction, modulus)
 
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+    def joint_range(self, margin: float) -> StateConstraints:
         """Return the constraints of the inner station's joints."""
-        return self._inner.joint_range(margin, min_singular_value)
+        return self._inner.joint_range(margin)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the inner station's disturbances at a reset, and return them by name."""

@@ -129,9 +129,9 @@ class DisturbedStation(Station):
         """Put the robot at rest with its true tool center at `pose`, (6,); `context` is the root context."""
         self._inner.set_pose(context, pose)
 
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+    def joint_range(self, margin: float) -> StateConstraints:
         """Return the constraints of the inner station's joints."""
-        return self._inner.joint_range(margin, min_singular_value)
+        return self._inner.joint_range(margin)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the disturbances of an episode; return them by name."""

@@ -22,7 +22,7 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.objects.pouring import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot

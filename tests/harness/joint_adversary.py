@@ -49,7 +49,7 @@ def attack(steps: int, seed: int = 0, *, constrained: bool = True) -> Result:
     """Run `steps` control steps with or without the joint constraints; return the result."""
     rng, result, builder = np.random.default_rng(seed), Result(), DiagramBuilder()
     station = builder.AddNamedSystem("station", ArmStation(BncWorkcell()))
-    joints = station.joint_range(MARGIN, 0.05)
+    joints = station.joint_range(MARGIN)
     linear = LinearConstraints(np.eye(6)[2:3], np.array([MIN_HEIGHT]))
     motion = MotionConstraints(linear, max_speed=SPEED, state=[joints] if constrained else [])
     system = CommandFilter(MotionConstraintFilter(motion, station.control_period), station.control_period)

@@ -21,8 +21,7 @@ from guiderail.diagrams.tasks.options import (
     in_ring,
 )
 from guiderail.models.common.transforms import DEGREE, MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION
+from guiderail.models.objects.bnc_connector import FRICTION, BncDimensions
 
 # Smallest and largest offset of the jack [m].
 OFFSET_RANGES = {

@@ -42,10 +42,18 @@ from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
+from guiderail.models.objects.bnc_connector import (
+    FRICTION,
+    JACK_SDF,
+    PLUG_SDF,
+    TOUCHING,
+    BncDimensions,
+    folder_of,
+    jack_surfaces,
+    plug_surfaces,
+)
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
-from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, TOUCHING, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 

@@ -9,8 +9,7 @@ from pydantic import Field
 from guiderail.diagrams.envs.options import Number, Pair, increases
 from guiderail.diagrams.tasks.options import FORCE_LIMITS, ForceOptions
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
-from guiderail.models.objects.grid_clamp.sdf import FRICTION
+from guiderail.models.objects.grid_clamp import FRICTION, GridClampDimensions
 
 # Contact force above which an episode ends [N]. An unbounded impedance of 1500 N/m does not reach this force: the
 # template's cuboid is 8 mm wide, and ends 6 mm below the target and 18 mm below a clamp on the table.

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import Field
 
 from guiderail.diagrams.envs.options import Number, TaskOptions
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 
 DEFAULT_GEOMETRY = PassageGeometry()
 SECOND_OBSTACLE = (0.446, 0.78)  # [m] center, on the mean demonstration, midway between the gap and the goal

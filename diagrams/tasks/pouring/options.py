@@ -13,7 +13,7 @@ from pydrake.math import RigidTransform
 from guiderail.diagrams.envs.options import Integer, Number, Numbers, Pair, ResetOptions, TaskOptions
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.pouring.vessels import MUG, Ball
+from guiderail.models.objects.pouring import MUG, Ball
 from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]

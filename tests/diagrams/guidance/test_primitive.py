@@ -257,7 +257,7 @@ def test_horizon_and_history_are_at_most_200_steps(option):
 @pytest.mark.parametrize("kind", ["kmp", "kgrl", "skgrl"])
 def test_motion_constraints_bound_the_primitives_commands(skill, kind):
     disc = Sphere(skill.reference.means[30], 0.03)
-    motion = MotionConstraints(skill.constraints, [disc], (), [0.3, 0.3], [3.0, 3.0])
+    motion = MotionConstraints(skill.constraints, [disc], [0.3, 0.3], [3.0, 3.0])
     guidance = build(kind, replace(skill, motion=motion))
     rng = np.random.default_rng(0)
     commands, _ = rollout(guidance, np.repeat(rng.uniform(-1, 1, (STEPS // 5, 2)), 5, axis=0))

@@ -13,8 +13,8 @@ from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, str
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.objects.grid_clamp import GridClampDimensions
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 

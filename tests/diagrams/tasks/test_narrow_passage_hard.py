@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
 from guiderail.diagrams.tasks.narrow_passage.task import scripted_slalom
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.tools.evaluation.baselines import BASELINES, constant_policy, zero_policy
 from guiderail.tools.evaluation.rollout import rollout
 

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 MARGIN = 0.02
