@@ -37,8 +37,7 @@ from guiderail.diagrams.tasks.registry import (
 )
 from guiderail.models.common.arrays import parse_number
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import find_plugins
-from guiderail.models.common.registry import did_you_mean, find_class
+from guiderail.models.common.registry import did_you_mean, find_class, find_plugins
 
 _LOGGER = logging.getLogger(__name__)
 _POLICY_FILES = ("policy.json", "policy.safetensors")  # files of a policy in its folder

@@ -19,7 +19,7 @@ from guiderail.diagrams.guidance.primitive import make_law
 from guiderail.diagrams.tasks.registry import TASKS
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_NAMES
-from guiderail.models.laws.skill import PRIMITIVE_FILE, SKILL_FILE
+from guiderail.models.laws.primitive import PRIMITIVE_FILE, SKILL_FILE
 from guiderail.models.policy import Ensemble, Policy
 from guiderail.models.primitives.kernels import DEFAULT_KERNEL
 from guiderail.tools.evaluation.subject import refuse_guidance_change

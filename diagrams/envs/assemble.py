@@ -46,9 +46,8 @@ from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.kernels import make_kernel
 from guiderail.models.primitives.reference import pass_through
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
-from guiderail.systems.reward_system import RewardSystem, RewardTerm
+from guiderail.systems.command_checks import ConstraintViolation
+from guiderail.systems.episode_terms import EpisodeMonitor, RewardSystem, RewardTerm, TerminationTerm
 
 
 def build_prior_knowledge(config: EnvConfig, station: Station) -> PriorKnowledge:
@@ -265,7 +264,7 @@ class Loop:
         image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
         if not terms:
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        from guiderail.systems.image_observation import ImageObservation  # most environments have no image
+        from guiderail.systems.policy_system import ImageObservation  # most environments have no image
 
         space, state = self.add_terms(terms, "state_observation")
         combined = ImageObservation(width, height, state.size())

@@ -17,7 +17,7 @@ from guiderail.models.primitives.gains import authority_gains, residual_gains
 from guiderail.models.primitives.lc_ns_kmp import HISTORY, HORIZON, get_shared_primitive
 
 if TYPE_CHECKING:
-    from guiderail.models.control.keep_out import KeepOut
+    from guiderail.models.control.command_filters import KeepOut
     from guiderail.models.control.motion_constraints import MotionConstraints
     from guiderail.models.laws import StateProgress
     from guiderail.models.templates import SharedControlTemplate

@@ -33,11 +33,9 @@ from guiderail.models.robots import DEFAULT_END_EFFECTOR, DEFAULT_ROBOT
 from guiderail.models.robots.joint_range import JointRange
 from guiderail.models.robots.mounting import add_drives, add_end_effector, add_robot, lighten_rotors
 from guiderail.models.robots.robot import EndEffector, Robot, find_end_effector, find_robot
-from guiderail.systems.external_torque_sensor import ExternalTorqueSensor, JointTorqueErrors
 from guiderail.systems.gripper_command import GripperCommand
-from guiderail.systems.joint_torque_wrench import JointTorqueWrench
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.wrench_sensors import ExternalTorqueSensor, JointTorqueErrors, JointTorqueWrench, WrenchSensor
 
 WRENCH_ESTIMATE_TIME_CONSTANT = 0.05  # filter time constant of a wrench estimated from joint torques [s]
 # Pose half way through a quarter turn of the workpiece, from 90 degrees to 0.

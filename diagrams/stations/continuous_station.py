@@ -9,8 +9,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.systems.body_poses import ContinuousPose
-from guiderail.systems.conversions import PoseFromTransform, SpatialForceFromWrench, TransformFromPose
+from guiderail.systems.poses import ContinuousPose, PoseFromTransform, SpatialForceFromWrench, TransformFromPose
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 

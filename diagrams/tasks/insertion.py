@@ -37,9 +37,9 @@ from guiderail.diagrams.tasks.task import Task, Threshold, World, add_constant, 
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.transforms import MM, POSE_SIZE
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
-from guiderail.systems.body_poses import RelativePoses
+from guiderail.systems.poses import RelativePoses
 from guiderail.systems.wrench_signals import CenterOfPressure
 
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters

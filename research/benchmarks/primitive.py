@@ -238,7 +238,7 @@ def _solvers(size: tuple[int, int, int, int]) -> dict[str, dict[str, Any]]:
 
 def _leaf_system(size: tuple[int, int, int, int], steps: int) -> dict[str, float]:
     """Time the prediction through the output port of `LcNsKmpSystem`, with a new action each time."""
-    from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+    from guiderail.systems.movement_primitive import LcNsKmpSystem
 
     p = _primitive(size, REGIMES["grazing"])
     system = LcNsKmpSystem(p, authority_gains(p), PERIOD)

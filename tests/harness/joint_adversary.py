@@ -17,7 +17,7 @@ from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.command_filter import CommandFilter
+from guiderail.systems.command_checks import CommandFilter
 
 START = np.array([0.0, 0.0, 0.1, 0.7, 0.0, 0.0])
 REACH = np.array([0.5, 0.5, 0.4, 2.5, 0.8, 0.8])  # largest offsets of the desired poses from the start [m, rad]

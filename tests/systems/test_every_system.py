@@ -18,8 +18,7 @@ import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
 from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.command_filters import BarrierFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import BarrierFilter, KeepOut
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.laws import Law, StateProgress
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory

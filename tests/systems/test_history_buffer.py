@@ -7,8 +7,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import nearest_pose
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory
-from guiderail.systems.history import HistoryBuffer
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import HistoryBuffer, LcNsKmpSystem
 
 
 class Counter(LeafSystem):

@@ -12,8 +12,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, check_task_name
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import MissingSiblingError, find_plugins, load_plugin
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import MissingSiblingError, did_you_mean, find_plugins, load_plugin
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.primitives import Demonstrations, LinearConstraints
 
 NUM_STEPS = 400  # points of a demonstration

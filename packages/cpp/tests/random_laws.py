@@ -22,8 +22,8 @@ from guiderail.models.control.wrench import WrenchBound, bounded_wrench, governe
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.templates import load_template, parse_template
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
+from guiderail.systems.command_checks import CommandWatchdog
+from guiderail.systems.wrench_limits import PhaseWrenchLimit
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays

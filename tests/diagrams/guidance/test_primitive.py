@@ -14,7 +14,7 @@ from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import build_guidance, check_guidance
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import StateProgress

@@ -12,7 +12,7 @@ import yaml
 from guiderail.diagrams.envs.options import validate_options
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.files import visible_files
-from guiderail.models.common.plugins import require_sibling
+from guiderail.models.common.registry import require_sibling
 from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.demonstrations import DemonstratedBounds, compute_bounds
 from guiderail.models.primitives.fit import MIN_SHARE, share_within_spread
