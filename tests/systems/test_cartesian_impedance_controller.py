@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydrake.common.value import Value
 from pydrake.geometry import Sphere
-from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
@@ -15,7 +15,6 @@ from pydrake.multibody.plant import (
     MultibodyPlant,
 )
 from pydrake.multibody.tree import (
-    FixedOffsetFrame,
     JacobianWrtVariable,
     PrismaticJoint,
     RevoluteJoint,
@@ -47,7 +46,7 @@ WORKCELL = BncWorkcell()
 class FreeArm:
     """Simulated arm that is commanded to remain at its initial pose, and forces on its tool."""
 
-    def __init__(self, q, *, gains=None, time_step=0.001, ball=False, turned_axes=None):
+    def __init__(self, q, *, gains=None, time_step=0.001, ball=False):
         builder = DiagramBuilder()
         self.plant, _ = AddMultibodyPlantSceneGraph(builder, time_step)
         self.arm = add_arm(self.plant, WORKCELL)
@@ -60,21 +59,9 @@ class FreeArm:
         self.plant.Finalize()
         self.model, arm = controller_model(WORKCELL)
         self.tool_center, self.target = arm.tool_center, arm.target
-        frame = None
-        if turned_axes is not None:
-            self.model, arm = _with_axes(turned_axes)
-            self.tool_center, self.target = arm.tool_center, arm.target
-            frame = self.model.GetFrameByName("axes")
         gains = gains or ImpedanceGains(STIFFNESS, LIMITS, np.array(q, dtype=float))
         self.controller = builder.AddSystem(
-            CartesianImpedanceController(
-                self.model,
-                self.target,
-                self.tool_center,
-                gains,
-                period=time_step,
-                stiffness_frame=frame,
-            )
+            CartesianImpedanceController(self.model, self.target, self.tool_center, gains, period=time_step)
         )
         builder.Connect(
             self.plant.get_state_output_port(self.arm.model), self.controller.get_estimated_state_input_port()
@@ -122,15 +109,6 @@ class FreeArm:
                 callback()
 
 
-def _with_axes(R_WAxes):
-    """Return a plant of the arm with a world-fixed frame `axes` of this rotation, and the arm."""
-    plant = MultibodyPlant(0.0)
-    arm = add_arm(plant, WORKCELL)
-    plant.AddFrame(FixedOffsetFrame("axes", plant.world_frame(), RigidTransform(R_WAxes, [0, 0, 0])))
-    plant.Finalize()
-    return plant, arm
-
-
 def displacement(before, after):
     """Return the translation and the rotation vector of the tool between two poses, in the axes of the target T."""
     X, Y = pose_to_transform(before), pose_to_transform(after)
@@ -141,16 +119,12 @@ def displacement(before, after):
 class Law:
     """Controller of an arm in a random state, and the arguments of its control law."""
 
-    def __init__(self, seed=0, *, turned_axes=None, **options):
+    def __init__(self, seed=0, **options):
         rng = np.random.default_rng(seed)
         self.q, self.v = np.array(POSTURES[1]), 0.2 * rng.standard_normal(7)
         gains = {"wrench_limits": np.full(6, 1e3), "posture": self.q + 0.1 * rng.standard_normal(7)}
         self.gains = ImpedanceGains(STIFFNESS, **(gains | {k: options.pop(k) for k in [*options] if k in FIELDS}))
-        if turned_axes is None:
-            model, arm = controller_model(WORKCELL)
-        else:
-            model, arm = _with_axes(turned_axes)
-            options["stiffness_frame"] = model.GetFrameByName("axes")
+        model, arm = controller_model(WORKCELL)
         context = model.CreateDefaultContext()
         model.SetPositionsAndVelocities(context, [*self.q, *self.v])
         X_WT, X_WP = arm.target.CalcPoseInWorld(context), arm.tool_center.CalcPoseInWorld(context)
@@ -167,7 +141,6 @@ class Law:
             "K": STIFFNESS,
             "damping_ratio": self.gains.damping_ratio,
             "wrench_limits": self.gains.wrench_limits,
-            "R_axes": None if turned_axes is None else (R_TW @ turned_axes).matrix(),
             "p_error": X_TPd.translation() - self.X_TP.translation(),
             "eta": eta,
             "epsilon": epsilon,
@@ -205,18 +178,12 @@ FIELDS = [field.name for field in fields(ImpedanceGains)]
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("turned_axes", [None, RotationMatrix(RollPitchYaw(0.4, -0.3, 0.7))], ids=["T", "turned"])
-def test_torques_are_those_of_the_law(seed, turned_axes):
-    law = Law(seed, turned_axes=turned_axes)
+def test_torques_are_those_of_the_law(seed):
+    law = Law(seed)
     assert not law.check().is_saturated
     np.testing.assert_array_equal(law["pose"], transform_to_pose(law.X_TP))
-    limited = Law(seed, turned_axes=turned_axes, wrench_limits=np.full(6, 3.0))
+    limited = Law(seed, wrench_limits=np.full(6, 3.0))
     assert limited.check().is_saturated
-
-
-def test_gains_have_their_documented_defaults():
-    gains = Law().gains
-    assert (gains.damping_ratio, gains.posture_stiffness, gains.posture_damping) == (1.0, 10.0, 5.0)
 
 
 def test_gravity_is_compensated_only_when_requested():
@@ -271,22 +238,6 @@ def test_static_displacement_is_compliance_times_wrench(q):
     actual = displacement(before, arm.pose())
     assert np.linalg.norm(actual[:3] - expected[:3]) < 0.02 * np.linalg.norm(expected[:3])
     assert np.linalg.norm(actual[3:] - expected[3:]) < 0.02 * np.linalg.norm(expected[3:])
-
-
-def test_stiffness_applies_in_the_axes_of_a_rotated_frame():
-    """The soft direction is a world axis that is parallel to no joint and no axis of T."""
-    R_WAxes = RotationMatrix.MakeZRotation(0.7) @ RotationMatrix.MakeXRotation(0.4)
-    K = np.diag([400.0, 2000.0, 2000.0, 40.0, 40.0, 40.0])
-    arm = FreeArm(
-        POSTURES[0], gains=ImpedanceGains(K, LIMITS, np.array(POSTURES[0])), time_step=0.005, turned_axes=R_WAxes
-    )
-    before = arm.pose()
-    force = np.array([5.0, 5.0, 0.0])
-    arm.push(force)
-    arm.advance(4.0)
-    R = R_WAxes.matrix()
-    expected = R @ np.linalg.inv(K[:3, :3]) @ R.T @ force
-    np.testing.assert_allclose(displacement(before, arm.pose())[:3], expected, atol=0.02 * np.linalg.norm(expected))
 
 
 def test_energy_never_increases_after_a_push():
@@ -365,8 +316,7 @@ def test_last_valid_pose_is_followed_when_commands_stop():
 
 @pytest.mark.parametrize("coordinate", [np.nan, np.inf, 1e300, 1.001e6])
 def test_command_is_ignored_when_it_is_invalid(coordinate):
-    """With a rotated stiffness frame, a wrench that overflows would become NaN in the rotation."""
-    arm = FreeArm(POSTURES[0], time_step=0.005, turned_axes=RotationMatrix.MakeZRotation(0.7))
+    arm = FreeArm(POSTURES[0], time_step=0.005)
     start = arm.pose()
     arm.command(np.array([coordinate, -coordinate, coordinate, 0.0, 0.0, 0.0]))
     arm.advance(0.5)
@@ -502,27 +452,6 @@ def test_estimated_state_that_is_not_finite_is_refused(index, number):
     controller.get_estimated_state_input_port().FixValue(context, np.where(np.arange(12) == index, number, 0.0))
     with pytest.raises(InputError, match="joint positions and velocities must be finite"):
         controller.get_generalized_force_output_port().Eval(context)
-
-
-def test_controller_has_its_ports_and_direct_feedthrough():
-    model, arm = controller_model(WORKCELL)
-    system = CartesianImpedanceController(
-        model, arm.target, arm.tool_center, ImpedanceGains(STIFFNESS, LIMITS, np.zeros(7)), period=0.005
-    )
-    assert [system.get_input_port(i).get_name() for i in range(3)] == [
-        "desired_pose",
-        "estimated_state",
-        "command_time",
-    ]
-    assert [system.get_output_port(i).get_name() for i in range(5)] == [
-        "generalized_force",
-        "pose",
-        "impedance_wrench",
-        "saturation",
-        "command_timed_out",
-    ]
-    desired, pose = system.get_desired_pose_input_port(), system.get_pose_output_port()
-    assert not system.HasDirectFeedthrough(desired.get_index(), pose.get_index())
 
 
 def _axis_angle(axis, angle):
