@@ -154,8 +154,8 @@ def outside_limit(arm, posture, joint, excess):
 BENT, STRETCHED = READY_POSTURE, np.zeros(7)
 
 
-@pytest.mark.parametrize("excess", [1e-4, 0.02, 0.3])
-@pytest.mark.parametrize(("posture", "joint"), [(BENT, 1), (BENT, 3), (BENT, 5), (STRETCHED, 1)])
+@pytest.mark.parametrize("excess", [1e-4, 0.3])
+@pytest.mark.parametrize(("posture", "joint"), [(BENT, 3), (STRETCHED, 1)])
 def test_joint_outside_its_limit_returns_without_a_jump(arm, posture, joint, excess):
     """A person may have moved the joint there by hand. The stretched posture is also singular."""
     q, goal = outside_limit(arm, posture, joint, excess)
@@ -220,16 +220,6 @@ def test_command_is_ignored_when_its_time_stamp_is_invalid(arm, time):
     rig.advance(0.005)
     np.testing.assert_array_equal(rig.joints, rig.q_start)
     assert rig.command_timed_out == 1.0
-
-
-def test_time_stamps_change_nothing_when_commands_are_current(arm):
-    without_time, with_time = Rig(arm), Rig(arm)
-    without_time.command(GOAL)
-    for step in range(20):
-        with_time.command(GOAL, time=0.01 * step)
-        for rig in (without_time, with_time):
-            rig.simulator.AdvanceTo(0.01 * (step + 1))
-    np.testing.assert_array_equal(with_time.joints, without_time.joints)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, Squ
 from guiderail.models.primitives.deviation import outputs_at
 from guiderail.models.primitives.fit import LONG, MIN_SHARE, fit, share_within_spread
 from guiderail.models.primitives.mixture import information_criteria
-from oracles.handwriting import LETTERS, make_correlated, share_within_deviation, write_letter
+from oracles.handwriting import make_correlated, share_within_deviation, write_letter
 
 
 def motion(selection):
@@ -22,7 +22,7 @@ PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 
 # `letters.py` in this folder prints the selection for letters with more demonstrations and steps.
-@pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
+@pytest.mark.parametrize(("letter", "page"), list(zip("Ne", PAGES, strict=True)))
 def test_fitted_letter_stays_within_the_demonstrations(letter, page):
     selection = fit(write_letter(letter, count=4, steps=60, **page))
     assert selection.is_within_spread
@@ -169,7 +169,7 @@ def test_long_recordings_are_thinned_out_before_the_mixture():
     np.testing.assert_allclose(long.reference.means[[0, -1]], short.reference.means[[0, -1]], atol=2e-3)
 
 
-@pytest.mark.parametrize("steps", [401, 1000, 5000])
+@pytest.mark.parametrize("steps", [401, 5000])
 def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch):
     """The cost of expectation maximization is bounded by the number of samples that it sees."""
     sizes = []
