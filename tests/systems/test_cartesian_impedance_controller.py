@@ -12,12 +12,9 @@ from pydrake.multibody.plant import (
     AddMultibodyPlantSceneGraph,
     CoulombFriction,
     ExternallyAppliedSpatialForce,
-    MultibodyPlant,
 )
 from pydrake.multibody.tree import (
     JacobianWrtVariable,
-    PrismaticJoint,
-    RevoluteJoint,
     SpatialInertia,
 )
 from pydrake.systems.analysis import Simulator
@@ -30,6 +27,7 @@ from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController, ImpedanceGains, Payload
 from guiderail.systems.support.drake_multibody import orientation_error, pose_to_transform, transform_to_pose
+from oracles.plants import six_axes
 
 STIFFNESS = np.diag([1500.0, 1000.0, 800.0, 40.0, 30.0, 30.0])
 LIMITS = np.array([40.0, 40.0, 40.0, 3.0, 3.0, 3.0])
@@ -363,25 +361,6 @@ def test_gains_at_their_limits_are_accepted():
     ImpedanceGains(stiffness.tolist(), [1e-9] * 6, np.zeros(7), damping_ratio=1e-9, **posture_gains)
 
 
-def six_axes(motors):
-    """Return a plant of three prismatic and three revolute axes, and its last body.
-
-    Args:
-        motors: Axis of each motor; the motor of axis i has the effort limit i + 1 [N, Nm].
-    """
-    plant, axes = MultibodyPlant(0.0), []
-    tool = plant.world_body()
-    for index, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
-        child = plant.AddRigidBody(f"link{index}", SpatialInertia.SolidSphereWithMass(0.3, 0.05))
-        kind = PrismaticJoint if index < 3 else RevoluteJoint
-        axes.append(plant.AddJoint(kind(f"axis{index}", tool.body_frame(), child.body_frame(), axis)))
-        tool = child
-    for index in motors:
-        plant.AddJointActuator(f"motor{len(plant.GetJointActuatorIndices())}", axes[index], index + 1.0)
-    plant.Finalize()
-    return plant, tool
-
-
 def make_controller(plant, tool):
     """Return a controller of this plant whose target is the world frame."""
     gains = ImpedanceGains(STIFFNESS, np.full(6, 1e6), np.zeros(6))
@@ -390,7 +369,7 @@ def make_controller(plant, tool):
 
 @pytest.mark.parametrize("motors", [range(6), (5, 4, 3, 2, 1, 0), (2, 0, 1, 5, 3, 4)])
 def test_each_joint_has_the_limit_of_its_own_motor(motors):
-    plant, tool = six_axes(motors)
+    plant, tool = six_axes(motors, range(1, 7))
     controller = make_controller(plant, tool)
     context = controller.CreateDefaultContext()
     controller.get_desired_pose_input_port().FixValue(context, [5.0, 5.0, 5.0, 0.0, 0.0, 0.0])
@@ -411,7 +390,7 @@ def test_plant_is_refused_without_one_motor_per_joint(motors):
 @pytest.mark.parametrize("index", [0, 6])
 def test_estimated_state_that_is_not_finite_is_refused(index, number):
     """Drake would end the process for such a state."""
-    controller = make_controller(*six_axes(range(6)))
+    controller = make_controller(*six_axes())
     context = controller.CreateDefaultContext()
     controller.get_desired_pose_input_port().FixValue(context, np.zeros(6))
     controller.get_estimated_state_input_port().FixValue(context, np.where(np.arange(12) == index, number, 0.0))

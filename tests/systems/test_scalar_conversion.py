@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 from pydrake.autodiffutils import ExtractGradient, ExtractValue, InitializeAutoDiff
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.multibody.tree import PrismaticJoint, RevoluteJoint, SpatialInertia
 from pydrake.symbolic import Expression, Variable
 from pydrake.systems.framework import DiagramBuilder
 
@@ -13,6 +11,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance_torques
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.systems.support.scalar_conversion import differentiable_torques
+from oracles.plants import six_axes
 from oracles.prerequisites import changed_outputs
 from oracles.systems import check_stale_outputs
 
@@ -20,27 +19,14 @@ STEP = 1e-6
 LIMITS = np.array([60.0, 60.0, 60.0, 6.0, 6.0, 6.0])
 
 
-def make_plant():
-    """Return a plant with three prismatic and three revolute joints."""
-    plant = MultibodyPlant(0.0)
-    body = plant.world_body()
-    for index, axis in enumerate([*np.eye(3), *np.eye(3)[::-1]]):
-        child = plant.AddRigidBody(f"link{index}", SpatialInertia.SolidSphereWithMass(0.3 + 0.1 * index, 0.05))
-        kind = PrismaticJoint if index < 3 else RevoluteJoint
-        joint = plant.AddJoint(kind(f"axis{index}", body.body_frame(), child.body_frame(), axis))
-        plant.AddJointActuator(f"motor{index}", joint, 200.0)
-        body = child
-    plant.Finalize()
-    return plant
-
-
 def make_controller(bound=None, **options):
-    plant = make_plant()
-    tool = plant.GetBodyByName("link5").body_frame()
+    plant, link = six_axes()
     K = np.diag([400.0, 300.0, 500.0, 20.0, 25.0, 15.0])
     K[0, 1] = K[1, 0] = 60.0
     gains = systems.ImpedanceGains(K, LIMITS, posture=np.full(6, 0.1), damping_ratio=0.7, bound=bound)
-    return systems.CartesianImpedanceController(plant, plant.world_frame(), tool, gains, period=0.01, **options)
+    return systems.CartesianImpedanceController(
+        plant, plant.world_frame(), link.body_frame(), gains, period=0.01, **options
+    )
 
 
 def state_and_pose(seed):
@@ -118,7 +104,7 @@ def test_torque_at_its_limit_is_not_saturated(share, is_saturated):
 def test_closed_loop_has_derivatives_of_its_motion():
     """The time derivatives of a robot under control, with a residual on the command, with respect to the action."""
     builder = DiagramBuilder()
-    plant = builder.AddNamedSystem("plant", make_plant())
+    plant = builder.AddNamedSystem("plant", six_axes()[0])
     controller = builder.AddNamedSystem("controller", make_controller())
     residual = builder.AddNamedSystem("residual", systems.Residual(np.full(6, 0.05)))
     terms = [
