@@ -209,7 +209,7 @@ def _resolve(task: type[Task], options: Mapping[str, Any]) -> EnvConfig:
     models = option_models(task, chosen["guidance"], chosen["station"], provides)
     known = {option for model in models.values() for option in option_fields(model)}
     _check_declared_options(task, provides, known)
-    defaults, preset, options = (flat_options(models.values(), given) for given in settings)
+    defaults, preset, options = (flat_options(given, task.model_fields) for given in settings)
     _check_given_options(task, options, known)
     parts: dict[str, Any] = dict(validate_tree(models, {**defaults, **preset, **options, **chosen}, name))
     common = parts.pop("common")

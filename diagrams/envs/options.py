@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping
+from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import fields
 from functools import lru_cache
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
@@ -80,23 +80,19 @@ def option_fields(model: Any) -> dict[str, str]:
     return {entries.get(field, field): field for field in names}
 
 
-def flat_options(models: Iterable[Any], options: Mapping[str, Any]) -> dict[str, Any]:
+def flat_options(options: Mapping[str, Any], plain: Collection[str] = ()) -> dict[str, Any]:
     """Return options with the entries of every structured option as options of their own.
 
-    A mapping as the value of `history`, for example, becomes the options "history", "history.variance", ….
-
-    Args:
-        models: Models, or dataclasses, that declare the options.
-        options: Options by name. A name that no model declares remains as it is.
+    A mapping as the value of `history`, for example, becomes the options "history", "history.variance", …. Mappings of
+    entries, such as "kernel.parameters", and of the options `plain` remain values.
 
     Raises:
         InputError: If an option is given both in a mapping and by its own name, with different values.
     """
-    structured = {name.partition(".")[0] for model in models for name in option_fields(model) if "." in name}
     flat: dict[str, Any] = {}
     for name, value in options.items():
         entries = {name: value}
-        if name in structured and isinstance(value, Mapping):
+        if isinstance(value, Mapping) and "." not in str(name) and name not in plain:
             entries = {f"{name}.{entry}": content for entry, content in value.items()}
         for entry, content in entries.items():
             group, _, last = str(entry).partition(".")

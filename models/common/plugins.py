@@ -5,10 +5,9 @@ points, as "KIND:NAME" = "module:attribute":
 
     [project.entry-points.guiderail]
     "station:mujoco" = "guiderail_mujoco.station:MujocoStation"
-    "station_options:mujoco" = "guiderail.diagrams.stations.options:ContactOptions"
 
-The kinds task_options, station_options, guidance_options and learner_config name the class of an entry's options in a
-module that imports neither Drake nor PyTorch, so that options can be checked before slow imports.
+The kind learner_config names the class of a learner's settings in a module that does not import PyTorch, so that they
+can be checked before this slow import.
 """
 
 from collections.abc import Iterator
@@ -34,20 +33,14 @@ SIBLINGS = {
 
 _DIAGRAMS, _LEARNING, _ROBOTS = "guiderail.diagrams", "guiderail.tools.learning", "guiderail.models.robots"
 BUILT_IN = {
-    "task:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.task:BncConnector",
-    "task:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.task:GridClamp",
-    "task:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.task:NarrowPassage",
-    "task:Pouring": f"{_DIAGRAMS}.tasks.pouring.task:Pouring",
-    "task_options:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.options:BncOptions",
-    "task_options:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.options:GridClampOptions",
-    "task_options:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.options:NarrowPassageOptions",
-    "task_options:Pouring": f"{_DIAGRAMS}.tasks.pouring.options:PouringOptions",
+    "task:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector:BncConnector",
+    "task:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp:GridClamp",
+    "task:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage:NarrowPassage",
+    "task:Pouring": f"{_DIAGRAMS}.tasks.pouring:Pouring",
     "station:arm": f"{_DIAGRAMS}.stations.arm:ArmStation",
     "station:gantry": f"{_DIAGRAMS}.stations.gantry:GantryStation",
     "station:plane": f"{_DIAGRAMS}.stations.plane:PlaneStation",
     "station:pouring": f"{_DIAGRAMS}.stations.pouring:PouringStation",
-    "station_options:arm": f"{_DIAGRAMS}.stations.options:ArmOptions",
-    "station_options:gantry": f"{_DIAGRAMS}.stations.options:GantryOptions",
     "guidance:kgrl": f"{_DIAGRAMS}.guidance.primitive:kgrl",
     "guidance:kmp": f"{_DIAGRAMS}.guidance.primitive:kmp",
     "guidance:none": f"{_DIAGRAMS}.guidance.sct:unguided",

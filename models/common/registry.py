@@ -156,6 +156,10 @@ class Registry(Generic[Entry]):
         names = (name for name, entry in self._entries.items() if entry is value)
         return next(names, next((name for name, point in points if point.value == declared), None))
 
+    def is_loaded(self, name: str) -> bool:
+        """Return True if the entry of a name was registered or imported in this process."""
+        return name in self._entries
+
     def is_packaged(self, name: str) -> bool:
         """Return True if the name is that of a plug-in of guiderail or of a sibling distribution."""
         return name in self._packaged
@@ -178,23 +182,6 @@ class Registry(Generic[Entry]):
     def _plugins(self) -> list[tuple[str, metadata.EntryPoint]]:
         """Name and entry point of every plug-in of this kind."""
         return [] if self._plugin is None else list(find_plugins(self._plugin))
-
-
-def find_class(kind: str, name: str, registry: Registry[Any], attribute: str = "") -> Any:
-    """Return the class of an entry's options, from the plug-in `kind` without importing the entry if there is one.
-
-    Args:
-        kind: Kind of the plug-in, such as "learner_config".
-        name: Name of the entry.
-        registry: Registry of the entry.
-        attribute: Attribute of the entry that has this class; by default, the entry is the class.
-    """
-    if name not in registry._entries:
-        for found, point in find_plugins(kind):
-            if found == name:
-                return point.load()
-    entry = registry.get(name)
-    return getattr(entry, attribute) if attribute else entry
 
 
 def check_callable(name: str, value: object) -> None:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
@@ -16,8 +16,9 @@ from pydantic.dataclasses import dataclass
 from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.registry import did_you_mean, find_class
-from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, reject_bool
+from guiderail.models.common.plugins import find_plugins
+from guiderail.models.common.registry import did_you_mean
+from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
 MAX_EPISODES = 10**9  # largest number of episodes of a run
@@ -65,6 +66,10 @@ class OffPolicyConfig(LearnerConfig):
     }
 
     algorithm: str = "tqc"  # registered name of the learner
+    demonstration_episodes: NonNegative = 0  # first episodes, in which a demonstrator acts
+    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
+    pipelined: bool = False  # learn in a second process, with weights that are one episode older
+    num_envs: Annotated[NonNegative, Field(le=1024)] = 0  # processes that simulate episodes; 0: only this one
     learning_rate: Rate = 3e-4  # learning rate of actor, critics and entropy coefficient
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"  # interval that gamma discounts
@@ -146,12 +151,6 @@ class OnPolicyConfig(LearnerConfig):
     batch_size: BatchSize = 64  # transitions
     net_arch: NetArch = (64, 64)  # units of the hidden layers
 
-    def __post_init__(self) -> None:
-        if self.demonstration_episodes:
-            raise InputError(f"{self.algorithm} learns from its own actions: leave demonstration_episodes out")
-        if self.symmetry:
-            raise InputError(f"{self.algorithm} learns from no symmetric copies: leave symmetry out")
-
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class PpoConfig(OnPolicyConfig):
@@ -178,6 +177,7 @@ class BcConfig(LearnerConfig):
 
     algorithm: str = "bc"
     demonstration_episodes: NonNegative = 10  # first episodes in which the demonstrator acts, at least 1
+    symmetry: Symmetries = False  # symmetry data augmentation; "near" also uses approximate symmetries of the task
     learning_rate: Rate = 1e-3
     gradient_steps: Positive = 5000  # gradient steps of the one training, after the last demonstration
     batch_size: BatchSize = 64  # transitions
@@ -267,13 +267,16 @@ def resolve_preset(
     elif not issubclass(kind, OffPolicyConfig):
         raise InputError(f"the preset {preset} has settings that {algorithm} does not have: leave --preset out")
     base = {} if preset is None else setting_values(PRESETS[preset])
-    return make_config(algorithm, base | flat_options([kind], settings or {}))
+    return make_config(algorithm, base | flat_options(settings or {}))
 
 
 def config_class(algorithm: str) -> type[LearnerConfig]:
-    """Return the class of a learner's settings; for a learner of guiderail, PyTorch is not imported."""
-    kind: type[LearnerConfig] = find_class("learner_config", algorithm, LEARNERS, "Config")
-    return kind
+    """Return the class of a learner's settings; for a plug-in `learner_config`, PyTorch is not imported."""
+    if not LEARNERS.is_loaded(algorithm):
+        for name, point in find_plugins("learner_config"):
+            if name == algorithm:
+                return cast("type[LearnerConfig]", point.load())
+    return cast("type[LearnerConfig]", LEARNERS.get(algorithm).Config)
 
 
 def default_preset(algorithm: str) -> str | None:
@@ -285,7 +288,7 @@ def make_config(algorithm: str, settings: Mapping[str, Any]) -> LearnerConfig:
     """Validate settings against the configuration class of a learner; missing settings get its defaults."""
     kind = config_class(algorithm)
     names = option_fields(kind)
-    values = {**flat_options([kind], settings), "algorithm": algorithm}
+    values = {**flat_options(settings), "algorithm": algorithm}
     for name in values:
         if name not in names:
             known = names.keys() - {"algorithm"}
@@ -317,11 +320,6 @@ def check_episodes(episodes: object) -> int:
 def setting_values(config: LearnerConfig) -> dict[str, Any]:
     """Return the settings of a configuration by name."""
     return {name: getattr(config, field) for name, field in option_fields(type(config)).items()}
-
-
-def flat_settings(settings: Mapping[str, Any] | None) -> dict[str, Any]:
-    """Return settings with the entries of structured settings as settings of their own; see `flat_options`."""
-    return flat_options([OffPolicyConfig], settings or {})
 
 
 def config_values(config: LearnerConfig) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.station import (
     tare_steps,
     whole_multiple,
 )
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError

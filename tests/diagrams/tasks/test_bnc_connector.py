@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env, make_prior_knowledge
-from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT, BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks.bnc_connector import (
+    ALIGNMENT,
     NUM_STEPS,
+    BncUncertainty,
     reference_trajectory,
     scripted_torque_search,
 )

@@ -5,11 +5,9 @@ import pytest
 
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.bnc_connector import options as bnc_options
-from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory, scripted_center_of_pressure
-from guiderail.diagrams.tasks.grid_clamp import task as grid_clamp_options
-from guiderail.diagrams.tasks.grid_clamp.task import scripted_gentle_search, straight_descent
+from guiderail.diagrams.tasks import bnc_connector, grid_clamp
+from guiderail.diagrams.tasks.bnc_connector import BncUncertainty, reference_trajectory, scripted_center_of_pressure
+from guiderail.diagrams.tasks.grid_clamp import scripted_gentle_search, straight_descent
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM
@@ -18,7 +16,7 @@ from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 
-HARD = {"BncConnector": bnc_options.HARD, "GridClamp": grid_clamp_options.HARD}
+HARD = {"BncConnector": bnc_connector.HARD, "GridClamp": grid_clamp.HARD}
 NEW_RUN = {"options": {"new_run": True}, "seed": 300_000}
 
 RUN = {}

@@ -6,9 +6,9 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.grid_clamp.options import COLLISION_FORCE
-from guiderail.diagrams.tasks.grid_clamp.task import (
+from guiderail.diagrams.tasks.grid_clamp import (
     CENTER,
+    COLLISION_FORCE,
     MAX_TRACKING_ERROR,
     SCALE,
     STIFFNESS,

@@ -13,7 +13,7 @@ import guiderail
 from guiderail.diagrams.envs import scene
 from guiderail.diagrams.envs.config import prior_of
 from guiderail.diagrams.guidance.registry import possible_guidance
-from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage
+from guiderail.diagrams.tasks.narrow_passage import NarrowPassage
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.narrow_passage.options import HARD, NarrowPassageOptions
-from guiderail.diagrams.tasks.narrow_passage.task import scripted_slalom
+from guiderail.diagrams.tasks.narrow_passage import HARD, NarrowPassageOptions, scripted_slalom
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.tools.evaluation.baselines import BASELINES, constant_policy, zero_policy

@@ -13,7 +13,7 @@ from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.guidance.registry import GUIDANCE, register_guidance
 from guiderail.diagrams.stations.impedance_control import WRENCH_RATE, make_phase_wrench_limit
 from guiderail.diagrams.stations.station import Impedance, max_wrench
-from guiderail.diagrams.tasks.grid_clamp.task import GridClamp
+from guiderail.diagrams.tasks.grid_clamp import GridClamp
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.models.common.errors import InputError
 from guiderail.models.templates import Transition, load_template

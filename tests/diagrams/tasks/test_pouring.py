@@ -6,7 +6,7 @@ import pytest
 
 import guiderail  # noqa: F401 (registers the environments)
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.task import START_HEIGHT, START_RADIUS, scripted_pour
+from guiderail.diagrams.tasks.pouring import START_HEIGHT, START_RADIUS, scripted_pour
 from guiderail.models.common.errors import InputError
 from research.action_fuzzing.pouring import ADVERSARIES
 

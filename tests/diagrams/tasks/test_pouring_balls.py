@@ -6,7 +6,7 @@ import pytest
 from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.task import scripted_pour_aimed
+from guiderail.diagrams.tasks.pouring import scripted_pour_aimed
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.pouring.vessels import Ball
 

@@ -5,8 +5,14 @@ import pytest
 from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.pouring.options import HARD, MAX_MUG_ERROR, frames_of, make_template
-from guiderail.diagrams.tasks.pouring.task import scripted_pour_aimed, scripted_pour_blind
+from guiderail.diagrams.tasks.pouring import (
+    HARD,
+    MAX_MUG_ERROR,
+    frames_of,
+    make_template,
+    scripted_pour_aimed,
+    scripted_pour_blind,
+)
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import pose_to_transform, transform_to_pose
 from guiderail.tools.evaluation.baselines import BASELINES, BaselinePolicy

@@ -6,8 +6,16 @@ from pydrake.math import RigidTransform
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
-from guiderail.diagrams.tasks.pouring.options import MAX_MUG_ERROR, POUR_LINE, THESIS, frames_of, make_template
-from guiderail.diagrams.tasks.pouring.task import scripted_pour, scripted_pour_aimed, scripted_pour_from_above
+from guiderail.diagrams.tasks.pouring import (
+    MAX_MUG_ERROR,
+    POUR_LINE,
+    THESIS,
+    frames_of,
+    make_template,
+    scripted_pour,
+    scripted_pour_aimed,
+    scripted_pour_from_above,
+)
 from guiderail.models.common.errors import InputError
 
 AIM_SPEEDS = {"aim_speed": 1.0, "pour_speed": 0.3}

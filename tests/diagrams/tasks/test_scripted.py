@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector import task as connector
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks import bnc_connector as connector
+from guiderail.diagrams.tasks.bnc_connector import (
     POSE_CENTER,
     POSE_SCALE,
     REACH,
@@ -12,7 +12,7 @@ from guiderail.diagrams.tasks.bnc_connector.task import (
     scripted_center_of_pressure,
     scripted_torque_search,
 )
-from guiderail.diagrams.tasks.grid_clamp.task import CENTER, LANE_ENDS, LANES, SCALE, scripted_search
+from guiderail.diagrams.tasks.grid_clamp import CENTER, LANE_ENDS, LANES, SCALE, scripted_search
 from guiderail.diagrams.tasks.options import CENTER_OF_PRESSURE_SCALE, COMMAND_SCALE
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM

@@ -91,8 +91,6 @@ def test_on_policy_settings_reach_the_algorithm():
     ppo = make(make_config("ppo", {"n_epochs": 3, "clip_range": 0.1, "n_steps": 32, "gae_lambda": 0.8}))
     assert (ppo.model.n_epochs, ppo.model.clip_range(1.0), ppo.model.gae_lambda) == (3, 0.1, 0.8)
     assert make(make_config("trpo", {"target_kl": 0.02})).model.target_kl == 0.02
-    with pytest.raises(InputError, match="ppo learns from its own actions: leave demonstration_episodes out"):
-        make_config("ppo", {"demonstration_episodes": 3})
     with pytest.raises(InputError, match="preset tqc_fast has settings that ppo does not have"):
         resolve_preset("tqc_fast", "ppo")
 
@@ -186,8 +184,10 @@ def test_on_policy_learner_discards_the_action_before_a_failure():
         ({"demonstration_episodes": 1, "init_from": "runs/a"}, "demonstration_episodes does not work with init_from"),
         ({"algorithm": "crossq", "net_arch.dropout": 0.01}, "leave net_arch.dropout=0.01 out"),
         ({"algorithm": "crossq", "demonstration_fraction": 0.5}, "needs demonstrations"),
-        ({"algorithm": "ppo", "symmetry": True}, "ppo learns from no symmetric copies: leave symmetry out"),
-        ({"algorithm": "trpo", "symmetry": "near"}, "trpo learns from no symmetric copies"),
+        *(
+            ({"algorithm": "ppo", name: 1}, f"ppo has no setting '{name}'")
+            for name in ("demonstration_episodes", "symmetry", "pipelined", "num_envs")
+        ),
     ],
 )
 def test_settings_that_exclude_each_other_are_named(settings, message):

@@ -23,7 +23,7 @@ from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.guidance.prior import Prior
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Station
 from guiderail.diagrams.stations.workcell import MovableWorkcell
-from guiderail.diagrams.tasks.bnc_connector.options import BncUncertainty
+from guiderail.diagrams.tasks.bnc_connector import BncUncertainty
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import (
     HOLD_DISTANCE,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import MM, POSE_NAMES
 from guiderail.models.objects.bnc_connector import demonstrations
