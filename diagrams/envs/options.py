@@ -30,12 +30,6 @@ STANDARD = "standard"
 """Default difficulty; every task has it."""
 
 
-def check_options_class(owner: str, attribute: str, given: object, kind: type[Options]) -> None:
-    """Raise an InputError unless an attribute of a task, a station or a guidance is a subclass of `kind`."""
-    if not (isinstance(given, type) and issubclass(given, kind)):
-        raise InputError(f"{attribute} of {owner} must be a subclass of {kind.__name__}, not {brief(given)}")
-
-
 class Options(BaseModel):
     """Base class of option models: immutable; refuses undeclared names, NaN and infinite numbers.
 

@@ -66,12 +66,12 @@ BUILT_IN = {
     "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
     "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
     "learner_config:bc": f"{_LEARNING}.learner_config:BcConfig",
-    "learner_config:crossq": f"{_LEARNING}.learner_config:CrossQConfig",
+    "learner_config:crossq": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:ppo": f"{_LEARNING}.learner_config:PpoConfig",
     "learner_config:sac": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:td3": f"{_LEARNING}.learner_config:Td3Config",
+    "learner_config:td3": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:tqc": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:trpo": f"{_LEARNING}.learner_config:TrpoConfig",
+    "learner_config:trpo": f"{_LEARNING}.learner_config:OnPolicyConfig",
 }
 """Plug-ins of this package: "module:attribute" by "kind:name"."""
 

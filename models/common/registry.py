@@ -184,6 +184,16 @@ class Registry(Generic[Entry]):
         return [] if self._plugin is None else list(find_plugins(self._plugin))
 
 
+def check_kind(kind: type) -> Callable[[str, object], None]:
+    """Return a `check` of a registry that refuses an entry that is no instance of `kind`, such as a plain function."""
+
+    def check(name: str, entry: object) -> None:
+        if not isinstance(entry, kind):
+            raise InputError(f"the entry {name!r} is a {kind.__name__}, which a decorator makes, not {brief(entry)}")
+
+    return check
+
+
 def check_callable(name: str, value: object) -> None:
     """Raise an InputError unless a value is a function or a class; for the `check` of a registry."""
     if not callable(value):

@@ -106,29 +106,7 @@ class OffPolicyConfig(LearnerConfig):
             raise InputError("demonstration_episodes does not work with init_from: leave one of them out")
         if self.device == "cuda" and self.num_envs:
             raise InputError("parallel actors are forks, which cannot use cuda: leave num_envs or device=cuda out")
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class Td3Config(OffPolicyConfig):
-    """Settings of twin delayed DDPG (TD3), by the names of Stable-Baselines3 where it has them."""
-
-    algorithm: str = "td3"
-    exploration_noise: Fraction = 0.1  # standard deviation of exploration noise, relative to half the action range
-    policy_delay: Positive = 2  # critic updates per actor update
-    target_policy_noise: Fraction = 0.2  # standard deviation of the noise of target actions
-    target_noise_clip: Fraction = 0.5  # largest noise of target actions
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class CrossQConfig(OffPolicyConfig):
-    """Settings of CrossQ, which has no target critics (`tau` has no effect)."""
-
-    algorithm: str = "crossq"
-    policy_delay: Positive = 3  # critic updates per actor update
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.dropout:
+        if self.dropout and self.algorithm == "crossq":
             raise InputError(
                 "crossq has no dropout, which replaces its batch normalization: leave "
                 f"net_arch.dropout={self.dropout:g} out"
@@ -137,7 +115,7 @@ class CrossQConfig(OffPolicyConfig):
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class OnPolicyConfig(LearnerConfig):
-    """Settings of an on-policy learner, by the names of Stable-Baselines3 where it has them."""
+    """Settings of an on-policy learner, PPO or TRPO, by the names of Stable-Baselines3 where it has them."""
 
     takes_images: ClassVar[bool] = False
     entries: ClassVar[Mapping[str, str]] = {"gamma_per": "gamma.per"}
@@ -146,7 +124,6 @@ class OnPolicyConfig(LearnerConfig):
     learning_rate: Rate = 3e-4
     gamma: Factor = 0.995  # discount factor per `gamma_per`
     gamma_per: Literal["control_step", "action"] = "control_step"
-    gae_lambda: Factor = 0.95  # λ of generalized advantage estimation
     n_steps: Annotated[Positive, Field(ge=2, le=10**6)] = 256  # transitions between two trainings
     batch_size: BatchSize = 64  # transitions
     net_arch: NetArch = (64, 64)  # units of the hidden layers
@@ -157,16 +134,7 @@ class PpoConfig(OnPolicyConfig):
     """Settings of proximal policy optimization (PPO)."""
 
     n_epochs: Positive = 10  # passes through the transitions of a training
-    clip_range: Factor = 0.2  # difference from 1 at which an action's probability ratio is clipped
     ent_coef: Fraction = 0.0  # weight of the entropy in the loss
-
-
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
-class TrpoConfig(OnPolicyConfig):
-    """Settings of trust region policy optimization (TRPO)."""
-
-    algorithm: str = "trpo"
-    target_kl: Rate = 0.01  # largest Kullback-Leibler divergence between the policies before and after a training
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))

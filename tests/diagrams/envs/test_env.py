@@ -1,7 +1,5 @@
 """Reset and step of `DiagramEnv`, on a task with one position, whose outputs are known exactly."""
 
-from dataclasses import replace
-
 import gymnasium
 import numpy as np
 import pytest
@@ -373,15 +371,6 @@ def test_simulation_fails_when_joint_speed_is_implausible():
         env._check_plausible(env.simulator.get_context(), np.zeros(2))
 
 
-@pytest.mark.parametrize("options", ["x", "", 3, [], [("start", 0.0)]])
-def test_reset_options_are_refused_when_not_a_mapping(options):
-    env = make()
-    with pytest.raises(InputError, match="the options of a reset are values by name"):
-        env.reset(options=options)
-    assert env.reset(options={"start": 0.0})[1]["start"] == 0.0
-    env.reset(options=None)
-
-
 def test_info_keys_match_the_declared_keys():
     env = make(num_steps=2)
     _, info = env.reset()
@@ -420,9 +409,6 @@ def test_metadata_is_not_shared_between_environments():
         ({"render_mode": "rgb_array"}, "camera"),
         ({"render_mode": "human"}, "Meshcat"),
         ({"render_mode": "ascii"}, "render mode"),
-        ({"action_repeat": 0}, "action_repeat"),
-        ({"action_repeat": 2.5}, "action_repeat"),
-        ({"action_repeat": True}, "action_repeat"),
     ],
 )
 def test_env_refuses_unsupported_arguments(arguments, message):
@@ -458,19 +444,6 @@ def test_step_is_refused_when_the_simulator_is_ahead():
     env.simulator.AdvanceTo(3 * PERIOD)
     with pytest.raises(InputError, match="advance it by step"):
         env.step([0.0])
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"observation_space": gymnasium.spaces.Box(-1, 1, (5,))}, "the observation has 4 entries"),
-        ({"num_steps": 2.5}, "a task can't last 2.5 steps"),
-        ({"control_period": None}, "control_period must be a number, not None"),
-    ],
-)
-def test_task_diagram_refuses_arguments_that_do_not_fit(wrong, message):
-    with pytest.raises(InputError, match=message):
-        replace(make().diagram, **wrong)
 
 
 def test_multiples_of_a_rounded_period_are_exact():

@@ -1,4 +1,4 @@
-"""Policies of other packages: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
+"""Policies of other packages: Stable-Baselines3, ONNX, functions and objects with `predict`."""
 
 import math
 import threading
@@ -53,43 +53,12 @@ def test_zip_is_read_only_with_trust(env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("none.zip", "there is no file"), ("text.zip", "no model of Stable-B"), ("text.pt", "is no TorchScript file"),
-     ("text.onnx", "is no ONNX file")],
+    [("none.zip", "there is no file"), ("text.zip", "no model of Stable-B"), ("text.onnx", "is no ONNX file")],
 )  # fmt: skip
 def test_damaged_files_are_refused(name, message, tmp_path):
     (tmp_path / f"text{Path(name).suffix}").write_text("text")
     with pytest.raises(InputError, match=message):
         load_policy(tmp_path / name, trust_policy=True)
-
-
-class Script(torch.nn.Module):
-    """Network that doubles the first two entries of the observation."""
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        return 2 * observation[:, :2]
-
-
-def test_torchscript_is_loaded_only_with_trust(env, tmp_path):
-    file = tmp_path / "policy.pt"
-    torch.jit.trace(Script(), torch.zeros(1, 3)).save(file)
-    with pytest.raises(InputError, match="is a program: give --trust-policy"):
-        load_policy(file)
-    act = load_policy(file, trust_policy=True)
-    np.testing.assert_allclose(check_compatible(act, env)(OBSERVATION), [0.2, -0.4])
-
-
-class Pair(torch.nn.Module):
-    """Network that returns two tensors."""
-
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return observation, observation
-
-
-def test_torchscript_that_returns_no_tensor_is_named(tmp_path):
-    file = tmp_path / "pair.pt"
-    torch.jit.trace(Pair(), torch.zeros(1, 3)).save(file)
-    with pytest.raises(InputError, match=r"pair\.pt returns .* instead of a tensor"):
-        load_policy(file, trust_policy=True)(OBSERVATION)
 
 
 def test_damaged_model_of_sb3_is_named(tmp_path):
@@ -239,27 +208,6 @@ def test_exception_of_a_policy_is_named(policy, message, env):
         check_compatible(policy, env)
     with pytest.raises(InputError, match=message):
         evaluate(policy, "Bead", 2, baselines=(), processes=2)
-
-
-class FailingNetwork(torch.nn.Module):
-    """Network whose assertion fails for every observation."""
-
-    def forward(self, observation: torch.Tensor) -> torch.Tensor:
-        assert bool(observation.sum() > 1e9), "too small"
-        return observation
-
-
-@pytest.mark.parametrize(
-    ("module", "message"),
-    [
-        (FailingNetwork(), "RuntimeError: AssertionError: too small"),
-        (torch.nn.Linear(3, 2).double(), ".*Float and Double"),
-    ],
-)
-def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
-    torch.jit.script(module).save(tmp_path / "policy.pt")
-    with pytest.raises(InputError, match=rf"^the policy policy\.pt raised {message}"):
-        check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
 
 
 def test_class_of_a_file_that_cannot_be_constructed_is_named(tmp_path):
