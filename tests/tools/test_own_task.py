@@ -1,7 +1,6 @@
 """Task that a user declares: effects of the declaration, and messages about mistakes in it."""
 
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -19,7 +18,7 @@ from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
-from guiderail.tools.catalog import describe_task_options, describe_template
+from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.evaluation.baselines import find_scripted_policy
 from guiderail.tools.evaluation.subject import counts_collisions, evaluation_scope
 from guiderail.tools.imports import import_modules
@@ -147,12 +146,6 @@ def test_wrong_declaration_is_named_at_the_first_step(attributes, message):
     assert "\n" not in str(error.value)
 
 
-def test_reward_that_overflows_in_a_step_is_refused():
-    declare(rewards=returning({"a": HUGE["a"]}))
-    with pytest.raises(InputError, match="the reward of 5 control steps overflows: scale it down"):
-        first_step(action_repeat=5)
-
-
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
@@ -268,13 +261,6 @@ def test_imported_file_finds_its_folder_and_names_errors(tmp_path):
         import_modules(["nowhere_to_be_found"])
     assert sys.path == path
     sys.modules.pop("lab_period")
-
-
-def test_validate_template_accepts_the_name_of_a_template(monkeypatch):
-    monkeypatch.setattr("guiderail.models.templates.validate.validate", lambda template: [])
-    first, second = describe_template(Path("pouring"))["transitions"]
-    assert first == "translational → tilt below 0.25 m, back above 0.27 m"
-    assert second == "tilt → pour below 0.075 m, no way back"
 
 
 def test_task_keeps_its_name_when_another_name_is_taken():

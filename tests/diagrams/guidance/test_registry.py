@@ -77,11 +77,6 @@ def test_unknown_need_is_refused():
         register_guidance("wrong", needs=(("demonstration",),))
 
 
-def test_name_is_refused_when_blank():
-    with pytest.raises(InputError, match=r"a guidance is registered by a name, .*, not ' '"):
-        register_guidance(" ")
-
-
 @pytest.mark.parametrize(
     ("build", "message"),
     [
