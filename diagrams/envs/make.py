@@ -30,11 +30,11 @@ from guiderail.diagrams.envs.env import DiagramEnv, check_render_mode
 from guiderail.diagrams.envs.task_diagram import TaskDiagram
 from guiderail.diagrams.guidance.prior import PriorKnowledge
 from guiderail.diagrams.guidance.registry import build_guidance
-from guiderail.diagrams.stations.continuous_station import ContinuousStation
 from guiderail.diagrams.stations.disturbances import disturbed
 from guiderail.diagrams.stations.options import Disturbances
 from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
+from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
 from guiderail.models.common.errors import InputError, brief
 from guiderail.models.common.plugins import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS

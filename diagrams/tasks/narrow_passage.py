@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 
@@ -177,13 +177,15 @@ class NarrowPassage(Task):
             obstacles_move=self.has_sampled_obstacles,
         )
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
         """Refuse obstacles that constrain the motion and are sampled."""
         if self.obstacles_constrain and self.has_sampled_obstacles:
             raise InputError(
                 "obstacles_constrain needs a single fixed obstacle: leave out second_obstacle, obstacle_beside and "
                 "obstacles_end"
             )
+        return self
 
     @property
     def duration(self) -> float:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from annotated_types import Len
-from pydantic import Field
+from pydantic import Field, model_validator
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import DiagramBuilder, OutputPort
 from scipy.spatial.transform import Rotation
@@ -348,7 +348,8 @@ class Pouring(Task):
             default, diameter=self.ball_diameter, mass=default.mass * (self.ball_diameter / default.diameter) ** 2
         )
 
-    def check(self) -> None:
+    @model_validator(mode="after")
+    def _check_options(self) -> Self:
         """Check that the options are compatible.
 
         Raises:
@@ -370,6 +371,7 @@ class Pouring(Task):
                 f"mug_error_least must be at most mug_error_most, which is {self.mug_error_most:g} m, "
                 f"not {self.mug_error_least:g} m: give both"
             )
+        return self
 
     @property
     def duration(self) -> float:

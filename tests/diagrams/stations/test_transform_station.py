@@ -3,8 +3,8 @@
 import numpy as np
 from pydrake.systems.analysis import Simulator
 
-from guiderail.diagrams.stations.continuous_station import TransformStation
 from guiderail.diagrams.stations.gantry import GantryStation
+from guiderail.diagrams.stations.wrapped_stations import TransformStation
 from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.systems.support.drake_multibody import pose_to_transform
 
