@@ -307,7 +307,7 @@ class DiagramEnv(DrakeGymEnv):
                 now = {name: port.Eval(context) for name, port in self._recorded}
                 self._violations = float(now["commanded_violation"][0]), float(now["measured_violation"][0])
                 self._observation = observation
-        info = self._info(0, (0.0, 0.0), 0.0, False, dict.fromkeys(self.diagram.reward_terms, 0.0))
+        info = self._info(0, 0, dict.fromkeys(self.diagram.reward_terms, 0.0))
         return self._observation, info | self.sampled
 
     @contextmanager
@@ -358,10 +358,7 @@ class DiagramEnv(DrakeGymEnv):
         context = self.simulator.get_context()
         self._action_value.GetMutableData().set_value(action)
 
-        total = peak_force = peak_contact_force = 0.0
-        commanded_violation = measured_violation = -np.inf
-        terms = dict.fromkeys(self.diagram.reward_terms, 0.0)
-        termination, fallback = 0, False
+        total, termination, terms = 0.0, 0, dict.fromkeys(self.diagram.reward_terms, 0.0)
         first_step, last_step = (
             self._control_steps,
             min(self._control_steps + self.action_repeat, self.diagram.num_steps),
@@ -383,12 +380,6 @@ class DiagramEnv(DrakeGymEnv):
                 break  # this control step is dropped
             self._control_steps += 1
             total += reward
-            # The built-in max would ignore NaN, and an unknown violation would be reported as slack.
-            peak_force = float(np.maximum(peak_force, force))
-            peak_contact_force = float(np.maximum(peak_contact_force, now["contact_force"][0]))
-            commanded_violation = float(np.maximum(commanded_violation, now["commanded_violation"][0]))
-            measured_violation = float(np.maximum(measured_violation, now["measured_violation"][0]))
-            fallback = fallback or bool(now["fallback"][0])
             for name, value in gained:
                 terms[name] += value
             self.trace.append(desired_pose, pose, force, reward, now)
@@ -400,12 +391,7 @@ class DiagramEnv(DrakeGymEnv):
         truncated = not terminated and (self._failure is not None or self._control_steps >= self.diagram.num_steps)
         if truncated and self._failure is None:
             termination = Termination.TIME_LIMIT.index
-        if self._control_steps == first_step:
-            # The simulation failed before the first control step ended.
-            commanded_violation, measured_violation = self._violations
-        self._violations = commanded_violation, measured_violation
-        cost = float(self.trace.unsafe(first_step).sum())
-        info = self._info(termination, (peak_force, peak_contact_force), cost, fallback, terms)
+        info = self._info(termination, first_step, terms)
         self._running = not (terminated or truncated)
         return self._observation, total, terminated, truncated, info
 
@@ -465,20 +451,25 @@ class DiagramEnv(DrakeGymEnv):
             raise InputError(f"the observation{of} is not finite, but {brief(observation.tolist())}")
         return observation
 
-    def _info(
-        self, termination: int, forces: tuple[float, float], cost: float, fallback: bool, terms: Mapping[str, float]
-    ) -> dict[str, Any]:
-        """Return `info` with the violations of the step; `forces` are of impedance and contact."""
+    def _info(self, termination: int, first: int, terms: Mapping[str, float]) -> dict[str, Any]:
+        """Return `info` of the control steps from number `first` on; a maximum of values that contain NaN is NaN.
+
+        Without such a control step, because the simulation failed in the first one, the violations are the last ones.
+        """
+        signals = {name: values[first:, 0] for name, values in self.trace.signals.items()}
+        if len(self.trace) > first:
+            commanded, measured = (float(signals[f"{name}_violation"].max()) for name in ("commanded", "measured"))
+            self._violations = commanded, measured
         failure = {} if self._failure is None else {"simulation_failure": self._failure}
         return {
             "is_success": TERMINATIONS[termination] == Termination.SUCCESS,
             "termination": TERMINATIONS[termination].value,
             "constraint_violation": self._violations[0],
             "measured_violation": self._violations[1],
-            "impedance_force": forces[0] if self._has_impedance else 0.0,
-            "contact_force": forces[1],
-            "cost": cost,
-            "fallback": fallback,
+            "impedance_force": float(self.trace.force[first:].max(initial=0.0)) if self._has_impedance else 0.0,
+            "contact_force": float(signals["contact_force"].max(initial=0.0)),
+            "cost": float(self.trace.unsafe(first).sum()),
+            "fallback": bool(signals["fallback"].any()),
             "control_steps": self._control_steps,
             **terms,
             **failure,
