@@ -17,7 +17,7 @@ from pydrake.systems.framework import LeafSystem
 import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.control.command_filters import BarrierFilter, KeepOut
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.laws import Law, StateProgress

@@ -206,7 +206,7 @@ def evaluate(
     """Evaluate a policy on held-out episodes, together with baseline policies.
 
     With several --task, or for a run over a set of environments, the policy is evaluated in each environment.
-    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX or TorchScript file, or
+    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX file, or
     module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
     on initial conditions from random numbers that training never uses. The demonstration alone, random actions and the
     scripted policy of the task run on the same episodes: if they succeed as well, the task is too easy to show
@@ -429,11 +429,9 @@ def list_(
     elif name == "metrics":
         from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
-        metrics = [
-            *(("episode: ", column) for column in COLUMNS),
-            *(("episodes: ", m) for m in statistics_of().values()),
-        ]
-        text = {prefix + m.name: m.description + (f" [{m.unit}]" if m.unit else "") for prefix, m in metrics}
+        metrics = [("episode: ", *column) for column in COLUMNS]
+        metrics += [("episodes: ", m.name, m.unit, m.description) for m in statistics_of().values()]
+        text = {prefix + name: meaning + (f" [{unit}]" if unit else "") for prefix, name, unit, meaning in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
         print_result({name: _usable(name)}, as_json)
