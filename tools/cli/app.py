@@ -353,7 +353,9 @@ PolicyTasks = Annotated[
 ]
 TrustPolicy = Annotated[
     bool,
-    option("Read a policy from a file that can execute code: a .zip of Stable-Baselines3.", "--trust-policy"),
+    option(
+        "Read a policy from a file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--trust-policy"
+    ),
 ]
 Processes = Annotated[
     int | None,

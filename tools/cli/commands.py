@@ -206,7 +206,7 @@ def evaluate(
     """Evaluate a policy on held-out episodes, together with baseline policies.
 
     With several --task, or for a run over a set of environments, the policy is evaluated in each environment.
-    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX file, or
+    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX or TorchScript file, or
     module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
     on initial conditions from random numbers that training never uses. The demonstration alone, random actions and the
     scripted policy of the task run on the same episodes: if they succeed as well, the task is too easy to show
