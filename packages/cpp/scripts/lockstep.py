@@ -5,9 +5,9 @@
     python packages/cpp/scripts/lockstep.py pretrained:connector connector --episodes 100
 
 The program computes observation, action and command of each control step from the measured pose and wrench, over a
-socket, while the simulator waits. It evaluates the network in double precision. A policy in Python rounds to single
-precision, so Python's episodes run twice: as they are, for the outcomes, and with the network in double precision, for
-the commands. The exit status is 0 if every episode has the same outcome.
+socket, while the simulator waits. It evaluates the network in double precision, but a policy in Python rounds to single
+precision. The first `--double` episodes therefore run a third time, in Python with the network in double precision. The
+exit status is 0 if every episode has the same outcome.
 """
 
 import argparse
@@ -32,7 +32,6 @@ from guiderail.tools.pretrained import find_run
 from guiderail_cpp.recording import double_action
 
 OUTCOME = ("success", "termination", "steps")
-NAMES = ("python", "double", "cpp")  # policy in Python, the same in double precision, and C++ program
 
 
 class Program:
@@ -85,7 +84,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("run")
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--episodes", type=int, default=100, help="number of episodes")
+    parser.add_argument("--first", type=int, default=0, help="number of the first episode")
+    parser.add_argument("--double", type=int, default=10, help="number of episodes also in double precision")
     arguments = parser.parse_args()
     folder = RunFolder(find_run(arguments.run))
     config, policy = folder.config(), Policy.load(folder.path)
@@ -121,32 +122,33 @@ def main() -> int:
             lambda _: np.ones(num_actions, np.float32),
         ),
     }
-    equal, differences = 0, []
-    success = dict.fromkeys(NAMES, 0)
-    for episode in range(arguments.episodes):
+    equal, success = 0, dict.fromkeys(("python", "cpp"), 0)
+    differences: dict[str, list[float]] = {"python": [], "double": []}
+    for number in range(arguments.episodes):
+        episode = arguments.first + number
         rows = {
             name: rollout(env, act, Paths(env), seed=HELD_OUT_SEED + episode, held_out=True)
             for name, (env, act) in runs.items()
+            if name != "double" or number < arguments.double
         }
         outcome = {name: [row.get(key) for key in OUTCOME] for name, row in rows.items()}
-        for name in NAMES:
+        is_equal = all(each == outcome["cpp"] for each in outcome.values())
+        equal += is_equal
+        for name in success:
             success[name] += bool(rows[name]["success"])
-        equal += outcome["python"] == outcome["double"] == outcome["cpp"]
-        differences.append([_difference(rows[name], rows["cpp"]) for name in ("python", "double")])
-        is_equal = "equal" if outcome["python"] == outcome["cpp"] else "DIFFERENT"
-        print(
-            f"episode {episode}: {is_equal}: {outcome['python']} in Python, {outcome['double']} in double precision, "
-            f"{outcome['cpp']} in C++; largest difference of a command {differences[-1][0]:.2g}, "
-            f"{differences[-1][1]:.2g} m or rad",
-            flush=True,
-        )
+        verdict = f"equal, {outcome['cpp']}" if is_equal else f"DIFFERENT: {outcome}"
+        for name in rows.keys() - {"cpp"}:
+            differences[name].append(_difference(rows[name], rows["cpp"]))
+            verdict += f", commands differ by {differences[name][-1]:.2g} m or rad from {name}"
+        print(f"episode {episode}: {verdict}", flush=True)
     program.close()
-    single, double = np.array(differences).T
     print(
         f"{equal} of {arguments.episodes} episodes have the same success, termination and number of steps; successes: "
-        f"{success}; largest difference of a command from Python {single.max():.2g} m or rad (median of the episodes "
-        f"{np.median(single):.2g}), with the network in double precision {double.max():.2g} ({np.median(double):.2g})"
+        f"{success['python']} in Python, {success['cpp']} in C++"
     )
+    for name, values in differences.items():
+        if values:
+            print(f"largest difference of a command from {name}: {max(values):.2g}, median {np.median(values):.2g}")
     return 0 if equal == arguments.episodes else 1
 
 
