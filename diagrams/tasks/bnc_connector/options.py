@@ -90,7 +90,7 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
     """Options of BncConnector."""
 
     reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
-    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
+    observation: Literal["state", "center_of_pressure", "mean_contact_point", "image", "image_and_state"] = Field(
         "state", description="name of the observation"
     )
 
@@ -130,7 +130,7 @@ class BncOptions(FixtureOffsetOptions, PriorOptions, ForceOptions):
 
 
 HARD: dict[str, Any] = {
-    "observation": "center_of_pressure",
+    "observation": "mean_contact_point",
     "demonstrations": "search",
     "action_repeat": 5,
     "fixture_offset": "per_episode",
