@@ -81,7 +81,7 @@ def train_once(method: str, seed: int, episodes: int, out: Path) -> Path:
 
 
 def evaluate_once(source: Path | str, method: str, condition: str, file: Path) -> None:
-    """Evaluate the policy of a run, or a baseline policy, under a condition; stored episodes are not simulated again."""
+    """Evaluate the policy of a run, or a baseline policy, under a condition, unless its episodes are stored."""
     change, episodes = CONDITIONS[condition]
     if file.exists() and len(read_table(file)) >= episodes:
         return
@@ -132,12 +132,12 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--seeds", default="3000001", help="seeds, comma-separated (default: 3000001)")
     parser.add_argument("--methods", default="kgrl", help=f"methods, comma-separated: {', '.join(ABLATIONS)}")
     parser.add_argument("--episodes", type=int, default=120, help="training episodes (default: 120)")
-    parser.add_argument("--conditions", default=",".join(CONDITIONS), help="conditions, comma-separated (default: all)")
-    parser.add_argument("--baselines", default="scripted,uniform_random", help="baseline policies (default: %(default)s)")
+    parser.add_argument("--conditions", default=",".join(CONDITIONS), help="conditions (default: all)")
+    parser.add_argument("--baselines", default="scripted,uniform_random", help="baseline policies")
     parser.add_json()
     args = parser.parse_args(arguments)
     out = args.out.resolve()
-    policies: list[tuple[Path | str, str, str]] = [(name, name, f"{name}-0") for name in args.baselines.split(",") if name]
+    policies: list[tuple[Path | str, str, str]] = [(name, name, f"{name}-0") for name in args.baselines.split(",")]
     for seed in args.seeds.split(","):
         for method in args.methods.split(","):
             run = train_once(method, int(seed), args.episodes, out)

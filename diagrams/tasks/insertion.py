@@ -293,7 +293,8 @@ def sides_of_the_rim(
         # In a pose, Ry comes before Rx.
         pose = block_diag(across, np.eye(2), axial[::-1, ::-1])
         wrench = block_diag(across, np.eye(1), axial, np.eye(1))
-        contact_terms = (across,) * {"state": 0, "mean_contact_point": 3}.get(observation, 2)  # center of pressure, and commanded x and y
+        # center of pressure, commanded x and y, and mean contact point
+        contact_terms = (across,) * {"state": 0, "mean_contact_point": 3}.get(observation, 2)
         observations.append(block_diag(np.eye(1), pose, wrench, *contact_terms, *more(across)))
         poses.append(pose)
         privileged.append(block_diag(across, np.linalg.det(across).round(), wrench))
@@ -307,7 +308,8 @@ class DemonstratedInsertion(InsertionTask):
     """Insertion with demonstrations and box constraints, and with the center of pressure as a signal.
 
     Observations: "state" is time, pose and wrench. "center_of_pressure" adds the center of pressure and the commanded x
-    and y, and "mean_contact_point" also the mean of the contact points of the last second. "image" is the wrist camera's image alone; "image_and_state" adds it to the state.
+    and y, and "mean_contact_point" also the mean of the points of contact in the last second. "image" is the wrist
+    camera's image alone; "image_and_state" adds it to the state.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28): costs of actions and forces, and a terminal reward.
     "shaped" adds the depth gained. "aligned" adds the depth gained and the distance gained towards the fixture's axis.

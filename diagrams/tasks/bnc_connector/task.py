@@ -193,8 +193,9 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """Return an action (2,) that moves the command by at most `STEP` towards the center of pressure, and so the jack.
 
-    The mean contact point replaces the center of pressure if it is observed. Once the plug has dropped into the jack, the command is constant until the search ends. Before and after the search,
-    the action is zero. The last command is read from the observation, so that the policy has no state.
+    The mean contact point replaces the center of pressure if it is observed. Once the plug has dropped into the jack,
+    the command is constant until the search ends. Before and after the search, the action is zero. The last command is
+    read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
