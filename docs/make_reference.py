@@ -530,7 +530,7 @@ def workcells() -> str:
         )
     )
     page += table(["port", "size", "description"], rows)
-    tasks = {TASKS.get(name).station_kind().workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
+    tasks = {TASKS.get(name).station.kind.workcell_kind: name for name in ("NarrowPassage", "GridClamp", "Pouring")}
     for kind, task in tasks.items():
         workcell = EnvConfig.resolve(task, {}).declared.workcell()
         page += f"## {kind}\n\nStations: {_listed(stations_for(kind))}. The task `{task}` has "

@@ -45,6 +45,7 @@ from .wrench_sensors import JointTorqueWrench as JointTorqueWrench
 from .wrench_sensors import WrenchSensor as WrenchSensor
 from .wrench_signals import CenterOfPressure as CenterOfPressure
 from .wrench_signals import ForceMonitor as ForceMonitor
+from .wrench_signals import MeanContactPoint as MeanContactPoint
 from .wrench_signals import MeanForce as MeanForce
 from .wrench_signals import PoseWrench as PoseWrench
 from .wrench_signals import WrenchTare as WrenchTare

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 import numpy as np
 from pydrake.math import RigidTransform
 
-from guiderail.models.common.errors import InputError, brief
+from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import POSE_SIZE, WRENCH_SIZE
 from guiderail.models.primitives import Kernel, LcNsKmp, LinearConstraints, ReferenceTrajectory, SquaredExponential
 from guiderail.models.primitives.gains import authority_gains, residual_gains
@@ -270,9 +270,6 @@ class PriorKnowledge:
         options: Options of the guidance by name; empty if it declares none.
         pose_size: Size O of the station's pose.
         wrench_size: Size W of the station's wrench.
-
-    Raises:
-        InputError: If the template is not a `PlacedTemplate`.
     """
 
     period: float
@@ -282,10 +279,6 @@ class PriorKnowledge:
     options: Mapping[str, Any] = field(default_factory=dict)
     pose_size: int = POSE_SIZE
     wrench_size: int = WRENCH_SIZE
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.template, PlacedTemplate | None):
-            raise InputError(f"a task's template is a PlacedTemplate with its frames, not {brief(self.template)}")
 
     @property
     def constraints(self) -> LinearConstraints:

@@ -5,10 +5,9 @@ points, as "KIND:NAME" = "module:attribute":
 
     [project.entry-points.guiderail]
     "station:mujoco" = "guiderail_mujoco.station:MujocoStation"
-    "station_options:mujoco" = "guiderail.diagrams.stations.options:ContactOptions"
 
-The kinds task_options, station_options, guidance_options and learner_config name the class of an entry's options in a
-module that imports neither Drake nor PyTorch, so that options can be checked before slow imports.
+The kind learner_config names the class of a learner's settings in a module that does not import PyTorch, so that they
+can be checked before this slow import.
 """
 
 import difflib
@@ -40,20 +39,14 @@ SIBLINGS = {
 
 _DIAGRAMS, _LEARNING, _ROBOTS = "guiderail.diagrams", "guiderail.tools.learning", "guiderail.models.robots"
 BUILT_IN = {
-    "task:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.task:BncConnector",
-    "task:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.task:GridClamp",
-    "task:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.task:NarrowPassage",
-    "task:Pouring": f"{_DIAGRAMS}.tasks.pouring.task:Pouring",
-    "task_options:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector.options:BncOptions",
-    "task_options:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp.options:GridClampOptions",
-    "task_options:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage.options:NarrowPassageOptions",
-    "task_options:Pouring": f"{_DIAGRAMS}.tasks.pouring.options:PouringOptions",
+    "task:BncConnector": f"{_DIAGRAMS}.tasks.bnc_connector:BncConnector",
+    "task:GridClamp": f"{_DIAGRAMS}.tasks.grid_clamp:GridClamp",
+    "task:NarrowPassage": f"{_DIAGRAMS}.tasks.narrow_passage:NarrowPassage",
+    "task:Pouring": f"{_DIAGRAMS}.tasks.pouring:Pouring",
     "station:arm": f"{_DIAGRAMS}.stations.arm:ArmStation",
     "station:gantry": f"{_DIAGRAMS}.stations.gantry:GantryStation",
     "station:plane": f"{_DIAGRAMS}.stations.plane:PlaneStation",
     "station:pouring": f"{_DIAGRAMS}.stations.pouring:PouringStation",
-    "station_options:arm": f"{_DIAGRAMS}.stations.options:ArmOptions",
-    "station_options:gantry": f"{_DIAGRAMS}.stations.options:GantryOptions",
     "guidance:kgrl": f"{_DIAGRAMS}.guidance.primitive:kgrl",
     "guidance:kmp": f"{_DIAGRAMS}.guidance.primitive:kmp",
     "guidance:none": f"{_DIAGRAMS}.guidance.sct:unguided",
@@ -79,12 +72,12 @@ BUILT_IN = {
     "learner:tqc": f"{_LEARNING}.off_policy:TqcLearner",
     "learner:trpo": f"{_LEARNING}.on_policy:TrpoLearner",
     "learner_config:bc": f"{_LEARNING}.learner_config:BcConfig",
-    "learner_config:crossq": f"{_LEARNING}.learner_config:CrossQConfig",
+    "learner_config:crossq": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:ppo": f"{_LEARNING}.learner_config:PpoConfig",
     "learner_config:sac": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:td3": f"{_LEARNING}.learner_config:Td3Config",
+    "learner_config:td3": f"{_LEARNING}.learner_config:OffPolicyConfig",
     "learner_config:tqc": f"{_LEARNING}.learner_config:OffPolicyConfig",
-    "learner_config:trpo": f"{_LEARNING}.learner_config:TrpoConfig",
+    "learner_config:trpo": f"{_LEARNING}.learner_config:OnPolicyConfig",
 }
 """Plug-ins of this package: "module:attribute" by "kind:name"."""
 
@@ -284,6 +277,10 @@ class Registry(Generic[Entry]):
         names = (name for name, entry in self._entries.items() if entry is value)
         return next(names, next((name for name, point in points if point.value == declared), None))
 
+    def is_loaded(self, name: str) -> bool:
+        """Return True if the entry of a name was registered or imported in this process."""
+        return name in self._entries
+
     def is_packaged(self, name: str) -> bool:
         """Return True if the name is that of a plug-in of guiderail or of a sibling distribution."""
         return name in self._packaged
@@ -308,21 +305,14 @@ class Registry(Generic[Entry]):
         return [] if self._plugin is None else list(find_plugins(self._plugin))
 
 
-def find_class(kind: str, name: str, registry: Registry[Any], attribute: str = "") -> Any:
-    """Return the class of an entry's options, from the plug-in `kind` without importing the entry if there is one.
+def check_kind(kind: type) -> Callable[[str, object], None]:
+    """Return a `check` of a registry that refuses an entry that is no instance of `kind`, such as a plain function."""
 
-    Args:
-        kind: Kind of the plug-in, such as "learner_config".
-        name: Name of the entry.
-        registry: Registry of the entry.
-        attribute: Attribute of the entry that has this class; by default, the entry is the class.
-    """
-    if name not in registry._entries:
-        for found, point in find_plugins(kind):
-            if found == name:
-                return point.load()
-    entry = registry.get(name)
-    return getattr(entry, attribute) if attribute else entry
+    def check(name: str, entry: object) -> None:
+        if not isinstance(entry, kind):
+            raise InputError(f"the entry {name!r} is a {kind.__name__}, which a decorator makes, not {brief(entry)}")
+
+    return check
 
 
 def check_callable(name: str, value: object) -> None:

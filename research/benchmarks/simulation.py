@@ -21,8 +21,8 @@ from guiderail.diagrams.envs.recording import DrivenStation, linear_motion
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
-from guiderail.diagrams.tasks.bnc_connector.task import NUM_STEPS, BncWorkcell
-from guiderail.diagrams.tasks.grid_clamp.task import GridClampWorkcell
+from guiderail.diagrams.tasks.bnc_connector import NUM_STEPS, BncWorkcell
+from guiderail.diagrams.tasks.grid_clamp import GridClampWorkcell
 from guiderail.models.common.transforms import POSE_SIZE
 from guiderail.models.objects.bnc_connector.demonstrations import insert_and_lock
 from guiderail.systems.cartesian_impedance_controller import CartesianImpedanceController

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
-from guiderail.diagrams.tasks.bnc_connector.options import ALIGNMENT
+from guiderail.diagrams.tasks.bnc_connector import ALIGNMENT
 from guiderail.models.common.errors import InputError
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector
 from guiderail.models.objects.narrow_passage import PassageGeometry

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.recording import drive_along
 from guiderail.diagrams.stations.arm import ArmStation
 from guiderail.diagrams.stations.gantry import GantryStation
 from guiderail.diagrams.stations.station import CONTROL_PERIOD, Impedance, Station
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import DEGREE, MM, POSE_NAMES
 from guiderail.models.objects.bnc_connector import demonstrations as bnc_connector

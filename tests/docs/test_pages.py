@@ -131,7 +131,7 @@ def test_reference_has_no_local_path(reference):
 def test_robot_page_has_the_limits_of_the_code():
     import numpy as np
 
-    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
     from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
     from guiderail_hardware.drivers.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE

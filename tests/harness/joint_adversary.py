@@ -14,7 +14,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.stations.arm import ArmStation
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.command_checks import CommandFilter

@@ -21,7 +21,7 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.diagrams.stations.arm import add_arm, controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance_torques
 from guiderail.models.control.wrench import WrenchBound

@@ -429,11 +429,9 @@ def list_(
     elif name == "metrics":
         from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
-        metrics = [
-            *(("episode: ", column) for column in COLUMNS),
-            *(("episodes: ", m) for m in statistics_of().values()),
-        ]
-        text = {prefix + m.name: m.description + (f" [{m.unit}]" if m.unit else "") for prefix, m in metrics}
+        metrics = [("episode: ", *column) for column in COLUMNS]
+        metrics += [("episodes: ", m.name, m.unit, m.description) for m in statistics_of().values()]
+        text = {prefix + name: meaning + (f" [{unit}]" if unit else "") for prefix, name, unit, meaning in metrics}
         print_result(text, as_json, "_")
     elif name in cli.LISTED:
         print_result({name: _usable(name)}, as_json)

@@ -6,7 +6,7 @@ from pydrake.multibody.tree import JacobianWrtVariable
 
 from guiderail.diagrams.envs.make import make_prior_knowledge
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory
+from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.models.common.transforms import MM
 from guiderail.models.objects.bnc_connector import demonstrations
 from guiderail.models.objects.bnc_connector.demonstrations import NUM_DEMONSTRATIONS, NUM_STEPS

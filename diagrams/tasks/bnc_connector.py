@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field, field_validator
 from pydrake.geometry import Box
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 
 from guiderail.diagrams.envs.observation import Observed
-from guiderail.diagrams.envs.options import STANDARD
+from guiderail.diagrams.envs.options import STANDARD, Integer, Number
 from guiderail.diagrams.envs.scene import (
     ARM_VIEW,
     TOOL_VIEW,
@@ -27,14 +28,20 @@ from guiderail.diagrams.envs.scene import (
 from guiderail.diagrams.envs.task_diagram import Symmetry
 from guiderail.diagrams.stations.station import CONTROL_PERIOD
 from guiderail.diagrams.stations.workcell import MovableWorkcell
-from guiderail.diagrams.tasks.bnc_connector.options import HARD, NOMINAL, BncOptions, BncUncertainty
 from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.insertion import DemonstratedInsertion, sides_of_the_rim
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
+    COLLISION_FORCE,
     COMMAND_SCALE,
+    FORCE_LIMITS,
     HISTORY_VARIANCE,
+    NEGLIGIBLE_OFFSET,
     REPEATABILITY_STD,
+    FixtureOffsetOptions,
+    HiddenOffsets,
+    PriorOptions,
+    in_ring,
     reference_of_file,
 )
 from guiderail.diagrams.tasks.registry import register_task
@@ -56,6 +63,87 @@ from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
+
+# Smallest and largest offset of the jack [m].
+OFFSET_RANGES = {
+    "per_run": (1.0 * MM, 1.5 * MM),
+    "per_episode": (0.0, 1.5 * MM),
+    "none": (0.0, NEGLIGIBLE_OFFSET),
+}
+GRASP_RADIUS = 0.3 * MM  # largest offset of the plug in the tool [m]
+
+
+class BncUncertainty(HiddenOffsets):
+    """Sampler of the offsets of jack and plug; see `HiddenOffsets` for the options of a reset.
+
+    - "per_run": the jack is offset by 1.0 to 1.5 mm in a random direction, sampled once per run; the plug is within
+      0.3 mm of its nominal position in the tool, sampled each episode. The thesis uses this setting.
+    - "per_episode": the jack is within 1.5 mm of its nominal position, sampled each episode.
+    - "none": the jack is within 0.3 mm of its nominal position, sampled each episode.
+
+    With `jack_turn`, the jack is also rotated about its axis; the jack's offset is then [x, y, angle]. The reset option
+    `offset` sets the jack's position; the jack is then not rotated, and the plug not offset.
+    """
+
+    def __init__(
+        self,
+        kind: str,
+        *,
+        offset_range: Sequence[float] | None = None,
+        jack_turn: float = 0.0,
+    ):
+        """Construct the sampler.
+
+        `jack_turn` is the largest turn of the jack [degrees]. `offset_range` is the smallest and largest offset of the
+        jack [m]; default: that of the kind.
+        """
+        super().__init__(kind)
+        self.jack_turn = jack_turn * DEGREE
+        self.offset_range = OFFSET_RANGES[kind] if offset_range is None else tuple(offset_range)
+
+    def _draw_run(self, rng: np.random.Generator) -> np.ndarray:
+        # Every kind samples this offset, so that all kinds take the same random numbers.
+        return self._append_turn(in_ring(rng, *self.offset_range), rng)
+
+    def _draw_episode(self, rng: np.random.Generator, run: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if self.kind == "per_run":
+            jack, plug = run, in_ring(rng, 0.0, GRASP_RADIUS)
+        else:
+            jack, plug = in_ring(rng, *self.offset_range), np.zeros(2)
+        rng.uniform(size=2)  # stored results of a seed depend on the number of samples
+        return (jack if self.kind == "per_run" else self._append_turn(jack, rng)), plug
+
+    def _offsets_of(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        jack = np.append(offset, 0.0) if self.jack_turn > 0.0 else offset
+        return jack, np.zeros(2)
+
+    def _append_turn(self, jack: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return np.append(jack, rng.uniform(-self.jack_turn, self.jack_turn)) if self.jack_turn > 0.0 else jack
+
+
+ALIGNMENT = 2.0 * MM  # largest |x| and |y| of every command: equation 4.26
+NOMINAL = BncDimensions()
+SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in this package
+
+
+HARD: dict[str, Any] = {
+    "observation": "mean_contact_point",
+    "demonstrations": "search",
+    "action_repeat": 5,
+    "fixture_offset": "per_episode",
+    "offset_range": (2.6 * MM, 3.0 * MM),
+    "bound": 3.5 * MM,
+    "force_limit": 20.0,
+    "mouth_chamfer": 0.1 * MM,
+}
+"""Options of difficulty="hard": the jack's offset is sampled in every episode and is larger than the chamfer can
+correct. Without `bounded_force`, pressing on the rim exceeds the force limit.
+
+The search is short, and the jack's offset is close to the largest displacement by an action. Most random actions
+displace the plug less and miss the jack. A policy can reach the jack if it observes the side of the rim on which the
+contact is. The demonstrations' covariance in x and y, and so the displacement per action, is constant during the
+search; otherwise a constant action would sweep the plug across the rim.
+"""
 
 # Size of the task board [m], its distance below the jack [m], and its color. The board has no collision geometry,
 # because the locked plug's mouth reaches slightly below the jack's bottom.
@@ -169,8 +257,9 @@ def _fit_shipped(demonstrations: str, count: int | None, prior_std: tuple[float,
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
 
 
-# Indices into the observation [time, pose, wrench, center of pressure, command].
+# Indices into the observation [time, pose, wrench, center of pressure, command, mean contact point].
 TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10, 11, slice(13, 15), slice(15, 17)
+MEAN_CONTACT_POINT = slice(17, 19)
 
 # Parameters of `scripted_torque_search`, for the demonstrations "insert".
 GAIN = 1.5  # action per scaled contact torque
@@ -200,8 +289,9 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """Return an action (2,) that moves the command by at most `STEP` towards the center of pressure, and so the jack.
 
-    Once the plug has dropped into the jack, the command is constant until the search ends. Before and after the search,
-    the action is zero. The last command is read from the observation, so that the policy has no state.
+    The mean contact point replaces the center of pressure if it is observed. Once the plug has dropped into the jack,
+    the command is constant until the search ends. Before and after the search, the action is zero. The last command is
+    read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
@@ -211,7 +301,8 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
     if not MAY_PRESS < time < HOLD_UNTIL:
         return np.zeros(2)
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
+    entries = MEAN_CONTACT_POINT if len(observation) >= MEAN_CONTACT_POINT.stop else CENTER_OF_PRESSURE
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[entries] * CENTER_OF_PRESSURE_SCALE
     height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTER[2], float(np.linalg.norm(lever))
     if height > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)
@@ -219,7 +310,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
 
 
 @register_task("BncConnector")
-class BncConnector(BncOptions, DemonstratedInsertion):
+class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
     """Insert, align and lock the connector.
 
     Rewards: "sparse" is the thesis's reward (equations 4.27, 4.28); "shaped" and "aligned" add terms to it.
@@ -229,6 +320,45 @@ class BncConnector(BncOptions, DemonstratedInsertion):
     simulated_rewards = ("aligned",)
     presets = {"hard": HARD}
     defaults = {"guidance": "skgrl", "action_repeat": 10, "action_dims": (0, 1), "history.variance": HISTORY_VARIANCE}
+
+    reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
+    observation: Literal["state", "center_of_pressure", "mean_contact_point", "image", "image_and_state"] = Field(
+        "state", description="name of the observation"
+    )
+
+    start_offset_max: Number = Field(
+        0.0, ge=0, le=ALIGNMENT, description="largest sampled offset of the start along x and y [m]"
+    )
+    bound: Number = Field(ALIGNMENT, ge=0.5 * MM, le=6.0 * MM, description="bound of a command's |x| and |y| [m]")
+    force_limit: Number = Field(
+        COLLISION_FORCE, ge=5, le=FORCE_LIMITS[1], description="force that ends an episode as a collision [N]"
+    )
+    mouth_chamfer: Number = Field(
+        NOMINAL.mouth_chamfer, ge=0.05 * MM, le=0.6 * MM, description="chamfer of the plug's mouth and slots [m]"
+    )
+    bore_clearance: Number = Field(
+        NOMINAL.bore_clearance,
+        ge=0.05 * MM,
+        le=0.2 * MM,
+        description="clearance between barrel and bore on each side [m]",
+    )
+    friction: Number = Field(FRICTION, ge=0.05, le=0.4, description="friction coefficient of the connector's metal")
+    demonstrations: str = Field(
+        "insert", description="demonstrations: insert, search, firm_search, or the path of a file"
+    )
+    num_demonstrations: Integer | None = Field(
+        None, ge=1, description="number of demonstrations to use, from the first on; a single one needs prior_std"
+    )
+
+    @field_validator("demonstrations")
+    @classmethod
+    def _check_file(cls, value: str) -> str:
+        if value in SHIPPED:
+            return value
+        path = Path(value)
+        if not path.is_file():
+            raise ValueError(f"must be {', '.join(SHIPPED)}, or the path of an existing file, .npz or .csv")
+        return str(path.resolve())  # so that a run can be resumed from another folder
 
     @property
     def insertion_length(self) -> float:
@@ -288,7 +418,7 @@ class BncConnector(BncOptions, DemonstratedInsertion):
         """
         if self.has_image:
             return None, None
-        across = () if self.observation == "state" else (-1.0,) * 4
+        across = (-1.0,) * {"state": 0, "mean_contact_point": 6}.get(self.observation, 4)
         observation = (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
         half = Symmetry.of_signs(observation, HALF_TURN, (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH))
         more = len(self.force_limit_terms())

@@ -13,34 +13,16 @@ from guiderail.systems.poses import ContinuousPose, PoseFromTransform, SpatialFo
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
-class ContinuousStation(Station):
-    """A station with the ports of an inner station, whose `pose` continues beyond ±π (`ContinuousPose`)."""
+class WrappedStation(Station):
+    """Station around an inner station, which has the methods and attributes that a subclass does not replace."""
 
-    def __init__(self, station: Station, near: np.ndarray):
-        """Construct the station; the given `station` becomes its subsystem.
-
-        `near` is the pose (6,) of which the first measured pose is the nearest equivalent, such as the first mean of a
-        reference.
-
-        Raises:
-            InputError: If `near` is not a finite pose.
-        """
+    def __init__(self, station: Station):
+        """Construct the station; a subclass adds the given `station` to its builder."""
         super().__init__()
         self._inner, self.control_period = station, station.control_period
-        self.plant, self.scene_graph = station.plant, station.scene_graph
-        builder = DiagramBuilder()
-        builder.AddNamedSystem("station", station)
-        measured = ContinuousPose(near, station.control_period)
-        add_system(builder, "continuous_pose", measured, pose=station.get_pose_output_port())
-        for port in map(station.get_input_port, range(station.num_input_ports())):
-            builder.ExportInput(port, port.get_name())
-        for port in map(station.get_output_port, range(station.num_output_ports())):
-            is_pose = port.get_name() == "pose"
-            builder.ExportOutput(measured.get_continuous_pose_output_port() if is_pose else port, port.get_name())
-        builder.BuildInto(self)
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the inner station that this class does not define, such as `arm`."""
+        """Return an attribute of the inner station, such as `plant` or `arm`."""
         if name == "_inner":
             raise AttributeError(name)
         return getattr(self._inner, name)
@@ -51,7 +33,7 @@ class ContinuousStation(Station):
         return self._inner.nominal_period
 
     def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the robot at rest with its tool center at `pose`, (6,); `context` is the root context."""
+        """Put the robot at rest with its true tool center at `pose`, (6,); `context` is the root context."""
         self._inner.set_pose(context, pose)
 
     def set_contact(self, context: Context, friction: float, modulus: float) -> None:
@@ -67,7 +49,32 @@ class ContinuousStation(Station):
         return self._inner.disturb(context, rng)
 
 
-class TransformStation(Station):
+class ContinuousStation(WrappedStation):
+    """A station with the ports of an inner station, whose `pose` continues beyond ±π (`ContinuousPose`)."""
+
+    def __init__(self, station: Station, near: np.ndarray):
+        """Construct the station; the given `station` becomes its subsystem.
+
+        `near` is the pose (6,) of which the first measured pose is the nearest equivalent, such as the first mean of a
+        reference.
+
+        Raises:
+            InputError: If `near` is not a finite pose.
+        """
+        super().__init__(station)
+        builder = DiagramBuilder()
+        builder.AddNamedSystem("station", station)
+        measured = ContinuousPose(near, station.control_period)
+        add_system(builder, "continuous_pose", measured, pose=station.get_pose_output_port())
+        for port in map(station.get_input_port, range(station.num_input_ports())):
+            builder.ExportInput(port, port.get_name())
+        for port in map(station.get_output_port, range(station.num_output_ports())):
+            is_pose = port.get_name() == "pose"
+            builder.ExportOutput(measured.get_continuous_pose_output_port() if is_pose else port, port.get_name())
+        builder.BuildInto(self)
+
+
+class TransformStation(WrappedStation):
     """A station with abstract ports, for diagrams whose signals are Drake's transforms and forces.
 
     It has the ports of the inner station, except that ``desired_transform``, an abstract `RigidTransform` X_TP,
@@ -81,11 +88,8 @@ class TransformStation(Station):
         Raises:
             InputError: If the poses of the station are not those of a body in space.
         """
-        super().__init__()
-        for name in ("plant", "scene_graph"):
-            if hasattr(station, name):
-                setattr(self, name, getattr(station, name))
-        self.control_period, self.wraps_angles, self._inner = station.control_period, station.wraps_angles, station
+        super().__init__(station)
+        self.wraps_angles = station.wraps_angles
         builder = DiagramBuilder()
         builder.AddNamedSystem("station", station)
         for port in map(station.get_input_port, range(station.num_input_ports())):
@@ -105,7 +109,3 @@ class TransformStation(Station):
     get_desired_transform_input_port = input_getter("desired_transform", "desired transform X_TP")
     get_transform_output_port = output_getter("transform", "measured transform X_TP")
     get_spatial_force_output_port = output_getter("spatial_force", "spatial force of the surroundings on the tool")
-
-    def set_pose(self, context: Context, pose: np.ndarray) -> None:
-        """Put the robot at rest with its tool center at `pose`, (6,); `context` is the root context."""
-        self._inner.set_pose(context, pose)
