@@ -1,4 +1,4 @@
-"""Base policy of the study `connector_hard_base_policy`: a search that sometimes succeeds (docs/experiments.md)."""
+"""Base policy of the study `connector_hard_base_policy`: a search that sometimes succeeds (research/experiments.md)."""
 
 import numpy as np
 

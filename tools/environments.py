@@ -127,14 +127,14 @@ def warn_of_deviation(config: Any) -> None:
     The motion deviates if less than the fraction `MIN_SHARE` of its steps lies within a standard deviation of the
     demonstrations.
     """
-    from guiderail.models.primitives.fit import MIN_SHARE, estimated_share  # imports SciPy, which takes a second
+    from guiderail.models.primitives.fit import MIN_SHARE, share_within_spread  # imports SciPy, which takes a second
 
     reference = config.reference()
     if reference is None:
         return
     values = config.options
     chosen = {name: values[name] for name in ("lambda_", "beta", "horizon")}
-    share = estimated_share(reference, kernel_from_options(values), **chosen)
+    share = share_within_spread(reference, kernel_from_options(values), **chosen)
     if share < MIN_SHARE:
         _LOGGER.warning(
             "without actions, %.0f%% of the steps stay within a standard deviation of the demonstrations: let "

@@ -45,9 +45,8 @@ from guiderail.models.laws import StateProgress
 from guiderail.models.primitives import LinearConstraints
 from guiderail.models.primitives.kernels import make_kernel
 from guiderail.models.primitives.reference import pass_through
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.episode_monitor import EpisodeMonitor, TerminationTerm
-from guiderail.systems.reward_system import RewardSystem, RewardTerm
+from guiderail.systems.command_checks import ConstraintViolation
+from guiderail.systems.episode_terms import EpisodeMonitor, RewardSystem, RewardTerm, TerminationTerm
 
 
 def build_prior_knowledge(config: EnvConfig, station: Station) -> PriorKnowledge:
@@ -100,11 +99,10 @@ def template_of(config: EnvConfig) -> PlacedTemplate | None:
 
 
 _LIMITS = ("max_speed", "max_acceleration")
-_JOINTS = ("joint_margin", "min_singular_value")
 # Options that are not attributes of `PrimitiveConfig` but determine one of them.
 _CONVERTED_OPTIONS = (
-    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag", *_LIMITS,
-    *_JOINTS,
+    "kernel", "length_scale", "kernel_parameters", "via_points", "progress", "progress_tolerance", "max_lag",
+    "joint_margin", *_LIMITS,
 )  # fmt: skip
 
 
@@ -129,9 +127,7 @@ def _motion_constraints(
     """Return a task's motion constraints, extended by the limits in its options; None if there are neither."""
     limits: dict[str, Any] = {}
     if options["joint_margin"] is not None:
-        limits["state"] = [station.joint_range(*(options[name] for name in _JOINTS))]
-    elif options["min_singular_value"]:
-        raise InputError("min_singular_value has an effect with joint_margin only: give joint_margin=0 as well")
+        limits["state"] = [station.joint_range(options["joint_margin"])]
     outputs = constraints.num_outputs
     limits |= {name: limits_per_output(name, options[name], outputs) for name in _LIMITS if options[name]}
     if motion is None:
@@ -267,7 +263,7 @@ class Loop:
         image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
         if not terms:
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
-        from guiderail.systems.image_observation import ImageObservation  # most environments have no image
+        from guiderail.systems.policy_system import ImageObservation  # most environments have no image
 
         space, state = self.add_terms(terms, "state_observation")
         combined = ImageObservation(width, height, state.size())

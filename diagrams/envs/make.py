@@ -36,7 +36,7 @@ from guiderail.diagrams.stations.registry import StationKind
 from guiderail.diagrams.stations.station import INPUTS, OUTPUTS, Station
 from guiderail.diagrams.stations.wrapped_stations import ContinuousStation
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import is_sibling_module
+from guiderail.models.common.registry import is_sibling_module
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.models.robots.robot import ROBOTS
 

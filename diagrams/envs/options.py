@@ -226,12 +226,6 @@ class PrimitiveOptions(Options):
         description="smallest distance of an arm's commanded joint positions from their limits [rad]; default: no "
         "constraint",
     )
-    min_singular_value: Number = Field(
-        0.0,
-        ge=0,
-        le=0.2,
-        description="smallest singular value of the arm's scaled Jacobian [m]; needs joint_margin",
-    )
     progress: Literal["clock", "state"] = Field(
         "clock", description="clock: the motion advances with time; state: the motion waits for a robot that lags"
     )

@@ -9,8 +9,7 @@ from pydrake.systems.framework import Context, DiagramBuilder
 from guiderail.diagrams.stations.station import Station
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.control.motion_constraints import StateConstraints
-from guiderail.systems.body_poses import ContinuousPose
-from guiderail.systems.conversions import PoseFromTransform, SpatialForceFromWrench, TransformFromPose
+from guiderail.systems.poses import ContinuousPose, PoseFromTransform, SpatialForceFromWrench, TransformFromPose
 from guiderail.systems.support.declarations import input_getter, output_getter
 
 
@@ -41,9 +40,9 @@ class WrappedStation(Station):
         """Multiply the friction and modulus of all contacts by factors until the next reset."""
         self._inner.set_contact(context, friction, modulus)
 
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
+    def joint_range(self, margin: float) -> StateConstraints:
         """Return the constraints of the inner station's joints."""
-        return self._inner.joint_range(margin, min_singular_value)
+        return self._inner.joint_range(margin)
 
     def disturb(self, context: Context, rng: np.random.Generator) -> Mapping[str, Any]:
         """Sample the inner station's disturbances at a reset, and return them by name."""

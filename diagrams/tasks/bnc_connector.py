@@ -49,10 +49,18 @@ from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import DEGREE, MM, POSE_SIZE
+from guiderail.models.objects.bnc_connector import (
+    FRICTION,
+    JACK_SDF,
+    PLUG_SDF,
+    TOUCHING,
+    BncDimensions,
+    folder_of,
+    jack_surfaces,
+    plug_surfaces,
+)
 from guiderail.models.objects.bnc_connector import demonstrations as shipped
 from guiderail.models.objects.bnc_connector.demonstrations import HOLD_UNTIL, NUM_STEPS, RIM, SEARCH
-from guiderail.models.objects.bnc_connector.geometry import JACK_SDF, PLUG_SDF, BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION, TOUCHING, folder_of, jack_surfaces, plug_surfaces
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.primitives import Demonstrations, LinearConstraints, ReferenceTrajectory
 
@@ -119,7 +127,7 @@ SHIPPED = ("insert", "search", "firm_search")  # names of the demonstrations in 
 
 
 HARD: dict[str, Any] = {
-    "observation": "center_of_pressure",
+    "observation": "mean_contact_point",
     "demonstrations": "search",
     "action_repeat": 5,
     "fixture_offset": "per_episode",
@@ -249,8 +257,9 @@ def _fit_shipped(demonstrations: str, count: int | None, prior_std: tuple[float,
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
 
 
-# Indices into the observation [time, pose, wrench, center of pressure, command].
+# Indices into the observation [time, pose, wrench, center of pressure, command, mean contact point].
 TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10, 11, slice(13, 15), slice(15, 17)
+MEAN_CONTACT_POINT = slice(17, 19)
 
 # Parameters of `scripted_torque_search`, for the demonstrations "insert".
 GAIN = 1.5  # action per scaled contact torque
@@ -280,8 +289,9 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """Return an action (2,) that moves the command by at most `STEP` towards the center of pressure, and so the jack.
 
-    Once the plug has dropped into the jack, the command is constant until the search ends. Before and after the search,
-    the action is zero. The last command is read from the observation, so that the policy has no state.
+    The mean contact point replaces the center of pressure if it is observed. Once the plug has dropped into the jack,
+    the command is constant until the search ends. Before and after the search, the action is zero. The last command is
+    read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
@@ -291,7 +301,8 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
     if not MAY_PRESS < time < HOLD_UNTIL:
         return np.zeros(2)
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
+    entries = MEAN_CONTACT_POINT if len(observation) >= MEAN_CONTACT_POINT.stop else CENTER_OF_PRESSURE
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[entries] * CENTER_OF_PRESSURE_SCALE
     height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTER[2], float(np.linalg.norm(lever))
     if height > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)
@@ -311,7 +322,7 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
     defaults = {"guidance": "skgrl", "action_repeat": 10, "action_dims": (0, 1), "history.variance": HISTORY_VARIANCE}
 
     reward: Literal["sparse", "shaped", "aligned"] = Field("sparse", description="name of the reward")
-    observation: Literal["state", "center_of_pressure", "image", "image_and_state"] = Field(
+    observation: Literal["state", "center_of_pressure", "mean_contact_point", "image", "image_and_state"] = Field(
         "state", description="name of the observation"
     )
 
@@ -407,7 +418,7 @@ class BncConnector(FixtureOffsetOptions, PriorOptions, DemonstratedInsertion):
         """
         if self.has_image:
             return None, None
-        across = () if self.observation == "state" else (-1.0,) * 4
+        across = (-1.0,) * {"state": 0, "mean_contact_point": 6}.get(self.observation, 4)
         observation = (1.0, *HALF_TURN, *HALF_TURN_OF_WRENCH, *across)
         half = Symmetry.of_signs(observation, HALF_TURN, (-1.0, -1.0, 1.0, *HALF_TURN_OF_WRENCH))
         more = len(self.force_limit_terms())

@@ -25,8 +25,15 @@ from guiderail.diagrams.tasks.registry import register_task
 from guiderail.diagrams.tasks.task import Condition, ScriptedPolicy, terminal_reward
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import MM, POSE_SIZE
-from guiderail.models.objects.grid_clamp.geometry import CLAMP_SDF, TABLE_SDF, GridClampDimensions
-from guiderail.models.objects.grid_clamp.sdf import FRICTION, clamp_surfaces, folder_of, table_surfaces
+from guiderail.models.objects.grid_clamp import (
+    CLAMP_SDF,
+    FRICTION,
+    TABLE_SDF,
+    GridClampDimensions,
+    clamp_surfaces,
+    folder_of,
+    table_surfaces,
+)
 from guiderail.models.objects.surfaces import Surface
 from guiderail.models.templates import load_template
 

@@ -34,8 +34,12 @@ from guiderail.models.common.arrays import find_streak
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.control.motion_constraints import MotionConstraints
-from guiderail.models.objects.narrow_passage import demonstrations
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry, action_cost
+from guiderail.models.objects.narrow_passage import (
+    NUM_STEPS,
+    PassageGeometry,
+    action_cost,
+    load_demonstrations,
+)
 from guiderail.models.primitives import ReferenceTrajectory
 
 DEFAULT_GEOMETRY = PassageGeometry()
@@ -100,7 +104,7 @@ MAX_START = 2.0  # [m] largest coordinate of a given start
 @cache
 def reference_trajectory() -> ReferenceTrajectory:
     """Return the reference of the nine demonstrations, fitted once per process."""
-    return ReferenceTrajectory.from_demonstrations(demonstrations.load(), components=COMPONENTS, floor=FLOOR)
+    return ReferenceTrajectory.from_demonstrations(load_demonstrations(), components=COMPONENTS, floor=FLOOR)
 
 
 @register_task("NarrowPassage")
@@ -190,7 +194,7 @@ class NarrowPassage(Task):
     @property
     def duration(self) -> float:
         """Duration of the demonstrations [s]."""
-        return demonstrations.NUM_STEPS * CONTROL_PERIOD
+        return NUM_STEPS * CONTROL_PERIOD
 
     @property
     def collision(self) -> Threshold:
@@ -315,7 +319,7 @@ class NarrowPassage(Task):
         return Scene(
             to_world=in_plane,
             camera=Camera((480, 640), np.deg2rad(40), X_WC),
-            demonstrations=tuple(demonstrations.load().outputs),
+            demonstrations=tuple(load_demonstrations().outputs),
             constraint=(edge,),
             viewpoint=((0.4, 0.35, 0.78), (0.4, 0.48, 0.0)),
             line_radius=0.0025,

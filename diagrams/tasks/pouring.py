@@ -35,7 +35,7 @@ from guiderail.diagrams.tasks.task import (
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.termination import Termination
 from guiderail.models.common.transforms import transform_to_pose
-from guiderail.models.objects.pouring.vessels import MUG, Ball
+from guiderail.models.objects.pouring import MUG, Ball
 from guiderail.models.templates import SharedControlTemplate, load_template
 
 FULL_SPEED = 0.15  # speed at an input of 1 along one axis [m/s]

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 import gymnasium
 
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import load_plugin
-from guiderail.models.common.registry import Registry, check_class, did_you_mean
+from guiderail.models.common.registry import Registry, check_class, did_you_mean, load_plugin
 
 if TYPE_CHECKING:
     from guiderail.diagrams.tasks.task import Task

@@ -17,9 +17,8 @@ from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.diagrams.tasks.contact_probe import SPEEDS, probe_contact
 from guiderail.models.common.transforms import MM
 from guiderail.models.control.wrench import center_of_pressure
+from guiderail.models.objects.bnc_connector import FRICTION, BncDimensions
 from guiderail.models.objects.bnc_connector.demonstrations import poses
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.bnc_connector.sdf import FRICTION
 from guiderail.systems.recorder import Recording
 from guiderail.tools.visualization.figures import legend, new_figure, save_figure
 from research.benchmarks import with_progress

@@ -37,7 +37,7 @@ from .models.laws import Law as Law
 from .models.laws import PrimitiveLaw as PrimitiveLaw
 from .models.laws import Stepper as Stepper
 from .models.laws import TemplateLaw as TemplateLaw
-from .models.objects.narrow_passage.geometry import PassageGeometry as PassageGeometry
+from .models.objects.narrow_passage import PassageGeometry as PassageGeometry
 from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp

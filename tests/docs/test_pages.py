@@ -77,7 +77,7 @@ def test_reference_has_every_command_task_and_template_kind(reference):
     import typer
 
     from guiderail.diagrams.tasks.registry import TASKS
-    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
     from guiderail.tools.cli.main import load_commands
     from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 

@@ -16,7 +16,7 @@ from guiderail.diagrams.stations.plane import PlaneStation
 from guiderail.diagrams.tasks.registry import TASKS, register_task
 from guiderail.diagrams.tasks.task import Task, Threshold
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 from guiderail.tools.catalog import describe_task_options
 from guiderail.tools.evaluation.baselines import find_scripted_policy

@@ -17,7 +17,7 @@ import typer
 import typer.core
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import find_plugins
+from guiderail.models.common.registry import find_plugins
 
 SEED = 1_000_000  # default seed of the first held-out episode
 COLUMN = 19  # width of a value in a table with several columns [characters]
@@ -353,7 +353,9 @@ PolicyTasks = Annotated[
 ]
 TrustPolicy = Annotated[
     bool,
-    option("Read a policy from a file that can execute code: a .zip of Stable-Baselines3.", "--trust-policy"),
+    option(
+        "Read a policy from a file that can execute code: a .zip of Stable-Baselines3 or TorchScript.", "--trust-policy"
+    ),
 ]
 Processes = Annotated[
     int | None,

@@ -12,8 +12,7 @@ from guiderail.diagrams.guidance.registry import GUIDANCE
 from guiderail.diagrams.stations.registry import STATIONS
 from guiderail.diagrams.tasks.registry import TASKS, check_task_name
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import MissingSiblingError, find_plugins, load_plugin
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import MissingSiblingError, did_you_mean, find_plugins, load_plugin
 from guiderail.tools.cli import app as cli
 from guiderail.tools.cli.app import argument, option, print_message, print_progress, print_result
 
@@ -207,7 +206,7 @@ def evaluate(
     """Evaluate a policy on held-out episodes, together with baseline policies.
 
     With several --task, or for a run over a set of environments, the policy is evaluated in each environment.
-    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX file, or
+    With --task, POLICY is the folder of a policy, a .zip of Stable-Baselines3, an ONNX or TorchScript file, or
     module:function (FILE.py:function), which returns an action for an observation. The policy acts deterministically,
     on initial conditions from random numbers that training never uses. The demonstration alone, random actions and the
     scripted policy of the task run on the same episodes: if they succeed as well, the task is too easy to show

@@ -269,7 +269,7 @@ def evaluate(
         processes: Largest number of processes; None for the number of cores. The results do not depend on it: a policy
             with internal state resets it in `Callback.on_episode_start`. A policy that samples random numbers seeds its
             generator in a method `start_episode(number)`, whose number depends on the episode's seed.
-        trust_policy: True to read a policy file that can execute code, a zip of Stable-Baselines3.
+        trust_policy: True to read a policy file that can execute code: a zip of Stable-Baselines3 or TorchScript.
         resample_offsets: True to sample the hidden values, which are constant in a run, again in every episode.
         save: File of demonstrations to write from the successful episodes, .npz or .csv; it must not exist.
         signal: Poses that are saved, "commanded" or "measured". Under impedance control a primitive should learn the

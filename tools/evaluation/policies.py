@@ -1,7 +1,7 @@
 """Policies of any origin: a run, a policy's folder, a file of another library, a function, or an object with `predict`.
 
 Code in a file is executed only if the user allows it: a policy's folder and an ONNX file hold only numbers, but a zip
-of Stable-Baselines3 is a pickle. With `module:function`, the user names the code.
+of Stable-Baselines3 is a pickle and a TorchScript file is a program. With `module:function`, the user names the code.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from guiderail.tools.imports import import_modules, module_name
 from guiderail.tools.pretrained import PRETRAINED, find_run
 from guiderail.tools.spaces import describe_space, from_tensors, has_layout, layout, probes, takes_observations
 
-ENDINGS = (".zip", ".onnx")
-"""Endings of files of policies: Stable-Baselines3 and ONNX."""
+ENDINGS = (".zip", ".onnx", ".pt", ".ts", ".torchscript")
+"""Endings of files of policies: Stable-Baselines3, ONNX and TorchScript."""
 
 # Package and algorithm that read a zip of Stable-Baselines3, by the module of the policy's class, because the zip does
 # not name its algorithm.
@@ -254,10 +254,10 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     """Return the policy of a folder, a file or `module:function`.
 
     Args:
-        source: Folder with `policy.safetensors`; `pretrained:NAME`; .zip of Stable-Baselines3; .onnx; or
-            `module:function`, where `module` is a module's name or a file (.py), and `function` is any policy that
-            `as_policy` takes, or a class of such policies.
-        trust_policy: True to read a zip of Stable-Baselines3, which can execute code.
+        source: Folder with `policy.safetensors`; `pretrained:NAME`; .zip of Stable-Baselines3; .onnx; TorchScript
+            (.pt, .ts, .torchscript); or `module:function`, where `module` is a module's name or a file (.py), and
+            `function` is any policy that `as_policy` takes, or a class of such policies.
+        trust_policy: True to read files that can execute code: a zip of Stable-Baselines3 and TorchScript.
     """
     if (function := function_of(str(source))) is not None:
         return _load_function(*function)
@@ -269,10 +269,9 @@ def load_policy(source: str | Path, *, trust_policy: bool = False) -> PolicyFn:
     if path.suffix == ".onnx":
         return _load_onnx(path)
     if not trust_policy:
-        raise InputError(
-            f"{path} is a pickle, which can execute code when it is read: give --trust-policy if you trust its origin"
-        )
-    return _load_sb3(path)
+        kind = "is a pickle, which can execute code when it is read" if path.suffix == ".zip" else "is a program"
+        raise InputError(f"{path} {kind}: give --trust-policy if you trust its origin")
+    return _load_sb3(path) if path.suffix == ".zip" else _load_torchscript(path)
 
 
 def function_of(source: str) -> tuple[str, str] | None:
@@ -316,6 +315,55 @@ def _load_sb3(path: Path) -> PolicyFn:
             f"{path} cannot be read ({_describe_error(error)}): save it with the installed versions"
         ) from error
     return PredictPolicy(model)
+
+
+def _load_torchscript(path: Path) -> PolicyFn:
+    require_extra("torch")
+    import torch
+
+    try:
+        module = torch.jit.load(path, map_location="cpu")
+    except RuntimeError as error:
+        raise InputError(f"{path} is no TorchScript file: write it with torch.jit.script(module).save(...)") from error
+    return TorchScriptPolicy(module.eval(), path)
+
+
+class TorchScriptPolicy(ForeignPolicy):
+    """Policy of a TorchScript file; every episode begins with the state of the file.
+
+    The exported method `reset` of the module is called too, if it has no arguments.
+    """
+
+    def __init__(self, module: Any, path: Path):
+        """Construct the policy of a module that `path` contains, which must not have been called."""
+        super().__init__(self._forward, name=path.name)
+        self._stored, self._path = module, path
+        self._module = deepcopy(module)
+
+    def copy(self) -> TorchScriptPolicy:
+        """Return the policy in the state of the file."""
+        return TorchScriptPolicy(self._stored, self._path)
+
+    def on_episode_start(self) -> None:
+        """Restore the buffers and attributes of the file, and call the exported method `reset`."""
+        self._module = deepcopy(self._stored)
+        reset = getattr(self._module, "reset", None)
+        if callable(reset) and len(reset.schema.arguments) == 1:  # only the module itself
+            with naming_failures(f"reset of the policy {self._path.name}"):
+                reset()
+
+    def _forward(self, observation: np.ndarray) -> np.ndarray:
+        import torch
+
+        try:
+            with torch.inference_mode():
+                action = self._module(torch.as_tensor(observation, dtype=torch.float32)[None])
+        except (RuntimeError, torch.jit.Error) as error:  # the lines before the last one are a traceback of TorchScript
+            reason = ([line.strip() for line in str(error).splitlines() if line.strip()] or [""])[-1]
+            raise RuntimeError(reason.removeprefix("RuntimeError: ")) from error
+        if not isinstance(action, torch.Tensor):
+            raise InputError(f"{self._path} returns {brief(action)} instead of a tensor of actions")
+        return action.numpy()
 
 
 def _load_onnx(path: Path) -> PolicyFn:

@@ -16,8 +16,7 @@ from pydantic.dataclasses import dataclass
 from guiderail.diagrams.envs.options import entries_of, flat_options, option_fields
 from guiderail.models.common.arrays import as_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.models.common.plugins import find_plugins
-from guiderail.models.common.registry import did_you_mean
+from guiderail.models.common.registry import did_you_mean, find_plugins
 from guiderail.tools.learning.learner import LEARNERS, LearnerConfig, NonNegative, Positive, Symmetries, reject_bool
 
 DEFAULT_PRESET = "tqc_contact"
@@ -162,7 +161,7 @@ _TABLE_4_1 = OffPolicyConfig(
 _TABLE_3_2 = replace(_TABLE_4_1, learning_rate=8e-4, gamma=0.95, gamma_per="action", learning_starts=1000)
 _FAST = OffPolicyConfig(learning_rate=1e-3, gamma=0.998, gradient_steps=8, ent_coef="auto")
 
-# The measurements behind each preset are in docs/experiments.md.
+# The measurements behind each preset are in research/experiments.md.
 PRESETS = {
     # Contact makes learning oscillate. Small batches, a moderate learning rate and layer normalization reduce the
     # oscillation. Greedy episodes train the critics on returns of the mean action. Checkpoint selection exports the

@@ -19,7 +19,7 @@ from guiderail.diagrams.tasks.bnc_connector import reference_trajectory
 from guiderail.diagrams.tasks.registry import TASKS, environment_id, register_task
 from guiderail.diagrams.tasks.task import Task
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import ReferenceTrajectory
 
 

@@ -10,7 +10,7 @@ from guiderail.diagrams.guidance.guidance import INPUTS, OUTPUTS, check_guidance
 from guiderail.diagrams.guidance.prior import PrimitiveConfig, PriorKnowledge, limits_per_output
 from guiderail.diagrams.guidance.registry import build_guidance
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import KeepOut
 from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.control.shapes import Sphere
 from guiderail.models.laws import StateProgress
@@ -202,7 +202,7 @@ def test_primitive_is_evaluated_once_a_control_step(skill):
 @pytest.mark.parametrize("kind", ["kmp", "kgrl", "skgrl"])
 def test_motion_constraints_bound_the_primitives_commands(skill, kind):
     disc = Sphere(skill.reference.means[30], 0.03)
-    motion = MotionConstraints(skill.constraints, [disc], (), [0.3, 0.3], [3.0, 3.0])
+    motion = MotionConstraints(skill.constraints, [disc], [0.3, 0.3], [3.0, 3.0])
     guidance = build(kind, replace(skill, motion=motion))
     rng = np.random.default_rng(0)
     commands, _ = rollout(guidance, np.repeat(rng.uniform(-1, 1, (STEPS // 5, 2)), 5, axis=0))

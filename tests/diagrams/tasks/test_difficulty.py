@@ -10,8 +10,8 @@ from guiderail.diagrams.tasks.bnc_connector import BncUncertainty, reference_tra
 from guiderail.diagrams.tasks.grid_clamp import scripted_gentle_search, straight_descent
 from guiderail.diagrams.tasks.insertion import InsertionReset
 from guiderail.models.common.transforms import MM
-from guiderail.models.objects.bnc_connector.geometry import BncDimensions
-from guiderail.models.objects.grid_clamp.geometry import GridClampDimensions
+from guiderail.models.objects.bnc_connector import BncDimensions
+from guiderail.models.objects.grid_clamp import GridClampDimensions
 from guiderail.tools.evaluation.baselines import zero_policy
 from guiderail.tools.evaluation.evaluate import evaluate_policy
 

@@ -15,7 +15,7 @@ from guiderail.diagrams.envs.config import prior_of
 from guiderail.diagrams.guidance.registry import possible_guidance
 from guiderail.diagrams.tasks.narrow_passage import NarrowPassage
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 
 WORLD = PassageGeometry()
 GUIDANCE = possible_guidance(prior_of(NarrowPassage).provides)

@@ -5,7 +5,7 @@ import pytest
 
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.tasks.narrow_passage import HARD, NarrowPassageOptions, scripted_slalom
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.tools.evaluation.baselines import BASELINES, constant_policy, zero_policy
 from guiderail.tools.evaluation.rollout import rollout
 

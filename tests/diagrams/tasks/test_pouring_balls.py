@@ -7,7 +7,7 @@ from guiderail.diagrams.envs.config import EnvConfig
 from guiderail.diagrams.envs.make import make_env
 from guiderail.diagrams.stations.pouring import PouringConfig
 from guiderail.diagrams.tasks.pouring import scripted_pour_aimed
-from guiderail.models.objects.pouring.vessels import Ball
+from guiderail.models.objects.pouring import Ball
 
 OPTIONS = {"balls": 6, "balls_in": 5, "ball_diameter": 0.026}
 # Positions of a ball [m] in the frame of the mug's tip.

@@ -8,6 +8,7 @@ import pytest
 from guiderail.diagrams.tasks import bnc_connector as connector
 from guiderail.diagrams.tasks import narrow_passage as passage
 from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage import PATH
 from guiderail.models.primitives import Demonstrations, mixture
 from guiderail.models.primitives.mixture import (
     FIELDS,
@@ -20,7 +21,7 @@ from guiderail.models.primitives.mixture import (
 )
 
 PACKAGED = [(path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()]
-PACKAGED.append((passage.demonstrations.PATH, passage.COMPONENTS))
+PACKAGED.append((PATH, passage.COMPONENTS))
 
 
 @pytest.mark.parametrize(("path", "components"), PACKAGED, ids=lambda value: getattr(value, "stem", None))

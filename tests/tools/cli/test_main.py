@@ -12,7 +12,7 @@ import typer
 import guiderail
 from guiderail.diagrams.tasks.registry import environment_id
 from guiderail.models.common.errors import InputError
-from guiderail.models.common.plugins import SIBLINGS
+from guiderail.models.common.registry import SIBLINGS
 from guiderail.models.primitives.kernels import KERNELS
 from guiderail.tools.cli import main as main_module
 from guiderail.tools.cli.app import to_json

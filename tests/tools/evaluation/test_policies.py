@@ -1,12 +1,14 @@
-"""Policies of other packages: Stable-Baselines3, ONNX, functions and objects with `predict`."""
+"""Policies of other packages: Stable-Baselines3, ONNX, TorchScript, functions and objects with `predict`."""
 
 import math
 import threading
+import zipfile
 from pathlib import Path
 
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from onnx_file import linear_policy
 from sb3_contrib import TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3 import A2C, DDPG, PPO, SAC, TD3
@@ -51,12 +53,54 @@ def test_zip_is_read_only_with_trust(env, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("none.zip", "there is no file"), ("text.zip", "no model of Stable-B"), ("text.onnx", "is no ONNX file")],
+    [("none.zip", "there is no file"), ("text.zip", "no model of Stable-B"), ("text.pt", "is no TorchScript file"),
+     ("text.onnx", "is no ONNX file")],
 )  # fmt: skip
 def test_damaged_files_are_refused(name, message, tmp_path):
     (tmp_path / f"text{Path(name).suffix}").write_text("text")
     with pytest.raises(InputError, match=message):
         load_policy(tmp_path / name, trust_policy=True)
+
+
+class Script(torch.nn.Module):
+    """Network that doubles the first two entries of the observation."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        return 2 * observation[:, :2]
+
+
+def test_torchscript_is_loaded_only_with_trust(env, tmp_path):
+    file = tmp_path / "policy.pt"
+    torch.jit.trace(Script(), torch.zeros(1, 3)).save(file)
+    with pytest.raises(InputError, match="is a program: give --trust-policy"):
+        load_policy(file)
+    act = load_policy(file, trust_policy=True)
+    np.testing.assert_allclose(check_compatible(act, env)(OBSERVATION), [0.2, -0.4])
+
+
+class Pair(torch.nn.Module):
+    """Network that returns two tensors."""
+
+    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        return observation, observation
+
+
+def test_torchscript_that_returns_no_tensor_is_named(tmp_path):
+    file = tmp_path / "pair.pt"
+    torch.jit.trace(Pair(), torch.zeros(1, 3)).save(file)
+    with pytest.raises(InputError, match=r"pair\.pt returns .* instead of a tensor"):
+        load_policy(file, trust_policy=True)(OBSERVATION)
+
+
+def test_damaged_model_of_sb3_is_named(tmp_path):
+    file = tmp_path / "damaged.zip"
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", "x" * 5000)
+    content = bytearray(file.read_bytes())
+    content[40:50] = bytes(10)
+    file.write_bytes(content)
+    with pytest.raises(InputError, match="is no model of Stable-Baselines3"):
+        load_policy(file, trust_policy=True)
 
 
 @pytest.mark.parametrize("batch", [1, "batch", None])
@@ -187,6 +231,39 @@ def test_exception_of_a_policy_is_named(policy, message, env):
         check_compatible(policy, env)
     with pytest.raises(InputError, match=message):
         evaluate(policy, "Bead", 2, baselines=(), processes=2)
+
+
+class FailingNetwork(torch.nn.Module):
+    """Network whose assertion fails for every observation."""
+
+    def forward(self, observation: torch.Tensor) -> torch.Tensor:
+        assert bool(observation.sum() > 1e9), "too small"
+        return observation
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (FailingNetwork(), "RuntimeError: AssertionError: too small"),
+        (torch.nn.Linear(3, 2).double(), ".*Float and Double"),
+    ],
+)
+def test_exception_of_torchscript_is_named(module, message, env, tmp_path):
+    torch.jit.script(module).save(tmp_path / "policy.pt")
+    with pytest.raises(InputError, match=rf"^the policy policy\.pt raised {message}"):
+        check_compatible(load_policy(tmp_path / "policy.pt", trust_policy=True), env)
+
+
+def test_class_of_a_file_that_cannot_be_constructed_is_named(tmp_path):
+    (tmp_path / "lab_model.py").write_text("class Model:\n    def __init__(self):\n        raise OSError('no disk')\n")
+    with pytest.raises(InputError, match=r"lab_model\.py:Model cannot be constructed: it raised OSError: no disk"):
+        load_policy(f"{tmp_path}/lab_model.py:Model")
+
+
+def test_message_has_a_hint_when_a_function_returns_a_pair(env):
+    message = "only a predict method returns an action and a state: return the action alone"
+    with pytest.raises(InputError, match=message):
+        check_compatible(lambda observation: (np.zeros(2), None), env)
 
 
 @pytest.mark.parametrize("task", ["Bead", None])

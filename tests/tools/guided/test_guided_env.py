@@ -427,7 +427,7 @@ def test_gymnasium_checker_accepts_the_environment():
 @pytest.mark.parametrize("guidance", ["kgrl", "skgrl"])
 def test_shapes_and_limits_apply_in_the_segment_frame(guidance):
     ball = Sphere([-0.2, -0.03, 0.0], 0.04)
-    motion = MotionConstraints(BOX, [ball], (), np.full(3, 0.8), np.full(3, 8.0))
+    motion = MotionConstraints(BOX, [ball], np.full(3, 0.8), np.full(3, 8.0))
     env = make_guided(guidance, constraints=motion, action_scale=5.0)
     rng = np.random.default_rng(0)
     env.unwrapped.commands.clear()

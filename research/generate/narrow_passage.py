@@ -5,18 +5,14 @@ originals, they are smooth, have the same duration, vary where the plane is free
 and goals differ by about 1 cm (standard deviation). They ignore the obstacle and the restricted zone: their mean
 crosses the obstacle, and two of them enter the zone.
 
-`python -m research.generate passage-demonstrations` writes the packaged file; afterwards generate `mixtures` again.
+After the generator `passage-demonstrations`, run `mixtures` again.
 """
-
-from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from guiderail.models.primitives import Demonstrations
-
-PATH = Path(__file__).with_name("narrow_passage.npz")
 
 NUM_DEMONSTRATIONS = 9
 NUM_STEPS = 400
@@ -62,11 +58,6 @@ def generate() -> Demonstrations:
     y = _Y[0] + (_Y[1] - _Y[0]) * progress + _profile(_DEVIATION_Y, progress) * curves[..., 1]
     outputs = gaussian_filter1d(np.stack([x, y], axis=-1), _SMOOTHING, axis=1, mode="nearest")
     return Demonstrations(PERIOD * np.arange(NUM_STEPS), list(outputs), names=("x [m]", "y [m]"))
-
-
-def load() -> Demonstrations:
-    """Load the nine demonstrations of 400 positions [m] each."""
-    return Demonstrations.load(PATH)
 
 
 def _profile(knots: np.ndarray, progress: np.ndarray) -> np.ndarray:
