@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from guiderail.diagrams.tasks.bnc_connector.task import (
+from guiderail.diagrams.tasks.bnc_connector import (
     CENTER_OF_PRESSURE,
     COMMAND,
     HOLD_UNTIL,

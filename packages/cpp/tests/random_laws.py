@@ -22,13 +22,14 @@ from guiderail.models.control.wrench import WrenchBound, bounded_wrench, governe
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.templates import load_template, parse_template
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
+from guiderail.systems.command_checks import CommandWatchdog
+from guiderail.systems.wrench_limits import PhaseWrenchLimit
+from guiderail.tools.export import GUIDED, load_skill
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.export import governor_arrays, policy_arrays
-from guiderail_cpp.recording import double_action
+from guiderail_cpp.export import EXPORTED, governor_arrays, policy_arrays, skill_arrays
+from guiderail_cpp.recording import double_action, record_skill
 from guiderail_cpp.templates import template_arrays
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter
 
@@ -413,7 +414,16 @@ def watchdog(steps: int) -> Files:
     return _files({"period": np.array([period]), "timeout": np.array([0.1])}, recording)
 
 
+def whole_skill(steps: int) -> Files:
+    """Observation, policy and guidance of the connector that comes with the package."""
+    skill = load_skill("pretrained:connector", GUIDED, EXPORTED)
+    data, texts, signals = skill_arrays(skill)
+    recording = record_skill(skill, signals, episodes=-(-steps // skill.num_steps))
+    return save(frozen(data), metadata=texts), save(frozen({name: rows[:steps] for name, rows in recording.items()}))
+
+
 LAWS: dict[str, Callable[[int], Files]] = {
+    "whole skill of the connector": whole_skill,
     "kgrl": kgrl,
     "kgrl, equal bounds": equal_bounds,
     "skgrl": skgrl,

@@ -38,7 +38,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from ros2_robot import use_loopback
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.inverse_kinematics import pose_error
 from guiderail_hardware.drivers import ros2

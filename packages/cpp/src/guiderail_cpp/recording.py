@@ -40,8 +40,8 @@ def record_skill(skill: TrainedSkill, signals: Mapping[str, int], episodes: int 
     rng, rows, start = np.random.default_rng(seed), [], _start(skill)
     period, size = skill.prior.period, skill.prior.pose_size
     entries = skill.description["observation"]
+    guidance = build_guidance(skill.config.environment["guidance"], skill.prior)
     for _ in range(episodes):
-        guidance = build_guidance(skill.config.environment["guidance"], skill.prior)
         simulator = Simulator(guidance)
         context = simulator.get_mutable_context()
         ports = {name: guidance.GetInputPort(name) for name in ("action", "pose", "wrench")}
