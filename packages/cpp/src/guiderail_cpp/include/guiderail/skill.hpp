@@ -39,6 +39,10 @@ class Skill {
     pressure_ = observation_.signal("center_of_pressure"), min_force_ = data.number("observation/min_force");
     if (pressure_ && observation_.size("center_of_pressure") != 2) throw std::runtime_error("a center of pressure is two numbers");
     state_ = observation_.signal("state"), distance_ = observation_.signal("transition_distance");
+    if (policy_.inputs() != observation_.count()) throw std::runtime_error("the observation does not fit the policy");
+    if (!(period_ > 0 && std::isfinite(period_) && std::isfinite(duration_) && action_repeat_ >= 1))
+      throw std::runtime_error("the period, the duration or the repetition of actions of the skill is invalid");
+    if (std::max(pose_size_, desired_size_) > outputs()) throw std::runtime_error("the observed pose does not fit the guidance");
     const int actions = primitive_ ? primitive_->actions() : template_->actions();
     if (actions != policy_.outputs()) throw std::runtime_error("the policy's action does not fit the guidance");
   }
