@@ -19,21 +19,36 @@ class PassageGeometry:
 
     The walls bound the position of the robot's center. The obstacles are discs on the path of the demonstrations. The
     robot can pass through an obstacle, at a cost.
+
+    Attributes:
+        start: Start (x, y) of the robot.
+        goal: Goal (x, y) of the robot.
+        goal_radius: Distance within which the goal is reached.
+        wall_y: Lower and upper face of the two walls.
+        gap_x: Left and right side of the gap between the walls.
+        wall_length: Length of each wall, beyond the reach of the robot.
+        zone_x: Lower bound of x in the restricted zone.
+        obstacle: Center of the obstacle.
+        obstacle_radius: Radius of an obstacle.
+        second_obstacle: Center of a second obstacle, or None.
+        obstacles_move: True if the positions of the obstacles are sampled in every episode.
+        obstacle_margin: Distance from an obstacle within which it has a cost.
+        robot_radius: Radius of the robot; the simulated walls are smaller than `walls` by this radius.
     """
 
-    start: tuple[float, float] = (0.30, 0.05)  # start (x, y) of the robot
-    goal: tuple[float, float] = (0.40, 0.95)  # goal (x, y) of the robot
-    goal_radius: float = 0.05  # distance within which the goal is reached
-    wall_y: tuple[float, float] = (0.50, 0.60)  # lower and upper face of the two walls
-    gap_x: tuple[float, float] = (0.32, 0.38)  # left and right side of the gap between the walls
-    wall_length: float = 5.0  # length of each wall, beyond the reach of the robot
-    zone_x: float = 0.60  # lower bound of x in the restricted zone
-    obstacle: tuple[float, float] = (0.56, 0.27)  # center of the obstacle
+    start: tuple[float, float] = (0.30, 0.05)
+    goal: tuple[float, float] = (0.40, 0.95)
+    goal_radius: float = 0.05
+    wall_y: tuple[float, float] = (0.50, 0.60)
+    gap_x: tuple[float, float] = (0.32, 0.38)
+    wall_length: float = 5.0
+    zone_x: float = 0.60
+    obstacle: tuple[float, float] = (0.56, 0.27)
     obstacle_radius: float = 0.03
-    second_obstacle: tuple[float, float] | None = None  # center of a second obstacle, or None
-    obstacles_move: bool = False  # True if the positions of the obstacles are sampled in every episode
-    obstacle_margin: float = 0.04  # distance from an obstacle within which it has a cost
-    robot_radius: float = 0.015  # radius of the robot; the simulated walls are smaller than `walls` by this radius
+    second_obstacle: tuple[float, float] | None = None
+    obstacles_move: bool = False
+    obstacle_margin: float = 0.04
+    robot_radius: float = 0.015
 
     @property
     def obstacles(self) -> np.ndarray:
@@ -89,7 +104,7 @@ class PassageGeometry:
     def obstacle_cost(self, pose: np.ndarray, obstacle: Sequence[float] | np.ndarray | None = None) -> float:
         """Return the cost r_o of one obstacle as a reward, zero or negative (equation 4.24).
 
-        See `obstacle_distance` for the arguments.
+        The arguments are those of `obstacle_distance`: `pose` (2,) and `obstacle` (2,) [m].
         """
         return -100.0 * max(self.obstacle_margin - self.obstacle_distance(pose, obstacle), 0.0)
 
