@@ -56,6 +56,17 @@ def test_runner_survives_wrong_measurements_and_keeps_its_limits(tmp_path):
     assert result.returncode == 0, result.stdout + result.stderr
 
 
+@needs_compiler
+def test_damaged_template_is_refused_when_it_is_read(tmp_path):
+    folder = tmp_path / "skill"
+    export_cpp("pretrained:pouring", folder)
+    sanitizers = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    compile_program(folder, HERE / "runner_test.cpp", tmp_path / "runner_test", *sanitizers)
+    command = [tmp_path / "runner_test", folder / "skill.safetensors"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
 def test_description_lists_signals_and_action(tmp_path):
     export_cpp("pretrained:clamp", tmp_path / "skill")
     skill = json.loads((tmp_path / "skill/skill.json").read_text())
