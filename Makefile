@@ -106,7 +106,7 @@ outside: $(OUTSIDE)/.ready  ## train in metaworld and robosuite with guidance, i
 
 siblings:  ## each sibling's tests with the core and that sibling alone, in an environment of its own, minutes
 	$(PYTHON) -m venv --clear $(ALONE)
-	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,osqp,piqp,onnx]" \
+	$(ALONE)/bin/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e ".[learn,onnx]" \
 	  pytest pytest-xdist hypothesis psutil mpmath colorednoise rosbags ruckig ur-rtde
 	for sibling in $(SIBLINGS); do \
 	  required=""; [ $$sibling = calibration ] && required="-e packages/studies"; \

@@ -3,7 +3,7 @@
 import numpy as np
 
 import guiderail as gr
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.objects.narrow_passage import PassageGeometry
 
 PATH = np.column_stack([np.full(80, 0.35), np.linspace(0.1, 0.9, 80)])
 

@@ -16,9 +16,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, JointTorques, impedance_torques
 from guiderail.models.control.wrench import MAX_WRENCH_SIZE, WrenchBound
 from guiderail.systems.support import declarations as declare
-from guiderail.systems.support.convertible_system import ConvertibleSystem
 from guiderail.systems.support.declarations import input_getter, output_getter
-from guiderail.systems.support.differentiable_impedance import differentiable_torques, values_of
 from guiderail.systems.support.drake_multibody import (
     check_plant,
     effort_limits,
@@ -26,8 +24,8 @@ from guiderail.systems.support.drake_multibody import (
     pose_to_transform,
     transform_to_pose,
 )
-from guiderail.systems.support.last_valid_bound import LastValidBound
-from guiderail.systems.support.last_valid_pose import LastValidPose
+from guiderail.systems.support.last_valid import LastValidBound, LastValidPose
+from guiderail.systems.support.scalar_conversion import ConvertibleSystem, differentiable_torques, values_of
 
 MAX_STIFFNESS = 1e8  # largest stiffness [N/m, Nm/rad]; above it, wrenches could overflow
 

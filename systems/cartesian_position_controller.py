@@ -19,7 +19,7 @@ from guiderail.models.control.damped_inverse import damped_joint_velocities, is_
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import input_getter, output_getter
 from guiderail.systems.support.drake_multibody import check_plant, pose_to_transform, transform_to_pose
-from guiderail.systems.support.last_valid_pose import CommandValidity
+from guiderail.systems.support.last_valid import CommandValidity
 
 
 @dataclass(frozen=True)

@@ -22,14 +22,14 @@ from guiderail.diagrams.stations.station import (
 from guiderail.diagrams.wiring import add_system
 from guiderail.models.common.arrays import round_period
 from guiderail.models.common.errors import InputError
-from guiderail.models.objects.pouring.vessels import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
+from guiderail.models.objects.pouring import MUG, THERMOS, Ball, Vessel, add_ball, add_shape, add_vessel
 from guiderail.models.robots import DEFAULT_ROBOT
 from guiderail.models.robots.mounting import add_drives, add_robot
 from guiderail.models.robots.robot import Robot, find_robot
-from guiderail.systems.body_poses import MeasuredPose, RelativePoses
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits
 from guiderail.systems.contact_detector import ContactDetector
-from guiderail.systems.wrench_sensor import WrenchSensor
+from guiderail.systems.poses import MeasuredPose, RelativePoses
+from guiderail.systems.wrench_sensors import WrenchSensor
 
 # Pose in the middle of the workspace, so that inverse kinematics finds the same branch for all poses.
 MID_POURING_POSE = np.array([-0.02, -0.15, 0.15, 0.0, 0.0, -0.8])

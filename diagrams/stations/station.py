@@ -242,12 +242,8 @@ class Station(Diagram):
         plant_context = self.plant.GetMyMutableContextFromRoot(context)
         self.plant.SetPositionsAndVelocities(plant_context, np.r_[positions, 0.0 * positions])
 
-    def joint_range(self, margin: float, min_singular_value: float) -> StateConstraints:
-        """Return constraints that keep the robot's joints within their limits and away from singular postures.
-
-        Args:
-            margin: Distance from the limits [rad].
-            min_singular_value: Smallest singular value of the scaled Jacobian [m]; 0 for no constraint.
+    def joint_range(self, margin: float) -> StateConstraints:
+        """Return constraints that keep the robot's joints within their limits and a margin [rad].
 
         Raises:
             InputError: If the station has no arm.

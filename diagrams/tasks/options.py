@@ -148,7 +148,7 @@ def reference_of_file(
         )
     num_steps = control_steps(demonstrations)
     fitted = ReferenceTrajectory.from_demonstrations(
-        demonstrations, components=components, num_steps=num_steps, floor=np.array(floor), prior_std=prior_std
+        demonstrations.resampled(num_steps), components=components, floor=np.array(floor), prior_std=prior_std
     )
     times = CONTROL_PERIOD * np.arange(num_steps)
     _REFERENCES[key] = ReferenceTrajectory(times, fitted.means, fitted.covariances)

@@ -77,7 +77,7 @@ def test_reference_has_every_command_task_and_template_kind(reference):
     import typer
 
     from guiderail.diagrams.tasks.registry import TASKS
-    from guiderail.models.templates.kinds import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
+    from guiderail.models.templates.parts import ACTIVE_CONSTRAINTS, INPUT_MAPPINGS, TRANSITION_DISTANCES
     from guiderail.tools.cli.main import load_commands
     from guiderail.tools.evaluation.metrics import COLUMNS, statistics_of
 
@@ -131,7 +131,7 @@ def test_reference_has_no_local_path(reference):
 def test_robot_page_has_the_limits_of_the_code():
     import numpy as np
 
-    from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+    from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
     from guiderail.diagrams.tasks.options import COLLISION_FORCE
     from guiderail.models.common.transforms import MM
     from guiderail_hardware.drivers.driver import EXTERNAL_TORQUE_SHARE, TORQUE_SHARE, VELOCITY_SHARE

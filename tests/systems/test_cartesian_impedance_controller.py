@@ -26,7 +26,7 @@ from pydrake.systems.framework import DiagramBuilder
 from scipy.spatial.transform import Rotation
 
 from guiderail.diagrams.stations.arm import add_arm, controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, damping_matrix, impedance_torques, spring_wrench
 from guiderail.models.control.wrench import WrenchBound

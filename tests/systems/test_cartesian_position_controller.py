@@ -8,9 +8,9 @@ from pydrake.multibody.tree import RevoluteJoint
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant, controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
-from guiderail.models.robots.iiwa import IIWA14
+from guiderail.models.robots.catalog import IIWA14
 from guiderail.models.robots.inverse_kinematics import solve_inverse_kinematics
 from guiderail.systems import cartesian_position_controller
 from guiderail.systems.cartesian_position_controller import CartesianPositionController, SpeedLimits

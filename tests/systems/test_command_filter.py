@@ -3,11 +3,10 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.command_filters import BarrierFilter, KeepOutFilter, TangentSpaceFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.models.control.command_filters import BarrierFilter, KeepOut, KeepOutFilter, TangentSpaceFilter
 from guiderail.models.control.motion_constraints import MotionConstraintFilter, MotionConstraints
 from guiderail.models.primitives import LinearConstraints
-from guiderail.systems.command_filter import CommandFilter
+from guiderail.systems.command_checks import CommandFilter
 
 PERIOD = 0.125
 BOX = LinearConstraints.box([-1.0, -np.inf], [1.0, np.inf])

@@ -5,7 +5,7 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.primitives import ZeroOrderHold
 
 from guiderail.models.common.errors import InputError
-from guiderail.systems.command_watchdog import CommandWatchdog
+from guiderail.systems.command_checks import CommandWatchdog
 
 PERIOD, TIMEOUT = 2.0**-6, 2.0**-3
 START, FIRST, SECOND = np.zeros(6), np.full(6, 1.0), np.full(6, 2.0)

@@ -17,9 +17,8 @@ from pydrake.systems.framework import LeafSystem
 import guiderail.systems
 from guiderail import systems
 from guiderail.diagrams.stations.arm import controller_model
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
-from guiderail.models.control.command_filters import BarrierFilter
-from guiderail.models.control.keep_out import KeepOut
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
+from guiderail.models.control.command_filters import BarrierFilter, KeepOut
 from guiderail.models.control.wrench import WrenchBound
 from guiderail.models.laws import Law, StateProgress
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
@@ -69,6 +68,7 @@ def system_by_name():
         systems.ConstraintViolation(LinearConstraints.box(np.zeros((3, 2)), np.ones((3, 2))), PERIOD),
         systems.ContinuousPose(np.zeros(6), PERIOD),
         systems.CenterOfPressure(0.5),
+        systems.MeanContactPoint(0.5, period=PERIOD, time_constant=1.0),
         systems.ImageObservation(4, 3, 2),
         systems.ContactDetector(plant, [body], [other], PERIOD),
         systems.EnergyTank(np.ones(6), np.ones(6), WrenchBound(np.ones(6), 1.0, 1.0), capacity=1.0, period=PERIOD),

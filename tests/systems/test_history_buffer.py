@@ -7,8 +7,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 from guiderail.models.common.errors import InputError
 from guiderail.models.common.transforms import nearest_pose
 from guiderail.models.primitives import Demonstrations, LcNsKmp, ReferenceTrajectory
-from guiderail.systems.history import HistoryBuffer
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import HistoryBuffer, LcNsKmpSystem
 
 
 class Counter(LeafSystem):
@@ -153,7 +152,7 @@ def test_first_commands_start_at_the_measured_angle_beyond_pi():
     sway = 0.02 * rng.standard_normal(5)
     outputs = [np.column_stack([0.1 * s, a * s, 0 * s, 0 * s, 0 * s, 3.14 + a * np.sin(s)]) for a in sway]
     reference = ReferenceTrajectory.from_demonstrations(
-        Demonstrations(0.02 * np.arange(60), outputs), components=3, floor=0.002, num_steps=60
+        Demonstrations(0.02 * np.arange(60), outputs), components=3, floor=0.002
     )
     builder = DiagramBuilder()
     kmp = builder.AddSystem(LcNsKmpSystem(LcNsKmp(reference, history=5, horizon=8), None, 0.02))

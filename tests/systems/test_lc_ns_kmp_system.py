@@ -6,8 +6,7 @@ from pydrake.systems.primitives import ConstantVectorSource, VectorLogSink, Zero
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory, UnsolvableError
-from guiderail.systems.history import HistoryBuffer
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import HistoryBuffer, LcNsKmpSystem
 from oracles.prerequisites import changed_outputs
 
 PERIOD = 0.02

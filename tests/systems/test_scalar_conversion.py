@@ -12,7 +12,7 @@ from guiderail import systems
 from guiderail.models.common.errors import InputError
 from guiderail.models.control.cartesian_impedance import ArmImpedance, impedance_torques
 from guiderail.models.control.wrench import WrenchBound
-from guiderail.systems.support.differentiable_impedance import differentiable_torques
+from guiderail.systems.support.scalar_conversion import differentiable_torques
 from oracles.prerequisites import changed_outputs
 from oracles.systems import check_stale_outputs
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium
 
@@ -19,9 +19,6 @@ from guiderail.tools.spaces import (
     has_layout,
     has_values,
 )
-
-if TYPE_CHECKING:
-    pass
 
 
 def rollout(
@@ -54,7 +51,7 @@ def rollout(
             is invalid, an environment of another package raises an exception or breaks Gymnasium's contract
             (`checked_step`), or a callback returns wrong columns (`new_columns`).
     """
-    from guiderail.tools.evaluation.metrics import Episode, episode_row, outside_row
+    from guiderail.tools.evaluation.metrics import episode_row, outside_row
 
     if not callable(act):
         act = as_policy(act)
@@ -93,7 +90,7 @@ def rollout(
             callback.on_step(transition)
         observation, is_over = next_observation, transition.is_last
     row = (
-        episode_row(Episode(index, base.trace, total, terms, info))
+        episode_row(index, base.trace, total, terms, info)
         if is_own
         else outside_row(index, total, infos, is_terminated=terminated)
     )

@@ -12,7 +12,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, cast
 
 import gymnasium
 import numpy as np
@@ -44,27 +44,29 @@ def reject_bool(value: Any) -> Any:
 
 Positive = Annotated[int, Field(ge=1, le=10**9), BeforeValidator(reject_bool)]
 NonNegative = Annotated[int, Field(ge=0, le=10**9), BeforeValidator(reject_bool)]
+Symmetries = bool | Literal["near"]
 
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class LearnerConfig:
-    """Base class of the learners' configurations: the settings that the training loop reads.
+    """Base class of the learners' configurations: the settings that every learner has.
 
-    A learner adds its own settings in a derived pydantic dataclass, which is its attribute `Config`.
+    A learner adds its own settings in a derived pydantic dataclass, which is its attribute `Config`. The training loop
+    also reads the settings below that have no annotation here. A learner that supports one of them declares it as a
+    field of its configuration.
 
     Attributes:
         algorithm: Registered name of the learner.
+        stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
+            never. Resuming such a run runs no further episodes.
         demonstration_episodes: Number of episodes at the start in which a demonstrator acts; the learner trains on
             their transitions.
         symmetry: Symmetry data augmentation, for tasks that have a symmetry; "near" also uses approximate ones.
-            On-policy learners refuse it.
         pipelined: Learn in a second process while the next episode is simulated with weights that are one episode
             older. The result is deterministic too.
         num_envs: Number N of processes that simulate episodes while the main process learns. Episode k uses the
             weights learned from the episodes before k − N: the result depends on N, not on the timing. 0: simulate and
             learn in turn.
-        stop_after_successes: Training ends early once the learner's own episodes succeeded this often in a row; 0:
-            never. Resuming such a run runs no further episodes.
         takes_images: True if the learner's networks accept observations with images.
         entries: Names of the fields that are entries of a structured setting; see `Options.entries`.
     """
@@ -73,11 +75,12 @@ class LearnerConfig:
     entries: ClassVar[Mapping[str, str]] = {}
 
     algorithm: str
-    demonstration_episodes: NonNegative = 0
-    symmetry: bool | Literal["near"] = False
-    pipelined: bool = False
-    num_envs: Annotated[NonNegative, Field(le=1024)] = 0
     stop_after_successes: NonNegative = 0
+
+    demonstration_episodes = 0
+    symmetry = cast("Symmetries", False)
+    pipelined = False
+    num_envs = 0
 
 
 class Learner(Callback, ABC):

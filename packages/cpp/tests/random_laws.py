@@ -23,9 +23,8 @@ from guiderail.models.laws.template_law import TemplateLaw
 from guiderail.models.policy import Policy
 from guiderail.models.primitives import LinearConstraints, Matern52, ReferenceTrajectory
 from guiderail.models.templates import load_template, parse_template
-from guiderail.systems.command_watchdog import CommandWatchdog
-from guiderail.systems.constraint_violation import ConstraintViolation
-from guiderail.systems.phase_wrench_limit import PhaseWrenchLimit
+from guiderail.systems.command_checks import CommandWatchdog, ConstraintViolation
+from guiderail.systems.wrench_limits import PhaseWrenchLimit
 from guiderail.tools.export import GUIDED, load_skill
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run

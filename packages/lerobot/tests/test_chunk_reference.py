@@ -7,7 +7,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from guiderail.models.common.errors import InputError
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
-from guiderail.systems.lc_ns_kmp_system import LcNsKmpSystem
+from guiderail.systems.movement_primitive import LcNsKmpSystem
 from guiderail.systems.policy_system import PolicyError
 from guiderail_lerobot.chunk_reference import ChunkReference
 

@@ -419,7 +419,7 @@ def test_ratio_lists_each_seed_once_with_several_evaluation_sets():
 
 def test_statistics_of_an_imported_task_are_computed(tmp_path):
     (tmp_path / "passage_of_lab.py").write_text(
-        "from guiderail.diagrams.tasks.narrow_passage.task import NarrowPassage\n"
+        "from guiderail.diagrams.tasks.narrow_passage import NarrowPassage\n"
         "from guiderail.diagrams.tasks.registry import register_task\n"
         "from guiderail.tools.evaluation.metrics import Metric\n\n\n"
         "@register_task('lab/Passage')\n"

@@ -4,8 +4,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from guiderail.models.common.errors import InputError
-from guiderail.models.control.keep_out import KeepOut
-from guiderail.models.objects.narrow_passage.geometry import PassageGeometry
+from guiderail.models.control.command_filters import KeepOut
+from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.models.primitives import LinearConstraints, UnsolvableError
 
 MARGIN = 0.02

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from guiderail.diagrams.tasks.bnc_connector import task as connector
-from guiderail.diagrams.tasks.narrow_passage import task as passage
+from guiderail.diagrams.tasks import bnc_connector as connector
+from guiderail.diagrams.tasks import narrow_passage as passage
 from guiderail.models.common.errors import InputError
+from guiderail.models.objects.narrow_passage import PATH
 from guiderail.models.primitives import Demonstrations, mixture
 from guiderail.models.primitives.mixture import (
     FIELDS,
@@ -20,7 +21,7 @@ from guiderail.models.primitives.mixture import (
 )
 
 PACKAGED = [(path, connector.COMPONENTS) for path in connector.DEMONSTRATIONS.values()]
-PACKAGED.append((passage.demonstrations.PATH, passage.COMPONENTS))
+PACKAGED.append((PATH, passage.COMPONENTS))
 
 
 @pytest.mark.parametrize(("path", "components"), PACKAGED, ids=lambda value: getattr(value, "stem", None))
@@ -43,8 +44,8 @@ def test_digest_depends_on_every_argument():
 def test_packaged_demonstrations_need_no_scikit_learn():
     """Importing scikit-learn would take 0.5 s and 60 MiB of every training process."""
     program = (
-        "import sys; from guiderail.diagrams.tasks.bnc_connector.task import reference_trajectory as connector; "
-        "from guiderail.diagrams.tasks.narrow_passage.task import reference_trajectory as passage; "
+        "import sys; from guiderail.diagrams.tasks.bnc_connector import reference_trajectory as connector; "
+        "from guiderail.diagrams.tasks.narrow_passage import reference_trajectory as passage; "
         "connector('insert'), connector('search'), connector('firm_search'), passage(); "
         "sys.exit('sklearn' in sys.modules)"
     )

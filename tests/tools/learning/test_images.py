@@ -97,14 +97,3 @@ def test_restored_learner_continues_as_without_interruption():
 def test_cuda_is_refused_when_absent():
     with pytest.raises(InputError, match="no CUDA device"):
         make(IMAGE_AND_STATE, device="cuda")
-
-
-def test_image_learner_refuses_unsupported_settings():
-    with pytest.raises(InputError, match="cannot use cuda"):
-        resolve_preset("tqc_contact", "tqc", {"device": "cuda", "num_envs": 2})
-    with pytest.raises(InputError, match="target actor"):
-        make(IMAGE_AND_STATE, "td3")
-    with pytest.raises(InputError, match="privileged critic takes no images"):
-        make(IMAGE_AND_STATE, privileged_critic=True)
-    with pytest.raises(InputError, match="too small"):
-        make(spaces.Box(0, 255, (6, 6, 3), np.uint8))

@@ -19,7 +19,7 @@ from guiderail.diagrams.stations.impedance_control import (
 )
 from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
-from guiderail.models.laws.skill import SKILL_FILE
+from guiderail.models.laws.primitive import SKILL_FILE
 from guiderail.models.policy import Policy
 from guiderail.models.templates import load_template
 from guiderail.tools.export import GUIDED, Exporter, TrainedSkill, to_json

@@ -8,7 +8,7 @@ from direct_driver import START, DirectDriver, start_station
 from pydrake.systems.analysis import Simulator
 
 from guiderail.diagrams.stations.arm import ArmControllerPlant
-from guiderail.diagrams.tasks.bnc_connector.task import BncWorkcell
+from guiderail.diagrams.tasks.bnc_connector import BncWorkcell
 from guiderail.models.common.errors import InputError
 from guiderail.models.robots.robot import find_robot
 from guiderail_hardware.drivers.clock import WallClock

@@ -39,12 +39,9 @@ class ChunkLearner(BcLearner):
         """Construct the learner; `Learner` describes the arguments.
 
         Raises:
-            InputError: If the environment is not built from a task's diagram, or `pipelined` or `num_envs` is set.
+            InputError: If the environment is not built from a task's diagram.
         """
         super().__init__(config, env, **arguments)
-        for name in ("pipelined", "num_envs"):
-            if getattr(config, name):
-                raise InputError(f"{config.algorithm} needs the environment in this process: leave {name} out")
         if not hasattr(env.unwrapped, "trace"):
             raise InputError(f"{config.algorithm} needs an environment that is built from a task's diagram")
         self._env = cast(Any, env.unwrapped)
