@@ -273,7 +273,13 @@ def api() -> str:
 
 
 def exported(name: str, thing: Any) -> str:
-    """Return the documentation of a class with its public methods, or of a function."""
+    """Return the documentation of a class with its public methods, or of a function.
+
+    A name of another package is only attributed to it: links of its documentation have no targets here.
+    """
+    package = thing.__module__.partition(".")[0]
+    if not package.startswith("guiderail"):
+        return f"From `{package}`.\n\n"
     page = documented(thing)
     if not inspect.isclass(thing):
         return signature(name, thing) + page

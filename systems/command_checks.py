@@ -10,7 +10,7 @@ from guiderail.models.control.motion_constraints import MotionConstraints
 from guiderail.models.primitives import LinearConstraints
 from guiderail.systems.support import declarations as declare
 from guiderail.systems.support.declarations import Source, input_getter, output_getter
-from guiderail.systems.support.last_valid import LastValidPose
+from guiderail.systems.support.last_valid import CommandValidity, LastValidPose
 
 
 class CommandFilter(LeafSystem):
@@ -98,14 +98,9 @@ class CommandWatchdog(LeafSystem):
         self._pose_port = self.DeclareVectorInputPort("pose", pose_size)
         self._command_time_port = self.DeclareVectorInputPort("command_time", 1)
         self._blend_factor_port = self.DeclareVectorInputPort("blend_factor", 1)
+        validity = CommandValidity(self._command_time_port, period=period, timeout=timeout)
         followed_pose = LastValidPose(
-            self,
-            self._desired_pose_port,
-            self._command_time_port,
-            self._pose_port.Eval,
-            period=period,
-            timeout=timeout,
-            blend_factor=self._blend_factor_port,
+            self, self._desired_pose_port, validity, self._pose_port.Eval, self._blend_factor_port
         )
         declare.output(self, "safe_pose", pose_size, followed_pose.eval, followed_pose.sources)
         followed_pose.declare_timed_out_output(self)

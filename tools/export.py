@@ -259,8 +259,9 @@ def policy_to_onnx(policy: Policy) -> bytes:
         nodes.append(("Tanh" if description["activation"] == "tanh" else "Relu", (value,), f"hidden_{index}"))
         value = f"hidden_{index}"
     low, high = (np.asarray(description[f"action_{end}"], np.float32) for end in ("low", "high"))
-    tensors |= {"low": low, "high": high}
+    tensors["low"] = low
     if description.get("squash", "tanh") == "clip":
+        tensors["high"] = high
         nodes += [("Max", (value, "low"), "above"), ("Min", ("above", "high"), "action")]
     else:
         tensors |= {"half": np.float32(0.5) * (high - low), "one": np.ones(1, np.float32)}

@@ -25,8 +25,8 @@ from guiderail.diagrams.envs.observation import (
 )
 from guiderail.diagrams.envs.options import PrimitiveOptions, validate_options
 from guiderail.diagrams.envs.scene import (
+    add_camera,
     add_meshcat,
-    add_observation_camera,
     add_picture,
     contact_results_of,
     scene_of,
@@ -260,7 +260,7 @@ class Loop:
         camera, terms = self.observed.camera, self.observed.terms
         if camera is None:
             return self.add_terms(terms, "observation")
-        image, (width, height) = add_observation_camera(self.builder, self.station, camera), camera.size
+        image, (width, height) = add_camera(self.builder, self.station, "observation_camera", camera), camera.size
         if not terms:
             return gymnasium.spaces.Box(0, 255, (height, width, 3), np.uint8), image
         from guiderail.systems.policy_system import ImageObservation  # most environments have no image

@@ -28,6 +28,7 @@ from guiderail.diagrams.tasks.contact_probe import RimContact
 from guiderail.diagrams.tasks.options import (
     CENTER_OF_PRESSURE_SCALE,
     COMMAND_SCALE,
+    CONTACT_MEMORY,
     MIN_CONTACT_FORCE,
     ForceOptions,
     HiddenOffsets,
@@ -42,7 +43,6 @@ from guiderail.models.primitives import LinearConstraints, ReferenceTrajectory
 from guiderail.systems.poses import RelativePoses
 from guiderail.systems.wrench_signals import CenterOfPressure, MeanContactPoint
 
-CONTACT_MEMORY = 1.0  # time over which points of contact are averaged [s]
 MAX_GIVEN_OFFSET = 0.3  # [m] largest coordinate of a given offset; a larger one is probably in millimeters
 
 

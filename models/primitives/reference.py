@@ -61,6 +61,17 @@ class ReferenceTrajectory:
         self.uniform = bool(np.abs(self.times - grid).max() <= 1e-12 * np.abs(self.times).max())
 
     @classmethod
+    def straight(
+        cls, start: Sequence[float], end: Sequence[float], std: float, *, num_steps: int, period: float
+    ) -> ReferenceTrajectory:
+        """Return a motion at constant speed from `start` (O,) to `end` (O,), with the standard deviation `std`.
+
+        It has `num_steps` steps of `period` [s].
+        """
+        variance = np.tile(std**2 * np.eye(len(start)), (num_steps, 1, 1))
+        return cls(period * np.arange(num_steps), np.linspace(start, end, num_steps), variance)
+
+    @classmethod
     def from_demonstrations(
         cls,
         demonstrations: Demonstrations,

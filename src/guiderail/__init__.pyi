@@ -21,6 +21,7 @@ from .diagrams.guidance.prior import ScriptedApproach as ScriptedApproach
 from .diagrams.guidance.registry import register_guidance as register_guidance
 from .diagrams.stations.plane import PlaneStation as PlaneStation
 from .diagrams.stations.registry import register_station as register_station
+from .diagrams.stations.station import JointStation as JointStation
 from .diagrams.stations.station import Station as Station
 from .diagrams.tasks.insertion import InsertionTask as InsertionTask
 from .diagrams.tasks.registry import register_task as register_task
@@ -36,6 +37,7 @@ from .models.laws import Law as Law
 from .models.laws import PrimitiveLaw as PrimitiveLaw
 from .models.laws import Stepper as Stepper
 from .models.laws import TemplateLaw as TemplateLaw
+from .models.objects.narrow_passage import PassageGeometry as PassageGeometry
 from .models.policy import Policy as Policy
 from .models.primitives import Demonstrations as Demonstrations
 from .models.primitives import Kmp as Kmp

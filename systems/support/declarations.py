@@ -25,7 +25,6 @@ from pydrake.systems.framework import (
 
 from guiderail.models.common.arrays import as_number, as_whole, is_finite, is_whole
 from guiderail.models.common.errors import InputError, brief
-from guiderail.systems.support import declarations as declare
 
 
 class SignalPorts:
@@ -406,7 +405,7 @@ class ReadFlag:
     """
 
     def __init__(self, system: LeafSystem):
-        self._entry = declare.cache(system, "is_read", lambda context: True, [system.nothing_ticket()])
+        self._entry = cache(system, "is_read", lambda context: True, [system.nothing_ticket()])
         # Initialization updates of the abstract state precede those of the discrete state, in which outputs are read.
         system.DeclareInitializationUnrestrictedUpdateEvent(
             lambda context, state: context.SetAllCacheEntriesOutOfDate()

@@ -29,6 +29,9 @@ class CommandValidity:
         period: Period of the check [s], positive.
         timeout: Age above which a command is stale [s], positive and finite.
 
+    Attributes:
+        command_time, period: Arguments.
+
     Raises:
         InputError: If the timeout is out of range.
     """
@@ -36,7 +39,7 @@ class CommandValidity:
     def __init__(self, command_time: InputPort, *, period: float, timeout: float):
         if not 0.0 < timeout < np.inf:
             raise InputError(f"the timeout of commands must be positive and finite, not {timeout} s")
-        self._command_time = command_time
+        self.command_time, self.period = command_time, period
         self._min_age, self._max_age = -(period + _TIME_TOLERANCE), timeout
 
     def is_valid(self, context: Context, pose: np.ndarray, time: float) -> bool:
@@ -47,9 +50,9 @@ class CommandValidity:
         """
         if not all(abs(number) <= _MAX_COORDINATE for number in pose.tolist()):
             return False  # also for NaN
-        if not self._command_time.HasValue(context):
+        if not self.command_time.HasValue(context):
             return True
-        stamp = float(self._command_time.Eval(context)[0])
+        stamp = float(self.command_time.Eval(context)[0])
         return time - stamp <= self._max_age and context.get_time() - stamp >= self._min_age
 
 
@@ -66,10 +69,8 @@ class LastValidPose:
     Args:
         system: System under construction, in which two states and two events are declared.
         desired_pose: Input port of the command, (O,).
-        command_time: Input port of the time stamp, (1,) [s]; if it is not connected, commands never time out.
+        validity: Validity check of the command; its period is that of the check.
         measured_pose: Function of the system's context that returns the measured pose, (O,).
-        period: Period of the check [s], positive; ideally the period of the commands.
-        timeout: Age above which a command is stale [s], positive and finite.
         blend_factor: Input port of the blend factor, (1,). If it is None or not connected, the robot is always
             controlled.
 
@@ -77,28 +78,26 @@ class LastValidPose:
         sources: Sources of `eval`, for the declaration of outputs and cache entries.
 
     Raises:
-        InputError: If the timeout is out of range. At initialization, if the measured pose is not finite.
+        InputError: At initialization, if the measured pose is not finite.
     """
 
     def __init__(
         self,
         system: LeafSystem,
         desired_pose: InputPort,
-        command_time: InputPort,
+        validity: CommandValidity,
         measured_pose: Callable[[Context], np.ndarray],
-        *,
-        period: float,
-        timeout: float,
         blend_factor: InputPort | None = None,
     ):
         self._system, self._desired_pose, self._blend_factor = system, desired_pose, blend_factor
-        self._measured_pose = measured_pose
-        self._validity = CommandValidity(command_time, period=period, timeout=timeout)
+        self._measured_pose, self._validity = measured_pose, validity
         self._last_pose = declare.unset_state(system, desired_pose.size())
         self._check_time = system.DeclareDiscreteState(1)
-        declare.update(system, period, self._update, self._reset)
+        declare.update(system, validity.period, self._update, self._reset)
         # Outputs and event share one check of a command.
-        self._valid = declare.cache_entry(system, "valid", self._check, [desired_pose, command_time, self._check_time])
+        self._valid = declare.cache_entry(
+            system, "valid", self._check, [desired_pose, validity.command_time, self._check_time]
+        )
         self.sources: list[declare.Source] = [desired_pose, self._valid, self._last_pose]
 
     def eval(self, context: Context) -> np.ndarray:

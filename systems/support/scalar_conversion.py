@@ -91,22 +91,15 @@ def differentiable_torques(law: ArmImpedance) -> JointTorques:
     Raises:
         InputError: If the arm is near a singular posture.
     """
-    K, J, R_axes = law.K, law.J, law.R_axes
-    if R_axes is not None:
-        R = np.zeros((6, 6), dtype=object)
-        R[:3, :3] = R[3:, 3:] = R_axes
-        K = R @ K @ R.T
+    K, J = law.K, law.J
     M_inverse_JT = inv(law.M) @ J.T
     Lambda_inverse = regularized(J @ M_inverse_JT)
     if not has_regular_inertia(values_of(Lambda_inverse)):
         raise InputError("an impedance has derivatives in regular postures only: move the arm away from this posture")
     damping = differentiable_damping(K, Lambda_inverse, law.damping_ratio) @ (J @ law.v)
     unlimited_wrench = spring_wrench(K, law.p_error, law.eta, law.epsilon) - damping
-    along_axes = unlimited_wrench if R_axes is None else R.T @ unlimited_wrench
-    wrench = np.minimum(np.maximum(along_axes, -law.wrench_limits), law.wrench_limits)
-    is_limited = bool((np.abs(values_of(along_axes)) >= values_of(law.wrench_limits)).any())
-    if R_axes is not None:
-        wrench = R @ wrench
+    wrench = np.minimum(np.maximum(unlimited_wrench, -law.wrench_limits), law.wrench_limits)
+    is_limited = bool((np.abs(values_of(unlimited_wrench)) >= values_of(law.wrench_limits)).any())
     leak = inv(Lambda_inverse) @ (M_inverse_JT.T @ law.posture_torque)
     unlimited_torque = J.T @ (wrench - leak) + law.posture_torque + law.gravity_torque
     torque = np.minimum(np.maximum(unlimited_torque, -law.torque_limits), law.torque_limits)

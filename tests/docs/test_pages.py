@@ -104,6 +104,14 @@ def test_signatures_of_the_reference_have_types(reference):
     assert not [name for name, hint in signatures if not hint]
 
 
+def test_reference_links_to_pages_that_exist(generator, reference):
+    for name, page in reference.items():
+        for link in LINK.findall(page):
+            target = (DOCS / "reference" / link).resolve()
+            is_page = link.removesuffix(".md") in generator.PAGES or target.is_file()
+            assert "://" in link or is_page, f"the reference page {name} links to {link}, which does not exist"
+
+
 def test_template_fields_have_descriptions(reference):
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \| (.*?) \| .* \|$", reference["templates"], re.MULTILINE)
     assert len(rows) > 50

@@ -199,12 +199,6 @@ def test_measured_pose_has_no_direct_feedthrough(projection):
     assert feedthrough == [[True, True], [False, False]]
 
 
-def test_safe_command_is_passed_through(projection):
-    _, context, _, _ = start(projection, [0.5, 0.3], [0.0, 0.0])
-    np.testing.assert_array_equal(projection.get_safe_pose_output_port().Eval(context), [0.5, 0.3])
-    assert projection.get_intervention_output_port().Eval(context) == [0.0]
-
-
 def test_command_into_the_wall_is_projected_onto_its_margin(projection):
     _, context, _, _ = start(projection, [3.0, 0.0], [0.0, 0.0])
     np.testing.assert_allclose(projection.get_safe_pose_output_port().Eval(context), [0.9, 0.0], atol=1e-5)

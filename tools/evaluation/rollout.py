@@ -116,7 +116,7 @@ def _check_action(action: Any, env: gymnasium.Env) -> None:
 
 def new_columns(callback: Callback, row: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the columns that a callback adds to an episode's row."""
-    columns = callback.on_episode_end(row)
+    columns = callback.on_episode_end(row) or {}
     if not isinstance(columns, Mapping):
         raise InputError(f"{type(callback).__name__}.on_episode_end must return a dictionary, not {brief(columns)}")
     if taken := sorted(set(columns) & set(row)):

@@ -93,10 +93,13 @@ class Learner(Callback, ABC):
 
     Attributes:
         Config: Configuration class, a pydantic dataclass derived from `LearnerConfig`.
+        stored: Names of the attributes that a resumed run continues from: arrays of at least one dimension, random
+            generators, and JSON-serializable values. None if the learner has its own `state` and `restore`.
         records_metrics: True if `metrics` will be read; set by the training loop.
     """
 
     Config: ClassVar[type[LearnerConfig]] = LearnerConfig
+    stored: ClassVar[tuple[str, ...] | None] = None
     records_metrics: bool = False
 
     @abstractmethod
@@ -128,22 +131,30 @@ class Learner(Callback, ABC):
         """Return the learned policy.
 
         Args:
-            description: Entries to add to the policy's description, such as the observation's shape.
+            description: Description of the policy: the observation's shape and the limits of an action. A learner may
+                add entries; see `Policy`.
         """
 
-    @abstractmethod
     def has_diverged(self) -> bool:
-        """Return True if a learned parameter is NaN or infinite."""
+        """Return True if a learned parameter is NaN or infinite; by default, if a stored array has such a number."""
+        return not all(np.isfinite(array).all() for array in self.state()[0].values())
 
-    @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Return the state that a resumed run continues from; called between two episodes.
+        """Return the state that a resumed run continues from, by default `stored`; called between two episodes.
 
         Returns:
             Arrays of numbers by name (a 0-d array is restored with the shape (1,)), and JSON-serializable values.
         """
+        if self.stored is None:
+            raise InputError(f"{type(self).__name__} names nothing in stored, and has no state() and restore()")
+        own = {name: getattr(self, name) for name in self.stored}
+        arrays = {name: value for name, value in own.items() if isinstance(value, np.ndarray)}
+        values = {name: value for name, value in own.items() if name not in arrays}
+        return arrays, {
+            name: value.bit_generator.state if isinstance(value, np.random.Generator) else value
+            for name, value in values.items()
+        }
 
-    @abstractmethod
     def restore(self, arrays: Mapping[str, np.ndarray], values: Mapping[str, Any]) -> None:
         """Restore a result of `state`.
 
@@ -155,6 +166,11 @@ class Learner(Callback, ABC):
             KeyError: If an entry is missing.
             RuntimeError, ValueError: If the state does not fit this learner.
         """
+        for name in self.stored or ():
+            if isinstance(generator := getattr(self, name), np.random.Generator):
+                generator.bit_generator.state = values[name]
+            else:
+                setattr(self, name, arrays[name] if isinstance(generator, np.ndarray) else values[name])
 
 
 def _check_learner(name: str, learner: Any) -> None:
@@ -174,11 +190,12 @@ LEARNERS: Registry[Any] = Registry(
 register_learner = LEARNERS.register
 
 
-def described_observation(env: gymnasium.Env) -> dict[str, Any]:
-    """Return the entries of a policy's description for an environment's observations."""
-    space = env.observation_space
+def describe_interface(env: gymnasium.Env) -> dict[str, Any]:
+    """Return the entries of a policy's description for an environment's observations and actions."""
+    space, actions = env.observation_space, cast(gymnasium.spaces.Box, env.action_space)
     image = getattr(space, "image_shape", None)
-    return {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
+    described = {"observation_shape": list(space.shape or ())} | ({} if image is None else {"image_shape": list(image)})
+    return described | {"action_low": actions.low.tolist(), "action_high": actions.high.tolist()}
 
 
 def divergence_error() -> InputError:

@@ -62,9 +62,13 @@ class PassageGeometry:
         lower, upper = self.walls
         return KeepOut(lower, upper, self.constraints, margin)
 
+    def goal_distance(self, pose: np.ndarray) -> float:
+        """Return the distance of the robot's center `pose` (2,) from the goal [m]."""
+        return float(np.hypot(pose[0] - self.goal[0], pose[1] - self.goal[1]))
+
     def at_goal(self, pose: np.ndarray) -> bool:
         """Return True if the robot's center `pose` (2,) [m] is less than `goal_radius` from the goal."""
-        return bool(np.hypot(pose[0] - self.goal[0], pose[1] - self.goal[1]) < self.goal_radius)
+        return self.goal_distance(pose) < self.goal_radius
 
     def in_passage(self, pose: np.ndarray) -> bool:
         """Return True if the robot is so close to the walls along y that they may block it, at any x.

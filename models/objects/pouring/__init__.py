@@ -100,7 +100,6 @@ def contact(stiffness: float | None = None, dissipation: float | None = None) ->
 
 
 def add_shape(
-    plant: MultibodyPlant,
     body: RigidBody,
     name: str,
     X_BG: RigidTransform,
@@ -109,6 +108,7 @@ def add_shape(
     properties: ProximityProperties | None = None,
 ) -> None:
     """Add a shape as collision and visual geometry; do nothing if the plant has no scene graph."""
+    plant = body.GetParentPlant()
     if plant.geometry_source_is_registered():
         plant.RegisterCollisionGeometry(body, X_BG, shape, name, properties or contact())
         plant.RegisterVisualGeometry(body, X_BG, shape, f"{name}_visual", np.array(color))
@@ -121,7 +121,7 @@ def add_vessel(plant: MultibodyPlant, name: str, vessel: Vessel, color: tuple[fl
     bottom = Cylinder(vessel.inner_diameter / 2 + vessel.wall / 2, vessel.bottom)
     parts.append(("bottom", RigidTransform([0.0, 0.0, -vessel.depth - vessel.bottom / 2]), bottom))
     for part, X_TG, shape in parts:
-        add_shape(plant, body, part, X_TG, shape, color)
+        add_shape(body, part, X_TG, shape, color)
     return body
 
 
@@ -130,5 +130,5 @@ def add_ball(plant: MultibodyPlant, name: str, ball: Ball, color: tuple[float, .
     inertia = SpatialInertia.HollowSphereWithMass(ball.mass, ball.diameter / 2)
     body = plant.AddRigidBody(name, plant.AddModelInstance(name), inertia)
     shape = Sphere(ball.diameter / 2)
-    add_shape(plant, body, "ball", RigidTransform(), shape, color, contact(ball.stiffness, ball.dissipation))
+    add_shape(body, "ball", RigidTransform(), shape, color, contact(ball.stiffness, ball.dissipation))
     return body

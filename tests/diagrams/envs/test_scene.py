@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -34,7 +35,9 @@ def test_triton_is_imported_before_rendering(tmp_path, monkeypatch):
     builder, scene_graph = DiagramBuilder(), SceneGraph()
     builder.AddSystem(scene_graph)
     camera = Camera((8, 8), 1.0, RigidTransform())
-    add_camera(builder, scene_graph, scene_graph.get_query_output_port(), "camera", camera)
+    query = scene_graph.get_query_output_port()
+    ports = {"HasOutputPort": lambda name: True, "GetOutputPort": lambda name: query}
+    add_camera(builder, SimpleNamespace(scene_graph=scene_graph, **ports), "camera", camera)
     assert sys.modules.pop("triton").__file__ == str(tmp_path / "triton.py")
 
 

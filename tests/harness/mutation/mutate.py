@@ -93,7 +93,7 @@ TARGETS = {
 }
 SURVIVORS = ROOT / "tests" / "harness" / "mutation" / "survivors.yaml"
 # Modules without mutants whose import is slow: imported before a process is forked for each mutant.
-SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "osqp", "piqp", "pydrake.math", "pytest")
+SLOW_IMPORTS = ("daqp", "hypothesis.extra.numpy", "mpmath", "numpy", "pydrake.math", "pytest")
 SLOW_IMPORTS += (
     "scipy.optimize",
     "scipy.sparse",

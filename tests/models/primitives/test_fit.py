@@ -8,7 +8,7 @@ from guiderail.models.primitives import Demonstrations, ReferenceTrajectory, Squ
 from guiderail.models.primitives.deviation import outputs_at
 from guiderail.models.primitives.fit import LONG, MIN_SHARE, fit, share_within_spread
 from guiderail.models.primitives.mixture import information_criteria
-from oracles.handwriting import LETTERS, make_correlated, share_within_deviation, write_letter
+from oracles.handwriting import make_correlated, share_within_deviation, write_letter
 
 
 def motion(selection):
@@ -22,7 +22,7 @@ PAGES = [{"size": 1.0}, {"size": 100.0, "offset": (300.0, -200.0)}]
 
 
 # `letters.py` in this folder prints the selection for letters with more demonstrations and steps.
-@pytest.mark.parametrize(("letter", "page"), list(zip(LETTERS, PAGES * 3, strict=True)))
+@pytest.mark.parametrize(("letter", "page"), list(zip("Ne", PAGES, strict=True)))
 def test_fitted_letter_stays_within_the_demonstrations(letter, page):
     selection = fit(write_letter(letter, count=4, steps=60, **page))
     assert selection.is_within_spread
@@ -71,20 +71,13 @@ def test_fit_selects_the_smoothest_of_the_best_candidates(selection):
         assert str(number) in selection.why
 
 
-def test_fit_is_invariant_to_the_unit_of_length(demonstrations, selection):
-    """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square."""
-    larger = fit(Demonstrations(demonstrations.times, [100 * y for y in demonstrations.outputs]))
-    assert larger.components == selection.components
-    assert larger.kernel == selection.kernel
-    assert larger.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
-    np.testing.assert_allclose(motion(larger), 100 * motion(selection), atol=1e-3)
-
-
-def test_unit_of_time_scales_only_the_length_scale(demonstrations, selection):
-    slower = fit(Demonstrations([10 * t for t in demonstrations.times], demonstrations.outputs))
-    assert slower.components == selection.components
-    assert slower.kernel.length_scale == pytest.approx(10 * selection.kernel.length_scale, rel=1e-9)
-    assert slower.lambda_ == pytest.approx(selection.lambda_, rel=1e-9)
+def test_fit_is_invariant_to_units(demonstrations, selection):
+    """Outputs scaled by 100 scale the motion by 100 and λ by the inverse square; time scales only the length scale."""
+    other = fit(Demonstrations([10 * t for t in demonstrations.times], [100 * y for y in demonstrations.outputs]))
+    assert other.components == selection.components
+    assert other.kernel.length_scale == pytest.approx(10 * selection.kernel.length_scale, rel=1e-9)
+    assert other.lambda_ == pytest.approx(selection.lambda_ / 1e4, rel=1e-6)
+    np.testing.assert_allclose(motion(other), 100 * motion(selection), atol=1e-3)
 
 
 def test_selection_accepts_arguments_of_the_primitive(selection):
@@ -169,8 +162,8 @@ def test_long_recordings_are_thinned_out_before_the_mixture():
     np.testing.assert_allclose(long.reference.means[[0, -1]], short.reference.means[[0, -1]], atol=2e-3)
 
 
-@pytest.mark.parametrize("steps", [401, 1000, 5000])
-def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch):
+@pytest.mark.parametrize(("steps", "samples"), [(400, 400), (401, 150), (5000, 150)])
+def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, samples, monkeypatch):
     """The cost of expectation maximization is bounded by the number of samples that it sees."""
     sizes = []
     fitted = mixture._fit
@@ -181,9 +174,6 @@ def test_size_of_the_mixture_does_not_grow_with_the_recording(steps, monkeypatch
 
     monkeypatch.setattr(mixture, "_fit", counted)
     selection = fit(slow(steps), components=5)
-    assert max(sizes) == 3 * 150
+    assert max(sizes) == 3 * samples
     assert selection.reference.num_steps == steps
-
-
-def test_recordings_of_usual_length_are_not_thinned_out():
-    assert "evenly spaced" not in fit(slow(400), components=5).why
+    assert ("evenly spaced" in selection.why) == (samples < steps)

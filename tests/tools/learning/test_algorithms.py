@@ -11,7 +11,7 @@ from spaces_only_env import SpacesOnlyEnv
 
 from guiderail.models.common.errors import InputError
 from guiderail.tools.evaluation.episode import Transition
-from guiderail.tools.learning.learner import LEARNERS, learner_arguments
+from guiderail.tools.learning.learner import LEARNERS, Learner, learner_arguments
 from guiderail.tools.learning.learner_config import config_values, make_config, resolve_preset
 from guiderail.tools.learning.networks import DemonstrationReplayBuffer, DroppedNormalizedReLU
 from guiderail.tools.learning.off_policy import TD3_NOISE
@@ -279,3 +279,30 @@ def test_probability_of_an_action_grows_over_base_motion_steps():
     assert fractions[0] == 0.0
     assert 0.4 < fractions[1] < 0.6
     assert fractions[2] == 1.0
+
+
+class Stored(Learner):
+    stored = ("best", "highest", "random")
+
+    def __init__(self):
+        self.best, self.highest, self.random = np.zeros(2), -np.inf, np.random.default_rng(0)
+
+    def act(self, observation):
+        return self.best
+
+    def policy(self, description):
+        raise NotImplementedError
+
+
+def test_stored_attributes_are_the_state_of_a_learner():
+    first, second = Stored(), Stored()
+    first.best, first.highest = first.random.standard_normal(2), 3.0
+    second.restore(*first.state())
+    np.testing.assert_array_equal(second.best, first.best)
+    assert (second.highest, second.random.normal()) == (3.0, first.random.normal())
+    assert not first.has_diverged()
+    first.best[0] = np.nan
+    assert first.has_diverged()
+    Stored.stored = None
+    with pytest.raises(InputError, match="Stored names nothing in stored"):
+        first.state()

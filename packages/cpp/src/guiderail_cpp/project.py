@@ -17,7 +17,7 @@ from guiderail.diagrams.stations.impedance_control import (
     MIN_MASS,
     WRENCH_RATE,
 )
-from guiderail.diagrams.tasks.options import MIN_CONTACT_FORCE
+from guiderail.diagrams.tasks.options import CONTACT_MEMORY, MIN_CONTACT_FORCE
 from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import SKILL_FILE
 from guiderail.models.policy import Policy
@@ -73,6 +73,7 @@ def skill_arrays(skill: TrainedSkill) -> tuple[Arrays, dict[str, str], dict[str,
         "period": np.array([prior.period]),
         "duration": np.array([prior.period * skill.num_steps]),
         "observation/min_force": np.array([MIN_CONTACT_FORCE]),
+        "observation/contact_samples": np.array([CONTACT_MEMORY / skill.prior.period]),
         "action_repeat": np.array([float(skill.config.action_repeat)]),
     }
     arrays |= _guidance_arrays(guidance, prior) | _force_arrays(skill) | policy_arrays(skill.policy)

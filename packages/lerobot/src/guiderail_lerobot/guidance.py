@@ -35,7 +35,9 @@ def guard_limits(config: PrimitiveConfig, max_jerk: tuple[float, ...] = ()) -> t
             number of entries, or outputs that the demonstrations do not move have no given limits.
     """
     outputs, motion, period = config.num_outputs, config.motion, config.control_period
-    if motion is not None and (motion.outside or motion.state or np.isfinite(motion.max_acceleration).any()):
+    if motion is not None and (
+        motion.outside or motion.state or np.isfinite(np.asarray(motion.max_acceleration)).any()
+    ):
         raise InputError(
             "a guard limits only speed and jerk, within linear bounds: leave max_acceleration, "
             "joint_margin and shapes out"

@@ -68,7 +68,7 @@ def export(run: Path | str, out: Path | str) -> GuiderailPolicy:
 
 
 def push_to_hub(folder: Path | str, repo_id: str, *, private: bool = False) -> str:
-    """Upload an exported folder to the Hugging Face Hub; `GuiderailPolicy.from_pretrained(repo_id)` loads it from there.
+    """Upload an exported folder to the Hugging Face Hub; `GuiderailPolicy.from_pretrained(repo_id)` loads it.
 
     Args:
         folder: Folder that `export` wrote.
