@@ -1,9 +1,9 @@
 """One connector skill for several engines, arms and contacts: `python -m research.engines --out engines`.
 
 A policy is trained with each seed over a set of environments (`VARIANTS`): on an arm with a sensor at its wrist and in
-MuJoCo, each with the nominal and with other friction. It is evaluated in held-out episodes under each of `CONDITIONS`, beside the
-scripted policy and policies that lack one part of the method (`ABLATIONS`). Every finished step is stored, and the same
-command resumes. `rows/` has the episodes, `engines.csv` one row per policy and condition.
+MuJoCo, each with the nominal and with other friction. It is evaluated in held-out episodes under each of `CONDITIONS`,
+beside the scripted policy and policies that lack one part of the method (`ABLATIONS`). Every finished step is stored,
+and the same command resumes. `rows/` has the episodes, `engines.csv` one row per policy and condition.
 """
 
 from __future__ import annotations
