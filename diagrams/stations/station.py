@@ -332,6 +332,9 @@ class JointStation(Station):
 
     A subclass adds the robot.
 
+    Args:
+        workcell: Workcell of the task, which `add_robot` gets.
+
     Attributes:
         plant_step: Time step of the plant [s]; the control period is a multiple of it.
     """

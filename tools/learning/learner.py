@@ -144,6 +144,9 @@ class Learner(Callback, ABC):
 
         Returns:
             Arrays of numbers by name (a 0-d array is restored with the shape (1,)), and JSON-serializable values.
+
+        Raises:
+            InputError: If `stored` is None and the class does not override this method.
         """
         if self.stored is None:
             raise InputError(f"{type(self).__name__} names nothing in stored, and has no state() and restore()")
