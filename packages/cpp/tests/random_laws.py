@@ -29,7 +29,7 @@ from guiderail.tools.export import GUIDED, load_skill
 from guiderail.tools.learning.run_folder import RunFolder
 from guiderail.tools.pretrained import find_run
 from guiderail_cpp.arrays import Arrays, frozen, primitive_arrays
-from guiderail_cpp.export import EXPORTED, governor_arrays, policy_arrays, skill_arrays
+from guiderail_cpp.project import EXPORTED, governor_arrays, policy_arrays, skill_arrays
 from guiderail_cpp.recording import double_action, record_skill
 from guiderail_cpp.templates import template_arrays
 from guiderail_hardware.systems.pose_rate_limiter import PoseRateLimiter

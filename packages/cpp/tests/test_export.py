@@ -12,7 +12,7 @@ from guiderail.models.common.errors import InputError
 from guiderail.models.laws.primitive import PrimitiveLaw
 from guiderail.models.primitives import LcNsKmp, LinearConstraints, ReferenceTrajectory
 from guiderail_cpp.arrays import primitive_arrays
-from guiderail_cpp.export import export_cpp
+from guiderail_cpp.project import export_cpp
 
 needs_compiler = pytest.mark.skipif(shutil.which("g++") is None, reason="there is no C++ compiler (g++)")
 HERE = Path(__file__).parent

@@ -100,8 +100,8 @@ OWN_KINDS = (
     Kind("wrenches lost", ros2.MAX_WRENCH_AGE + NEXT, lambda rng: lambda message, elapsed: [message]),
     Kind("joint missing", NEXT, lambda rng: lambda message, elapsed: [message]),
 )
-# Without a safety monitor at the robot, lost commands are not reported: the controller holds its last target. Neither is
-# a constant latency, because the loop of forces is closed at the robot.
+# Without a safety monitor at the robot, lost commands are not reported: the controller holds its last target. Nor is a
+# constant latency, because the loop of forces is closed at the robot.
 SILENT = ("commands lost", "controller killed", "controller stopped")
 CAMPAIGN = [
     replace(kind, bound=UNDETECTED) if kind.name in (*SILENT, "commands 60 ms late") or _is_latency(kind) else kind
