@@ -88,7 +88,7 @@ lerobot: $(VENV)/.ready  ## the plug-in for LeRobot, in an environment of its ow
 	python3.12 -m venv .venv-lerobot
 	.venv-lerobot/bin/python -m pip install -qq --disable-pip-version-check -e . -e packages/lerobot \
 	  "lerobot[core-scripts]" pytest
-	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null \
+	GUIDERAIL_PYTHON=$(CURDIR)/$(BIN)/python .venv-lerobot/bin/python -m pytest -q -c /dev/null --confcutdir packages/lerobot/tests/plugin \
 	  packages/lerobot/tests/plugin
 
 motions: $(VENV)/.ready  ## adversarial commands against the limits of motion, minutes

@@ -1,9 +1,9 @@
 """One connector skill for several engines, arms and contacts: `python -m research.engines --out engines`.
 
 A policy is trained with each seed over a set of environments (`VARIANTS`): on an arm with a sensor at its wrist and in
-MuJoCo, each with the nominal and with other friction. It is evaluated in held-out episodes under each of `CONDITIONS`, beside the
-scripted policy and policies that lack one part of the method (`ABLATIONS`). Every finished step is stored, and the same
-command resumes. `rows/` has the episodes, `engines.csv` one row per policy and condition.
+MuJoCo, each with the nominal and with other friction. It is evaluated in held-out episodes under each of `CONDITIONS`,
+beside the scripted policy and policies that lack one part of the method (`ABLATIONS`). Every finished step is stored,
+and the same command resumes. `rows/` has the episodes, `engines.csv` one row per policy and condition.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from guiderail.tools.files import write_atomically
 from guiderail.tools.learning.train import train
 from guiderail.tools.tables import read_table, table_text
 from research.command import Parser, print_result, run_program
+from research.results.methods import markdown_table
 
 TASK = "BncConnector"
 ENVIRONMENT: dict[str, Any] = {"guidance": "kgrl", "difficulty": "hard", "reward": "aligned", "sensing": "wrist"}
@@ -99,7 +100,8 @@ def evaluate_once(source: Path | str, method: str, condition: str, file: Path) -
 def tabulate(out: Path) -> pd.DataFrame:
     """Return one row per policy and condition, from the stored episodes and the training episodes of the runs."""
     table = []
-    for file in sorted((out / "rows").glob("*/*.csv")):
+    files = [file for name in CONDITIONS for file in sorted((out / "rows").glob(f"*/{name}.csv"))]
+    for file in files:
         rows, (method, _, seed) = read_table(file), file.parent.name.rpartition("-")
         row: dict[str, Any] = {"method": method, "seed": seed, "condition": file.stem, "episodes": len(rows)}
         row["successes"] = int(rows["success"].sum())
@@ -115,6 +117,18 @@ def tabulate(out: Path) -> pd.DataFrame:
             row["training_seconds"] = round(float(training["wall_time"].max()), 1)
         table.append(row)
     return pd.DataFrame(table)
+
+
+def condition_table(table: pd.DataFrame) -> str:
+    """Return a Markdown table with a row for each condition and the successes of each method, one number per seed."""
+    methods = [name for name in (*ABLATIONS, "scripted", "uniform_random") if name in set(table["method"])]
+    lines = [["condition", "episodes", *methods]]
+    for condition, rows in table.groupby("condition", sort=False):
+        cells = [rows.loc[rows["method"] == name].sort_values("seed")["successes"] for name in methods]
+        lines.append(
+            [str(condition), str(rows["episodes"].max()), *(", ".join(map(str, cell)) or "–" for cell in cells)]
+        )
+    return markdown_table(lines[0], lines[1:])
 
 
 def _report(text: str) -> None:

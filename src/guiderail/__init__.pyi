@@ -52,9 +52,9 @@ from .models.robots.robot import Robot as Robot
 from .models.robots.robot import register_robot as register_robot
 from .models.templates import SharedControlTemplate as SharedControlTemplate
 from .models.templates import load_template as load_template
-from .systems.episode_monitor import TerminationTerm as TerminationTerm
+from .systems.episode_terms import RewardTerm as RewardTerm
+from .systems.episode_terms import TerminationTerm as TerminationTerm
 from .systems.policy_system import PolicySystem as PolicySystem
-from .systems.reward_system import RewardTerm as RewardTerm
 from .tools.evaluation.episode import Callback as Callback
 from .tools.evaluation.episode import Transition as Transition
 from .tools.evaluation.evaluate import evaluate as evaluate

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from guiderail.diagrams.envs.make import make_env
-from guiderail.diagrams.tasks.narrow_passage import HARD, NarrowPassageOptions, scripted_slalom
+from guiderail.diagrams.tasks.narrow_passage import HARD, NarrowPassage, scripted_slalom
 from guiderail.models.objects.narrow_passage import PassageGeometry
 from guiderail.tools.evaluation.baselines import BASELINES, constant_policy, zero_policy
 from guiderail.tools.evaluation.rollout import rollout
@@ -37,7 +37,7 @@ def test_commands_satisfy_the_constraints_under_any_action(env, name):
 
 
 def test_obstacles_are_on_opposite_sides_and_observed(env):
-    nominal, sides = NarrowPassageOptions(**HARD).geometry.obstacles, []
+    nominal, sides = NarrowPassage(**HARD).geometry.obstacles, []
     starts = []
     for seed in range(8):
         observation, info = env.reset(seed=seed)
@@ -61,7 +61,7 @@ def test_plant_has_the_obstacles_at_their_sampled_positions(env):
 
 
 def test_standard_has_the_default_geometry_and_start():
-    assert NarrowPassageOptions().geometry == PassageGeometry()
+    assert NarrowPassage().geometry == PassageGeometry()
     standard = make_env("NarrowPassage")
     assert standard.observation_space.shape == (1,)
     _, info = standard.reset(seed=3)
