@@ -1,6 +1,9 @@
 """Drivers: a user's driver with only `read` and `write`, registration, and refused drivers and robots."""
 
+import re
+import tomllib
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -151,3 +154,18 @@ def test_safety_monitor_raises_when_commands_are_not_readable():
     plant = driver.model.plant
     with pytest.raises(InputError, match="cannot be watched"):
         SafetyMonitor(driver, plant, safety_limits(plant, driver))
+
+
+def test_every_driver_of_the_package_is_an_entry_point():
+    package = Path(__file__).parents[2]
+    points = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]["guiderail"]
+    declared = {name.removeprefix("driver:") for name in points if name.startswith("driver:")}
+    sources = (path.read_text() for path in (package / "src/guiderail_hardware/drivers").glob("*.py"))
+    registered = {
+        name for source in sources for name in re.findall(r'^@register_driver\("(\w+)"\)', source, re.MULTILINE)
+    }
+    assert declared == registered
+    for name, place in points.items():
+        if name.startswith("driver:"):
+            module, _, attribute = place.partition(":")
+            assert f"class {attribute}(" in (package / "src" / f"{module.replace('.', '/')}.py").read_text()
