@@ -257,9 +257,8 @@ def _fit_shipped(demonstrations: str, count: int | None, prior_std: tuple[float,
     return ReferenceTrajectory.from_demonstrations(loaded, components=COMPONENTS, floor=FLOOR, prior_std=prior_std)
 
 
-# Indices into the observation [time, pose, wrench, center of pressure, command, mean contact point].
+# Indices into the observation [time, pose, wrench, center of pressure, command, …].
 TIME, Z, FORCE_Z, TORQUE_X, TORQUE_Y, CENTER_OF_PRESSURE, COMMAND = 0, 3, 9, 10, 11, slice(13, 15), slice(15, 17)
-MEAN_CONTACT_POINT = slice(17, 19)
 
 # Parameters of `scripted_torque_search`, for the demonstrations "insert".
 GAIN = 1.5  # action per scaled contact torque
@@ -289,9 +288,8 @@ def scripted_torque_search(observation: np.ndarray) -> np.ndarray:
 def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     """Return an action (2,) that moves the command by at most `STEP` towards the center of pressure, and so the jack.
 
-    The mean contact point replaces the center of pressure if it is observed. Once the plug has dropped into the jack,
-    the command is constant until the search ends. Before and after the search, the action is zero. The last command is
-    read from the observation, so that the policy has no state.
+    Once the plug has dropped into the jack, the command is constant until the search ends. Before and after the search,
+    the action is zero. The last command is read from the observation, so that the policy has no state.
 
     Raises:
         InputError: If the observation has no center of pressure.
@@ -301,8 +299,7 @@ def scripted_center_of_pressure(observation: np.ndarray) -> np.ndarray:
     time = 0.5 * (observation[TIME] + 1.0) * NUM_STEPS * CONTROL_PERIOD
     if not MAY_PRESS < time < HOLD_UNTIL:
         return np.zeros(2)
-    entries = MEAN_CONTACT_POINT if len(observation) >= MEAN_CONTACT_POINT.stop else CENTER_OF_PRESSURE
-    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[entries] * CENTER_OF_PRESSURE_SCALE
+    command, lever = observation[COMMAND] * COMMAND_SCALE, observation[CENTER_OF_PRESSURE] * CENTER_OF_PRESSURE_SCALE
     height, length = observation[Z] * POSE_SCALE[2] + POSE_CENTER[2], float(np.linalg.norm(lever))
     if height > ON_RIM and length > 0.0:
         command = command + STEP * lever / max(length, MM)
