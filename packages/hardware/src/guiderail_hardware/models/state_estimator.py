@@ -251,9 +251,7 @@ class StateEstimator:
         # The return of the first robot is a sign of a second one as well.
         is_other = {fault, self._find_fault(before, before.last, status, now)} & set(SOURCE_FAULTS)
         state, fault = self._check_source(state, values, now, fault, is_trusted=is_trusted, is_other=bool(is_other))
-        # The last status had a velocity that the torques do not explain.
-        is_held = not is_doubted and before.last_time > before.accepted_time
-        if fault == Fault.CONFLICT and not is_doubted and not is_held:
+        if fault == Fault.CONFLICT and not is_doubted:
             # The last statuses may be from a second robot, which does not react to the torques: their effect is added.
             reported = before.last_values[self._velocities]
             state = replace(state, velocity=reported + self._missing_velocity(state, M)[0])
@@ -270,14 +268,7 @@ class StateEstimator:
             is_learning = is_comparable and not state.torque.any() and not before.tolerance.any()
             state = self._update_rest(state, M @ change[self._velocities] if is_learning else state.predicted)
         state = replace(state, pulse=self._zeros, other_pulse=self._zeros, pulse_error=self._zeros)
-        deviation, explained, allowed = self._momentum_deviation(state, M)
-        is_contradictory = (deviation > allowed).any()
-        if is_held:
-            # The prediction, unlike the sums of momentum, does not decay.
-            deviation = np.abs(values[self._velocities] - state.velocity)
-            is_contradictory |= status.time - before.accepted_time > self._limits.max_age
-        is_explained = is_doubted or (deviation <= explained).all()
-        fault = fault or self._find_contradiction(state, is_contradictory and not is_explained)
+        fault = fault or self._find_contradiction(state, M)
         state, fault = self._synchronize(state, last.offset, now - status.time, now, fault)
         state = replace(state, last_time=status.time, last_values=values, receipt_time=now)
         velocity = values[self._velocities]
@@ -296,22 +287,15 @@ class StateEstimator:
                 velocity = np.where(velocity * state.velocity > 0.0, np.sign(velocity) * size, 0.0)
         if fault in (Fault.FROZEN, Fault.INCONSISTENT, Fault.NOT_REACTING) and not is_doubted:
             is_frozen = (change[self._positions] == 0.0) | (fault == Fault.NOT_REACTING)
-            if is_explained or not is_held:
-                missing, is_missing = self._missing_velocity(state, M)
-                state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
+            missing, is_missing = self._missing_velocity(state, M)
+            state = replace(state, velocity=np.where(is_frozen & is_missing, status.velocities + missing, velocity))
         if fault not in ACCEPTABLE_FAULTS or not is_trusted:
             return self._finish(state, before, fault, now)
         age = max(now - (status.time + last.offset), 0.0) if np.isfinite(last.time) else 0.0
         reach = EXTERNAL_STEP * self._torque_tolerance
         external = np.clip(values[self._torques], before.external - reach, before.external + reach)
-        state = replace(state, variation=np.abs(external - before.external), external=external)
-        if not is_explained:
-            # A collision, or another robot: the external torque decides within `REACTION_WINDOW`.
-            missing, is_missing = self._missing_velocity(state, M)
-            if not is_held:
-                state = replace(state, velocity=np.where(is_missing, status.velocities + missing, velocity))
-            return self._finish(state, before, fault, now)
-        state = replace(state, velocity=velocity, accepted_values=values)
+        variation = np.abs(external - before.external)
+        state = replace(state, velocity=velocity, variation=variation, accepted_values=values, external=external)
         state = replace(state, accepted_time=status.time, accepted_offset=state.last_offset)
         return self._finish(state, before, fault, now, age)
 
@@ -349,7 +333,7 @@ class StateEstimator:
         """Return the state with the effect of the torques since the last check."""
         step = max(now - before.check_time + self._period, 0.0)
         # The external torque is unknown without a recent status, and may be wrong while statuses are in doubt.
-        age = now - step - (before.last_time + before.last_offset)
+        age = now - step - (before.accepted_time + before.accepted_offset)
         is_known = np.isfinite(age) and not np.isfinite(before.doubt_time)
         freshness = np.clip(2.0 - age / self._period, 0.0, 1.0) if is_known else 0.0
         external = freshness * before.external
@@ -481,14 +465,7 @@ class StateEstimator:
         is_missing = np.prod(np.sign(missing), axis=1) > 0.0
         return np.where(is_missing, np.sign(missing[:, 0]) * np.abs(missing).min(axis=1), 0.0), is_missing
 
-    def _momentum_deviation(self, state: EstimatorState, M: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return |M⁻¹ (p − m)|, its limit without and with a collision, each (n,) [rad/s]."""
-        inverse, limits = np.linalg.inv(M), self._limits
-        deviation = np.abs(inverse @ (state.predicted - state.measured))
-        explained = limits.velocity_noise + np.abs(inverse) @ state.tolerance
-        return deviation, explained, explained + np.minimum(REACTION * state.reaction, limits.velocity_jump)
-
-    def _find_contradiction(self, state: EstimatorState, is_contradictory: bool) -> Fault:
+    def _find_contradiction(self, state: EstimatorState, M: np.ndarray) -> Fault:
         counts = (
             (state.equal_positions, MAX_EQUAL_POSITIONS),
             (state.equal_velocities, MAX_EQUAL_VELOCITIES),
@@ -499,7 +476,11 @@ class StateEstimator:
         tolerance = self._limits.position_tolerance
         if (np.abs(state.residual) > tolerance).any() or (np.abs(state.drift) > MAX_DRIFT * tolerance).any():
             return Fault.INCONSISTENT
-        if is_contradictory or (state.excess > MAX_EXCESS).any():
+        inverse, limits = np.linalg.inv(M), self._limits
+        deviation = np.abs(inverse @ (state.predicted - state.measured))
+        reaction = np.minimum(REACTION * state.reaction, limits.velocity_jump)
+        allowed = limits.velocity_noise + np.abs(inverse) @ state.tolerance + reaction
+        if (deviation > allowed).any() or (state.excess > MAX_EXCESS).any():
             return Fault.NOT_REACTING
         return Fault.NONE
 
