@@ -52,6 +52,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "no contact memory": {"environment": NO_MEMORY},
     "own observation": {"settings": {"privileged_critic": False}},
     "one engine": {"variants": {"arm": VARIANTS["arm"]}},
+    "half in MuJoCo": {"variants": {**VARIANTS, "mujoco friction": {**VARIANTS["friction"], "station": "mujoco"}}},
     "residual": {"environment": {"guidance": "residual", "action_scale": 1.85}},
     "safe residual": {"environment": {"guidance": "safe_residual", "action_scale": 1.85}},
 }
