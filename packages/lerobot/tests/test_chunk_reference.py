@@ -138,8 +138,6 @@ def test_window_is_refused_when_it_does_not_fit_the_primitive():
         window = np.zeros((5, 2)), np.tile(covariance, (5, 1, 1))
         with pytest.raises(InputError, match="positive definite"):
             primitive.predict_window(0, *window)
-        with pytest.raises(InputError, match="positive definite"):
-            primitive.predict_at(0.1 * np.arange(5), *window)
 
 
 @pytest.mark.parametrize("history", [0, 3])

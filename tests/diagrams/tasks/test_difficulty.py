@@ -81,8 +81,8 @@ def test_hard_connector_has_its_dimensions_and_offsets(connector):
         _, info = connector.reset(seed=seed)
         radii.append(np.linalg.norm(info["jack_offset"]))
     assert 2.6 * MM <= min(radii) < max(radii) <= 3.0 * MM
-    assert connector.observation_space.shape == (17,)
-    assert connector.unwrapped.diagram.symmetry.observations.shape == (1, 17, 17)
+    assert connector.observation_space.shape == (19,)
+    assert connector.unwrapped.diagram.symmetry.observations.shape == (1, 19, 19)
 
 
 def test_center_of_pressure_points_to_the_jack(connector):

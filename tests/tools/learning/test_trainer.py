@@ -401,7 +401,7 @@ def write_subclass(folder, package, base, decorator, name):
 
 def test_resume_refuses_a_changed_task_file(tmp_path, monkeypatch):
     monkeypatch.setitem(TASKS._entries, "changes/Passage", None)  # removed after the test
-    names = "narrow_passage.task.NarrowPassage", "registry.register_task"
+    names = "narrow_passage.NarrowPassage", "registry.register_task"
     file = write_subclass(tmp_path, "guiderail.diagrams.tasks", *names, "changes/Passage")
     out, environment = tmp_path / "run", {"guidance": "kgrl", "action_repeat": 40}
     Training(out, ["changes/Passage"], environment, {"episodes": 1}, imports=[str(file)], pictures=False).start()
