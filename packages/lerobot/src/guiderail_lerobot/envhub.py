@@ -36,7 +36,8 @@ class LeRobotObservation(gymnasium.ObservationWrapper[dict[str, np.ndarray], np.
             raise InputError("an environment whose observation is an image is not available for LeRobot's EnvHub")
         self.task = self.task_description = task
         self._max_episode_steps = -(-env.diagram.num_steps // env.action_repeat)
-        self.observation_space = gymnasium.spaces.Dict({"agent_pos": env.observation_space})
+        observed: gymnasium.Space[Any] = gymnasium.spaces.Dict({"agent_pos": env.observation_space})
+        self.observation_space = observed
 
     def observation(self, observation: np.ndarray) -> dict[str, np.ndarray]:
         """Return the observation, (n,), as a dictionary."""
