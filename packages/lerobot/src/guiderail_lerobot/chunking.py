@@ -154,6 +154,7 @@ class ChunkLearner(BcLearner):
         return Policy(
             layers,
             {
+                **description,  # its limits are those of the environment's actions; those below are of chunks
                 "format": FORMAT,
                 "pool": 1,
                 "activation": "relu",
@@ -161,7 +162,6 @@ class ChunkLearner(BcLearner):
                 "action_low": np.tile(low, ensemble).tolist(),
                 "action_high": np.tile(high, ensemble).tolist(),
                 "chunk": [ensemble, self.config.chunk_steps, self._num_outputs],
-                **description,
             },
         )
 
